@@ -6,8 +6,9 @@ import functools
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,7 @@ COMMON = (
     ),
     click.option(
         "--engine",
-        metavar=f"[{'|'.join(CHOICES)}]",
-        shell_complete=lambda _, __, begun: [name for name in CHOICES if name.startswith(begun)],
+        type=click.Choice(CHOICES),
         help="Kernels; auto: warp where it is installed. DDRECON_ENGINE or auto unless given.",
     ),
     click.option(
@@ -48,8 +48,8 @@ COMMON = (
 )
 FEWER = {"watch": (DEBUG,), "info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG)}
 """The common options of commands that compute nothing."""
-THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
-"""Waiting threads spin for a moment, then sleep.
+ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
+"""Waiting threads spin for a moment, then sleep; said before torch is loaded.
 
 That is 1.5 times faster than sleeping at once, without the stalls of endless spinning.
 """
@@ -88,7 +88,8 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapped(debug: bool, **options: Any) -> None:
-        _set_environment()
+        for name, value in ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
         try:
             with interruptible():
                 _run(command, **options)
@@ -108,7 +109,9 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             tell_failure(error)
             if debug or not is_shortage(error):
                 raise
-            click.echo(_shortage(error), err=True)
+            reason = str(error).partition("\n")[0] or "no more is given"
+            advice = "make volume.resolution or the images smaller, or --resume the run"
+            click.echo(f"out of memory: {reason}; {advice}", err=True)
             sys.exit(2)
         except KeyboardInterrupt as error:
             _show(f"interrupted {error}".strip())
@@ -119,85 +122,36 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def _set_environment() -> None:
-    """Says how torch's threads wait, and keeps torch quiet about ranks; before it is loaded."""
-    for name, value in THREADING.items():
-        os.environ.setdefault(name, value)
-    if "RANK" in os.environ:
-        # Where others cannot be reached, one line says so, and not a page of torch's.
-        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
-
-
-def _run(
-    command: Callable[..., None],
-    overrides: tuple[str, ...] = (),
-    device: str = "cpu",
-    engine: str | None = None,
-    threads: int | None = None,
-    seed: int = 0,
-    quiet: bool = False,
-    verbose: bool = False,
-    dtype: str = "float64",
-    report: Path | None = None,
-    share: str = "views",
-    **others: Any,
-) -> None:
+def _run(command: Callable[..., None], **options: Any) -> None:
     """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
-    from ddrecon.cli.session import open_session, read_input, show_compilations
+    from ddrecon.cli.session import Session, show_compilations
     from ddrecon.io.files.folders import require_folder_of
     from ddrecon.ranks import alone, is_first, leave_ranks
 
-    common = overrides, device, engine, threads, seed, quiet, verbose
-    reader = functools.cache(read_input)
-    with show_warnings(), show_compilations(quiet):
-        if report is not None:
-            require_folder_of(report)
-        if "RANK" not in os.environ:  # ranks meet before one of them fails, so that it is told once
-            for path in _named_scenes(**others):
-                reader(path, overrides)
-        session = open_session(*common, dtype, report, share, reader)
+    common = {field.name for field in fields(Session)} & options.keys()
+    session = Session(**{name: options.pop(name) for name in common})
+    with show_warnings(), show_compilations(session.quiet):
+        if session.report is not None:
+            require_folder_of(session.report)
+        if "RANK" in os.environ:  # ranks meet before one of them fails, so that it is told once
+            # Where others cannot be reached, one line says so, and not a page of torch's.
+            os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
+            session.start()
         is_shared = command.__name__ in SHARED
         if is_shared or is_first():
             with nullcontext() if is_shared else alone():
-                command(session=session, **others)
+                command(session=session, **options)
     leave_ranks()
-
-
-def _named_scenes(
-    scene: Path | None = None, file: Path | None = None, sources: Sequence[Path] = (), **_: Any
-) -> list[Path]:
-    """The scene files among a command's arguments; raises FormatError for another missing file."""
-    from ddrecon.io.files.reading import guard_reading
-
-    data = [*sources, *([file] if file else [])]
-    for path in data:
-        if path.suffix not in SCENE_SUFFIXES:
-            with guard_reading(path):
-                pass
-    return [*([scene] if scene else []), *(path for path in data if path.suffix in SCENE_SUFFIXES)]
-
-
-def _shortage(error: BaseException) -> str:
-    """The line that says what memory `error` found missing, and what helps."""
-    reason = str(error).partition("\n")[0] or "no more is given"
-    advice = "make volume.resolution or the images smaller; --resume takes up an interrupted run"
-    return f"out of memory: {reason}; {advice}"
 
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
     """Warnings about data become lines on stderr, each once; those of libraries stay unseen."""
-    told = set[str]()
-
-    def show(message: Warning | str) -> None:
-        if str(message) not in told:
-            told.add(str(message))
-            _show(f"warning: {message}")
-
+    show = functools.cache(lambda text: _show(f"warning: {text}"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = lambda message, *_: show(message)
+        warnings.showwarning = lambda message, *_: show(str(message))
         yield
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import platform
 from itertools import pairwise
 
 import click
 
+from ddrecon import __version__
 from ddrecon.cli.file_commands import export, info
-from ddrecon.cli.scene_commands import check, optimize, render
+from ddrecon.cli.scene_commands import check, optimize, render, watch
 from ddrecon.cli.uncertainty import uncertainty
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
-from ddrecon.cli.version import show_version
-from ddrecon.cli.watch import watch
+from ddrecon.engine import engine_versions
+from ddrecon.errors import DdreconError
 
 
 class Commands(click.Group):
@@ -26,6 +28,26 @@ class Commands(click.Group):
             for word, after in pairwise([*args, ""])
         ]
         return super().parse_args(context, words)
+
+
+def show_version(context: click.Context, parameter: click.Parameter, is_asked: bool) -> None:
+    """Prints what a run's result may depend on, and ends the program."""
+    if not is_asked or context.resilient_parsing:
+        return
+    try:
+        engine, *packages = engine_versions().items()
+    except DdreconError as error:
+        click.echo(str(error), err=True)
+        context.exit(error.exit_code)
+    import torch
+
+    brought = "".join(f" ({name} {version})" for name, version in packages)
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+    click.echo(
+        f"ddrecon {__version__}, Python {platform.python_version()}, "
+        f"torch {torch.__version__}, engine {engine[1]}{brought}, device {device}"
+    )
+    context.exit()
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

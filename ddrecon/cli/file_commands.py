@@ -1,12 +1,9 @@
-"""Commands that take data files: export, info.
-
-torch is imported inside the commands, so that `--help` answers at once.
-"""
+"""Commands that take data files: export, info."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,7 +11,16 @@ from ddrecon.cli.command import REPORT, SCENE_SUFFIXES, in_session
 from ddrecon.errors import UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ddrecon.cli.session import Session
+    from ddrecon.io.volumes.field import Fields
+    from ddrecon.scene import Scene
+
+LEFT_OUT = ("sigma_a", "sigma_s")
+"""Not written of a medium: sigma_t and albedo are what programs of film and games take."""
+ROUNDING = 1e-6
+"""By what part cells may differ that are the same: one cross section follows from the others."""
 
 
 @click.command()
@@ -47,67 +53,87 @@ def export(
     SCENE is a scene file or the folder of a finished run; a folder of `ddrecon uncertainty` counts
     as its volumes.
     """
+    scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
+    from ddrecon.io.volumes.convert import read_together
     from ddrecon.io.volumes.table import FORMATS
+    from ddrecon.reference.export import export_scene
+    from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
     kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
     if kind not in known:
         raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
-    has_scene = any(map(_is_scene, sources))
-    if (has_scene or kind in (".xml", ".json")) and len(sources) > 1:
+    is_of_scene = kind not in FORMATS or any(map(_is_scene, sources))
+    if is_of_scene and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
-    if kind in (".xml", ".json") and up == "z":
+    if kind not in FORMATS and up == "z":
         raise click.UsageError("--up z turns volumes only")
-    if kind == ".xml":
-        from ddrecon.reference.export import export_scene
-
-        written = export_scene(session.load(sources[0]), output, may_exist=overwrite)
-    elif kind == ".json":
-        from ddrecon.scene_file.transforms import export_transforms
-
-        scene_file = session.read(sources[0])
-        written = export_transforms(
-            session.build(scene_file), scene_file, output, may_exist=overwrite
-        )
+    written = [output]
+    if not is_of_scene:
+        fields, bounds = read_together(sources)
+        _write_fields(output, overwrite, up, fields, {}, bounds)
     else:
-        _export_fields(session, sources, output, overwrite, has_scene, up)
-        written = [output]
+        scene_file = scene_file or session.read(sources[0])
+        scene = session.build(scene_file)
+        if kind == ".xml":
+            written = export_scene(scene, output, may_exist=overwrite)
+        elif kind == ".json":
+            written = export_transforms(scene, scene_file, output, may_exist=overwrite)
+        else:
+            _write_fields(output, overwrite, up, *_fields_of(scene))
     click.echo(f"written: {', '.join(map(str, written))}")
 
 
-def _export_fields(
-    session: Session,
-    sources: tuple[Path, ...],
-    output: Path,
-    overwrite: bool,
-    is_scene: bool,
-    up: str,
+def _write_fields(
+    output: Path, overwrite: bool, up: str, fields: Fields, constants: Fields, bounds: np.ndarray
 ) -> None:
-    """Writes the fields of a scene, or of all volumes `sources`, to `output`."""
+    """Writes a volume to `output`, and prints what is the same everywhere in it."""
     from ddrecon.io.files.folders import require_free_files
-    from ddrecon.io.volumes.convert import raise_z, read_together
+    from ddrecon.io.volumes.convert import raise_z
     from ddrecon.io.volumes.table import keeps_constants, write_fields
-    from ddrecon.scene_file.export_fields import fields_of
 
     require_free_files([output], may_exist=overwrite)
-    if is_scene:
-        fields, constants, bounds = fields_of(session.load(sources[0]))
-    else:
-        (fields, bounds), constants = read_together(sources), {}
     if up == "z":
         fields, bounds = raise_z(fields, bounds)
     write_fields(output, fields, bounds, constants)
     if constants:
-        numbers = ", ".join(f"{name} {_words(value)}" for name, value in constants.items())
-        place = (
-            "in its metadata" if keeps_constants(output) else "which the format has no place for"
-        )
+        words = {
+            name: " ".join(f"{number:.6g}" for number in value.flatten().tolist())
+            for name, value in constants.items()
+        }
+        numbers = ", ".join(f"{name} {numbers}" for name, numbers in words.items())
+        has_place = keeps_constants(output)
+        place = "in its metadata" if has_place else "which the format has no place for"
         click.echo(f"fields: {', '.join(fields)}; the same everywhere, {place}: {numbers}")
 
 
-def _words(value: Any) -> str:
-    return " ".join(f"{number:.6g}" for number in value.flatten().tolist())
+def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
+    """What differs from cell to cell, what is the same everywhere, and the box, of `scene`.
+
+    Density is always among the first. Fields are [z, y, x] or [z, y, x, 3], constants have one
+    number or three, and the box [2, 3] is its corners (x, y, z).
+    """
+    import numpy as np
+
+    from ddrecon.variables.kinds import is_of_volume, split_name
+    from ddrecon.variables.values import value_of, variable_names
+
+    fields, constants = dict[str, np.ndarray](), dict[str, np.ndarray]()
+    for name in filter(is_of_volume, variable_names(scene)):
+        if name in LEFT_OUT:
+            continue
+        value = value_of(scene, name).detach().float().cpu()
+        if value.ndim >= 3:
+            low, high = value.flatten(-3).aminmax(dim=-1)
+            if split_name(name)[1] == "density" or (high - low > ROUNDING * high.abs()).any():
+                last = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+                fields[name] = last.numpy()
+                continue
+            value = (low + high) / 2
+        if value.numel() in (1, 3):
+            constants[name] = value.numpy()
+    return fields, constants, np.array(scene.volume.grid.bounds_xyz)
 
 
 def _is_scene(source: Path) -> bool:
@@ -124,8 +150,8 @@ def info(session: Session, file: Path) -> None:
 
     Of a scene file or the folder of a finished run, it is its volume.
     """
+    scene = session.load(file) if _is_scene(file) else None
     from ddrecon.io.info import describe, describe_medium, lines
-    from ddrecon.scene_file.export_fields import fields_of
 
-    report = describe_medium(*fields_of(session.load(file))) if _is_scene(file) else describe(file)
+    report = describe_medium(*_fields_of(scene)) if scene else describe(file)
     session.show(report, lines(report))

@@ -1,32 +1,21 @@
-"""Commands that take a scene: check, render, optimize.
+"""Commands of scenes and runs: check, render, optimize, watch.
 
-torch is imported inside the commands, so that `--help` answers at once.
+torch is imported inside the commands, after their scene is read: help, and what is wrong with a
+scene file, are shown at once.
 """
 
 from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
-from ddrecon.cli.watch import SAVE_EVERY, watched
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
-
-
-class CountOrAuto(click.IntRange):
-    """A whole number, or `auto`."""
-
-    name = "integer or auto"
-
-    def convert(
-        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
-    ) -> Any:
-        return value if value == "auto" else super().convert(value, parameter, context)
 
 
 @click.command()
@@ -37,12 +26,12 @@ class CountOrAuto(click.IntRange):
 @in_session
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
-    from ddrecon.cli.check import describe, lines
-    from ddrecon.scene_file.dump import find_expert_keys
-
     scene_file = session.read(scene)
+    from ddrecon.cli.check import describe, lines
+    from ddrecon.scene_file.load import find_expert_keys
+
     expert = find_expert_keys(scene_file.tree)
-    report = describe(session.build(scene_file), expert, session.shares_cells)
+    report = describe(session.build(scene_file), expert, session.share == "cells")
     session.show(report, lines(report))
 
 
@@ -96,6 +85,11 @@ def render(
     has_mp4: bool,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
+    if count is None and has_mp4:
+        raise click.UsageError("--mp4 is a movie of --ring N")
+    if lights:
+        session = session.with_overrides(f"lights=[{', '.join(lights)}]")
+    scene_file = session.read(scene)
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
@@ -110,13 +104,11 @@ def render(
         write_ring,
     )
 
-    if count is None and has_mp4:
-        raise click.UsageError("--mp4 is a movie of --ring N")
     if has_mp4:
         require_mp4()
-    loaded = session.with_lights(lights).load(scene)
+    loaded = session.build(scene_file)
     require_sharing(loaded)
-    views = session.pick_views(loaded, names)
+    views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
         views = list(loaded.views)
@@ -142,7 +134,7 @@ def render(
 @OVERWRITE
 @click.option(
     "--iterations",
-    type=CountOrAuto(min=1),
+    metavar="N|auto",
     help="Total number of iterations, also after --resume; auto: the run ends by itself.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
@@ -151,9 +143,6 @@ def render(
     type=click.IntRange(min=1),
     metavar="K",
     help="Write pictures every K iterations.",
-)
-@click.option(
-    "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
 )
 @click.option(
     "--uncertainty",
@@ -170,21 +159,20 @@ def optimize(
     scene: Path,
     output: Path,
     overwrite: bool,
-    iterations: int | str | None,
+    iterations: str | None,
     resume: bool,
     preview_every: int | None,
-    is_watched: bool,
     has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
+    if iterations is not None:
+        session = session.with_overrides(f"optimize.iterations={iterations}")
+    scene_file = session.read(scene)
     from ddrecon.cli.uncertainty import add_uncertainty, follow_added
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
-    if iterations is not None:
-        session = session.with_overrides(f"optimize.iterations={iterations}")
-    scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
     require_sharing(built)
     if not is_first():
@@ -192,15 +180,8 @@ def optimize(
         if has_uncertainty:
             follow_added(run)
         return
-    with (
-        open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
-            run,
-            folder,
-        ),
-        watched(output) if is_watched else nullcontext(),
-    ):
-        if is_watched:
-            folder.save_often(SAVE_EVERY)
+    choice = {"may_exist": overwrite, "resume": resume}
+    with open_run(built, scene_file, output, environment, **choice) as (run, folder):
         is_last = not has_uncertainty
         summary = drive_run(run, folder, preview_every, session.is_quiet, is_last)
         lines = summary_lines(summary, output)
@@ -208,3 +189,25 @@ def optimize(
             record, more = add_uncertainty(run, output, session.is_quiet)
             summary, lines = summary | {"uncertainty": record}, [*lines, *more]
     session.show(summary, lines)
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    show_default="8765, or a free one if that is taken",
+    help="Where to serve it; 0 is a free one.",
+)
+@in_session
+def watch(session: Session, run: Path, port: int | None) -> None:
+    """Serve the page of RUN, the folder of a run, on this machine alone, while the run goes on.
+
+    Ctrl-C ends it.
+    """
+    from ddrecon.run.live import LiveRun, listen, serve_page, url_of
+
+    live = LiveRun(run)
+    with listen(port) as listening, serve_page(live.page, listening) as server:
+        click.echo(f"{url_of(listening)}  (Ctrl-C ends)")
+        server.serve_forever()

@@ -1,11 +1,7 @@
-"""The command `uncertainty`.
-
-torch is imported inside the command, so that `--help` answers at once.
-"""
+"""The command `uncertainty`, and what `optimize --uncertainty` does."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,23 +85,16 @@ def uncertainty(
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
     state = state_of(run)
-    session = replace(session, dtype=dtype_of(state))
-    taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
+    scene = session.build(session.read(run / "scene.yaml"), dtype_of(state))
+    taken = take_up(scene, state, run)
     noise = None if read is None else Noise(read, 0.0)
     request = Request(session.seed, noise, tolerance, next_view)
     if not is_first():
         follow_uncertainty(taken, samples, request)
         return
     with claim_folder(output, may_exist=overwrite or resume):
-        record = drive_uncertainty(
-            taken,
-            output,
-            samples,
-            request,
-            has_samples=has_samples,
-            resume=resume,
-            is_quiet=session.is_quiet,
-        )
+        choice = {"has_samples": has_samples, "resume": resume, "is_quiet": session.is_quiet}
+        record = drive_uncertainty(taken, output, samples, request, **choice)
     session.show(record, uncertainty_lines(record, output))
 
 
@@ -118,15 +107,8 @@ def add_uncertainty(
 
     path = folder / "uncertainty"
     path.mkdir(exist_ok=True)
-    record = drive_uncertainty(
-        run,
-        path,
-        SAMPLES,
-        Request(run.seed),
-        has_samples=False,
-        resume=False,
-        is_quiet=is_quiet,
-    )
+    choice = {"has_samples": False, "resume": False, "is_quiet": is_quiet}
+    record = drive_uncertainty(run, path, SAMPLES, Request(run.seed), **choice)
     return record, uncertainty_lines(record, path)
 
 

@@ -1,13 +1,10 @@
-"""Commands that tell how far to trust the others: gradcheck, reference, bench.
-
-torch is imported inside the commands, so that `--help` answers at once.
-"""
+"""Commands that say how far to trust the others: gradcheck, reference, bench."""
 
 from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +14,7 @@ from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_sess
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.scene_file.load import SceneFile
 
 
 @click.command()
@@ -39,9 +37,10 @@ if TYPE_CHECKING:
 @in_session
 def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
+    loaded = session.load(scene)
     from ddrecon.validate.gradcheck import check_parameters, describe, table
 
-    checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
+    checks = check_parameters(loaded, names, samples, session.seed, session.progress)
     session.show(describe(checks), table(checks))
     if not all(check.has_passed for check in checks):
         sys.exit(1)
@@ -82,6 +81,7 @@ def reference(
     is_only_traced: bool,
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
+    loaded = session.load(scene)
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.reference.compare import (
         compare_to_folder,
@@ -90,8 +90,7 @@ def reference(
     )
     from ddrecon.reference.trace import open_tracer
 
-    loaded = session.load(scene)
-    views = session.pick_views(loaded, names)
+    views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     tracer = open_tracer(loaded, views, threads=session.threads)
     with claim_folder(output, may_exist=overwrite):
         shown = None if is_only_traced else loaded
@@ -134,25 +133,28 @@ def bench(
         raise click.UsageError("-D changes a scene file; name one")
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
+    scene_file = None if scene is None else session.read(scene)
     from ddrecon.io.files.folders import claim_folder
 
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         if is_hard:
             _bench_hard(session, output)
         else:
-            _bench_speed(session, scene, is_quick, output)
+            _bench_speed(session, scene_file, is_quick, output)
 
 
-def _bench_speed(session: Session, path: Path | None, is_quick: bool, output: Path | None) -> None:
-    """Measures the scene at `path`, or the plume, and writes what was asked for."""
+def _bench_speed(
+    session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
+) -> None:
+    """Measures the scene, or the plume, and writes what was asked for."""
     from ddrecon.bench.measure import run_bench
     from ddrecon.bench.plume import load_pair
     from ddrecon.bench.report import bench_lines, describe, write_bench
     from ddrecon.errors import MissingExtraError, SceneError
     from ddrecon.reference.trace import open_tracer
 
-    load = None if path is None else lambda dtype: replace(session, dtype=dtype).load(path)
-    scene, double = load_pair(load, session.device, is_quick)
+    load = None if scene_file is None else partial(session.build, scene_file)
+    scene, double = load_pair(load, session.start(), is_quick)
     if scene.volume.media is not None:
         raise click.UsageError("the derivative by the density is measured; name a scene of one")
     tracer = None
@@ -171,7 +173,7 @@ def _bench_hard(session: Session, output: Path | None) -> None:
     from ddrecon.io.files.json_file import write_json
     from ddrecon.validate.hard import describe, run_cases, table
 
-    results = run_cases(session.device, session.progress)
+    results = run_cases(session.start(), session.progress)
     if output is not None:
         write_json(output / "hard.json", describe(results))
     session.show(describe(results), table(results))

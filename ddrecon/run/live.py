@@ -7,14 +7,11 @@ only.
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from multiprocessing import parent_process
 from pathlib import Path
 from socket import create_server, socket
-from socketserver import BaseServer
 from threading import Lock, Thread
 from time import monotonic
 
@@ -116,21 +113,6 @@ class LiveRun:
 def _written(file: Path | None) -> int:
     """When `file` was written [ns]; 0 where it is not there."""
     return file.stat().st_mtime_ns if file is not None and file.is_file() else 0
-
-
-def serve_run(folder: Path, listening: socket) -> None:
-    """Serves the page of the run in `folder` until the process ends that has started this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the run
-    torch.set_num_threads(1)
-    with serve_page(LiveRun(folder).page, listening) as server:
-        Thread(target=_end_with_parent, args=(server,), daemon=True).start()
-        server.serve_forever()
-
-
-def _end_with_parent(server: BaseServer) -> None:
-    if (parent := parent_process()) is not None:
-        parent.join()
-        server.shutdown()
 
 
 def listen(port: int | None) -> socket:

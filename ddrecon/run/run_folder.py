@@ -69,7 +69,6 @@ class RunFolder:
             remove_temporaries(path)
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
-        self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run."""
@@ -97,10 +96,6 @@ class RunFolder:
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 
-    def save_often(self, seconds: float) -> None:
-        """Writes checkpoints every so many `seconds` from now on, for those who watch."""
-        self.save_every, self.next_save = seconds, monotonic() + seconds
-
     def save_in_time(self, run: Reconstruction) -> None:
         """Writes a checkpoint if the last is old."""
         if monotonic() >= self.next_save:
@@ -108,7 +103,7 @@ class RunFolder:
 
     def _note_saved(self, run: Reconstruction, seconds: float) -> None:
         self.saved = run.iteration
-        self.next_save = monotonic() + max(self.save_every, seconds / CHECKPOINT_SHARE)
+        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""

@@ -1,29 +1,65 @@
-"""Scene files as tensors: the front door `load_scene`."""
+"""Scene files as tensors: the front door `load_scene`; and what a scene gets that it leaves out."""
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterable
-from dataclasses import replace
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import DataWarning, FormatError, UsageError
+from ddrecon.grid import Triple
+from ddrecon.io.images.table import read_image
+from ddrecon.io.volumes.table import read_field
 from ddrecon.layer import DTYPES
-from ddrecon.light.lights import Light
-from ddrecon.march.steps import choose_steps
-from ddrecon.scene import Scene
-from ddrecon.scene_file.build_lights import build_lights
-from ddrecon.scene_file.build_starts import (
-    build_starts,
-    require_start_files,
-)
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.march.steps import choose_steps, greatest_depth
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_blend import Blend
+from ddrecon.memory import Needs, make_room, needs_of
+from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
-from ddrecon.scene_file.build_volume import build_volume
-from ddrecon.scene_file.choices import choose_rounds, share_colors
-from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.build_volume import build_media
+from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
+from ddrecon.scene_file.problems import Problems, suggestion
+from ddrecon.scene_file.read import type_hints
+from ddrecon.scene_file.schema import (
+    AmbientSection,
+    Color,
+    DirectionalSection,
+    LightSection,
+    PointSection,
+    SceneTree,
+)
+from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
+from ddrecon.variables.kinds import PAIRS, PHASE, kind_of, split_name
+from ddrecon.variables.values import component_names, value_of, variable_names
 from ddrecon.variables.wildcards import name_each
+
+MORE_ROUNDS = 0.3, 0.6
+"""A second moment of the phase function above one of these deserves a round more: by about so much
+a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
+"""
+FEW_ANGLES = 0.1
+"""A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
+THICK = 2.0
+"""Where a cell has more optical depths and light is scattered forward, one round of two moments is
+nearer to the truth than any of more: what is not scaled out as a peak has to cross the cell. Only
+where the phase function is given.
+"""
+OPTIMIZED = 0.31
+"""The second moment that stands for a phase function which is optimized: two rounds."""
 
 
 def load_scene(
@@ -55,23 +91,307 @@ def build_scene(
     """The scene of a file that was read, as tensors; `load_scene` says what is raised."""
     place, tree, problems = torch.device(device), share_colors(scene_file.tree), Problems()
     scene_file = replace(scene_file, tree=tree)
-    volume, grid = None, None
+    media, grid = dict[str, Volume](), None
     with problems.collecting():
-        volume = build_volume(scene_file, dtype, place)
-        grid = volume.grid
+        media = build_media(scene_file, dtype, place)
+        grid = next(iter(media.values())).grid
     with problems.collecting():
         views = build_views(scene_file, grid, dtype, place)
     lights: list[Light] = []
-    with problems.collecting():
-        lights = build_lights(scene_file, dtype, place)
-    require_start_files(scene_file, problems)
-    problems.raise_any()
+    for index, section in enumerate(tree.lights):
+        with problems.collecting():
+            lights.append(_build_light(scene_file, index, section, dtype, place))
     optimize = tree.optimize
+    for name, settings in optimize.parameters.items() if optimize else ():
+        if isinstance(settings.init, FieldFile):
+            with problems.collecting():
+                require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
+    problems.raise_any()
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    diffusion = choose_rounds(tree, volume.phase, volume)
-    render = tree.render
+    diffusion = choose_rounds(tree, _phase_of(media))
+    needs = needs_of_scene(media, views, lights, diffusion, optimize)
+    if too_much := make_room(needs, place):
+        raise scene_file.refused("volume.resolution", too_much)
+    # Only now each cell has a number of its own.
+    media = {
+        name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
+    }
+    volume = media[""] if "" in media else mix_media(media)
+    diffusion, render = choose_rounds(tree, volume.phase, volume), tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
-    return replace(scene, starts=build_starts(scene_file, scene))
+    return replace(scene, starts=_build_starts(scene_file, scene))
+
+
+def _build_light(
+    scene_file: SceneFile,
+    index: int,
+    section: LightSection,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Light:
+    def tensor(value: Color) -> Tensor:
+        return torch.tensor(value, dtype=dtype, device=device)
+
+    def color(value: Color) -> Tensor:
+        """[1] or [3]"""
+        return tensor(value).view(-1)
+
+    if isinstance(section, DirectionalSection):
+        return DirectionalLight(tensor(section.direction), color(section.irradiance))
+    if isinstance(section, AmbientSection):
+        return AmbientLight(color(section.radiance))
+    if isinstance(section, PointSection):
+        return PointLight(tensor(section.position), color(section.intensity))
+    pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
+    is_gray = bool((pixels == pixels[..., :1]).all())
+    if is_gray and not may_change(scene_file.tree, f"lights.{index}.radiance"):
+        pixels = pixels[..., :1]
+    radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
+    numbers = tensor(section.scale), tensor(section.rotation)
+    return EnvironmentLight(radiance, *numbers, section.directions, section.up)
+
+
+def _read_map(path: Path) -> np.ndarray:
+    """The radiance of an environment map, float32 [h, w, 3].
+
+    What is negative, as around a sun in lossy files, becomes 0 with a warning.
+    """
+    pixels = read_image(path).pixels
+    height, width = pixels.shape[:2]
+    if height < 2 or width < 3:
+        raise FormatError(
+            path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}"
+        )
+    if negative := np.count_nonzero(pixels.min(axis=2) < 0):
+        what = f"{negative} pixels with negative radiance are taken as 0"
+        warnings.warn(f"{path}: {what}", DataWarning, 4)
+    return pixels.clip(min=0)
+
+
+def _phase_of(media: Mapping[str, Volume]) -> PhaseFunction:
+    """The phase function of `media`, of two a blend of both."""
+    first, *others = media.values()
+    half = first.density.new_tensor(0.5)
+    return Blend(first.phase, others[0].phase, half) if others else first.phase
+
+
+def needs_of_scene(
+    media: Mapping[str, Volume],
+    views: Sequence[View],
+    lights: Sequence[Light],
+    diffusion: DiffusionSettings,
+    optimize: OptimizeSettings | None,
+) -> Needs:
+    """What the memory of a scene with these parts depends on.
+
+    Of one medium that is alone its name is "". Derivatives count where something is optimized.
+    """
+    phase, parameters = _phase_of(media), optimize.parameters if optimize else {}
+    first = next(iter(media.values()))
+    colors = max(phase.colors, *(len(medium.sigma_a) for medium in media.values()))
+    return needs_of(
+        first.grid,
+        phase,
+        colors,
+        first.density,
+        diffusion,
+        pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
+        lights=len(lights),
+        optimized=parameters,
+        varied=sum(_varied(name, one, media, colors) for name, one in parameters.items()),
+    )
+
+
+def _varied(
+    name: str, settings: ParameterSettings, media: Mapping[str, Volume], colors: int
+) -> int:
+    """How many numbers a cell the parameter `name` has."""
+    (medium, last), kind = split_name(name), kind_of(name)
+    volume = media.get(medium.removeprefix("media.").strip("."))
+    if last == "density" or not kind.is_cellwise or volume is None:
+        return int(last == "density")
+    sigmas = {"sigma_a": [volume.sigma_a], "sigma_s": [volume.sigma_s]}
+    both = [volume.sigma_a, volume.sigma_s]
+    has_cells = any(sigma.ndim > 1 for sigma in sigmas.get(last, both))
+    if not kind.is_color or last.startswith(PHASE):
+        has_cells = volume.phase.cells is not None
+    is_given = isinstance(settings.init, FieldFile) or has_cells
+    is_field = is_given if settings.field is None else settings.field
+    return is_field * (colors if kind.is_color else 1)
+
+
+def choose_rounds(
+    tree: SceneTree, phase: PhaseFunction, volume: Volume | None = None
+) -> DiffusionSettings:
+    """The diffusion settings of `tree`, with rounds and degree as `phase` deserves if left out.
+
+    A phase function that is optimized may become any: it starts as one of strong peaks does.
+    `volume`: None where it is not known yet; fewer rounds and moments may do in it.
+    """
+    settings = tree.diffusion
+    if not settings.rounds:
+        return settings
+    moments = phase.moments(3)
+    left = float(moments[:, 2].abs().max())
+    is_forward = float(moments[:, 1].min()) > 0 and not bool(phase.backward_tail(1, 1).any())
+    optimized = tree.optimize.parameters if tree.optimize else {}
+    if any(name == "g" or name.startswith(PHASE) for name in optimized):
+        left = max(left, OPTIMIZED)
+    elif is_forward and volume is not None and greatest_depth(volume) > THICK:
+        left = 0.0
+    rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
+    return replace(
+        settings,
+        transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,
+        degree=degree if settings.degree is None else settings.degree,
+    )
+
+
+def share_colors(tree: SceneTree) -> SceneTree:
+    """`tree` with one number for each color whose three are equal, but for what is optimized."""
+    return replace(
+        tree,
+        volume=_share(tree, tree.volume, ""),
+        lights=_share(tree, tree.lights, "lights."),
+        views=tuple(_share(tree, view, f"views.{view.name}.") for view in tree.views),
+    )
+
+
+def may_change(tree: SceneTree, name: str) -> bool:
+    """Whether the variable `name` is optimized, or follows from others that are."""
+    medium, last = split_name(name)
+    names = {name, medium + last.removeprefix(PHASE), re.sub(r"^views\..*\.", "views.*.", name)}
+    others = [pair for pair in PAIRS if last not in pair]
+    if len(others) == 1:
+        names |= {medium + other for other in others[0]}
+    return not names.isdisjoint(tree.optimize.parameters if tree.optimize else ())
+
+
+def _share(tree: SceneTree, value: Any, owner: str) -> Any:
+    """`value` of `tree`, names in which begin with `owner`, with equal colors as one number."""
+    if isinstance(value, Mapping):
+        return {name: _share(tree, one, f"{owner}{name}.") for name, one in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_share(tree, one, f"{owner}{index}.") for index, one in enumerate(value))
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    shared = {}
+    for field in fields(value):
+        one, name = getattr(value, field.name), owner + field.name
+        is_color = isinstance(one, tuple) and field.name in _colors_of(type(value))
+        is_equal = is_color and len(set(one)) == 1 and not may_change(tree, name)
+        shared[field.name] = one[0] if is_equal else _share(tree, one, f"{name}.")
+    return replace(value, **shared)
+
+
+@functools.cache
+def _colors_of(kind: type) -> set[str]:
+    """The fields of records of this `kind` that are a number or three."""
+    hints = type_hints(kind).items()
+    return {name for name, hint in hints if {float, Triple} <= set(get_args(hint))}
+
+
+def _build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
+    """The value each optimized parameter of `scene` starts from, by name.
+
+    Raises SceneError with all problems, or FormatError.
+    """
+    problems, starts = Problems(), {}
+    for name, settings in scene.optimize.parameters.items() if scene.optimize else ():
+        with problems.collecting():
+            starts[name] = _start(scene_file, scene, name, settings)
+    problems.raise_any()
+    return starts
+
+
+def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
+    key = f"optimize.parameters.{name}"
+    try:
+        value = value_of(scene, name).clone()
+    except UsageError:
+        raise scene_file.refused(
+            key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
+        ) from None
+    kind = kind_of(name)
+    if isinstance(settings.init, FieldFile):
+        value = _read_cells(scene_file, f"{key}.init.file", name, settings.init, value)
+    elif settings.init is not None:
+        value = _fill(scene_file, f"{key}.init", name, settings.init, value)
+    if kind.is_cellwise:
+        value = _spread(scene_file, key, settings, value, scene.volume.grid.shape)
+    if not bool(((value >= kind.low) & (value <= kind.high)).all()):
+        raise scene_file.refused(
+            f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
+        )
+    return value
+
+
+def _read_cells(
+    scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
+) -> Tensor:
+    """The file's values per cell, [C, z, y, x] or, where there are no colors, [z, y, x]."""
+    kind = kind_of(name)
+    if not kind.is_cellwise:
+        raise scene_file.refused(key, f"{name} is not a field: give its numbers")
+    read = partial(read_field, name=init.name or split_name(name)[1].removeprefix(PHASE))
+    field = torch.from_numpy(read_referenced(scene_file, key, init.file, read).values).to(value)
+    if field.ndim == 4 and not kind.is_color:
+        raise scene_file.refused(
+            key,
+            f"{name} has no colors, but the file has {list(field.shape)} values [z, y, x, color]",
+        )
+    if not kind.is_color:
+        return field
+    return field.permute(3, 0, 1, 2) if field.ndim == 4 else field[None]
+
+
+def _fill(
+    scene_file: SceneFile, key: str, name: str, init: float | tuple[float, ...], value: Tensor
+) -> Tensor:
+    """`value` with every entry `init`, or every color or component its own."""
+    kind = kind_of(name)
+    count = len(component_names(name, value)) if kind.components else 0
+    if isinstance(init, float):
+        if not count:
+            return torch.full_like(value, init)
+    elif kind.is_color and len(init) == 3:
+        colors = value.new_tensor(init).view(-1, *[1] * (value.ndim - 1))
+        return colors.expand(3, *value.shape[1:]).clone()
+    elif len(init) == (count or value.shape[:1].numel()) and value.ndim == 1 and not kind.is_color:
+        return value.new_tensor(init)
+    expected = f"a list of {count} numbers" if count else "one number"
+    if kind.is_color:
+        expected += " or [r, g, b]"
+    given = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
+    raise scene_file.refused(key, f"expected {expected}{given}")
+
+
+def _spread(
+    scene_file: SceneFile,
+    key: str,
+    settings: ParameterSettings,
+    value: Tensor,
+    shape: tuple[int, int, int],
+) -> Tensor:
+    """`value` as a field of `shape`, or as one number (a color), as the scene asks for."""
+    is_field = value.ndim >= 3
+    if is_field and tuple(value.shape[-3:]) != shape:
+        raise scene_file.refused(
+            f"{key}.init.file",
+            f"has {list(value.shape[-3:])} cells [z, y, x], but the volume has {list(shape)}",
+        )
+    if settings.field is None or settings.field == is_field:
+        return value
+    if settings.field:
+        return value.view(*value.shape, 1, 1, 1).expand(*value.shape, *shape).clone()
+    low, high = value.flatten(-3).aminmax(dim=-1)
+    if not torch.equal(low, high):
+        raise scene_file.refused(
+            key,
+            "differs from cell to cell where it starts;"
+            " give init: number, or leave field: false out",
+        )
+    return low

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -20,10 +20,14 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import CameraSection, Color, LensSection, PerspectiveSection
+from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
 
-NAMED = 4
-"""Views that a line about several names."""
+READERS: Mapping[str, Callable[[Path], Image]] = {
+    "image": read_image,
+    "background": read_image,
+    "mask": lambda path: Image(read_mask(path)[..., None]),
+}
+"""What reads the pictures of a view, by their keys."""
 LATTICE = 33
 """Pixels along each side of an image at which its distortion is checked."""
 COARSER = 8
@@ -38,90 +42,64 @@ def build_views(
 
     Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
     """
-    problems, views = Problems(), []
-    for index in range(len(scene_file.tree.views)):
+    problems, views, sections = Problems(), list[View](), scene_file.tree.views
+    for index in range(len(sections)):
         with problems.collecting():
             views.append(_build_view(scene_file, index, dtype, device))
-    if grid is not None:
-        _note_blind(scene_file, views, grid, problems)
+    cameras = {view.name: view.camera for view in views}
+    blind = [name for name in cameras if grid is not None and not sees_box(cameras[name], grid)]
+    if grid is not None and blind:
+        index = [section.name for section in sections].index(blind[0])
+        others = f" and {len(blind) - 1} more" if len(blind) > 1 else ""
+        why = explain_blindness([cameras[name] for name in blind], [*cameras.values()], grid)
+        what = f"no pixel of view {blind[0]!r}{others} looks through the volume; {why}"
+        problems.note(scene_file.refused(f"views.{index}.camera", what))
     problems.raise_any()
     return views
-
-
-def _note_blind(
-    scene_file: SceneFile, views: Sequence[View], grid: Grid, problems: Problems
-) -> None:
-    """Notes the `views` that do not see the box of `grid`, in one line: they share a cause."""
-    seeing = [sees_box(view.camera, grid) for view in views]
-    blind = [view for view, sees in zip(views, seeing, strict=True) if not sees]
-    if not blind:
-        return
-    others = [view.camera for view, sees in zip(views, seeing, strict=True) if sees]
-    sections = scene_file.tree.views
-    index = [section.name for section in sections].index(blind[0].name)
-    key, which = f"views.{index}.camera", f"no pixel of view {blind[0].name!r}"
-    if len(blind) > 1:
-        named = ", ".join(repr(view.name) for view in blind[:NAMED])
-        rest = ", ..." if len(blind) > NAMED else ""
-        which = f"no pixel of {len(blind)} of {len(sections)} views ({named}{rest})"
-    if len(blind) == len(sections) > 1:
-        key, which = "views", "none"
-    why = explain_blindness([view.camera for view in blind], grid, others)
-    problems.note(scene_file.refused(key, f"{which} looks through the volume; {why}"))
 
 
 def _build_view(
     scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
 ) -> View:
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
-    image = mask = background = None
-    step = 0.0
-    if section.image is not None:
-        with problems.collecting():
-            stored = read_referenced(scene_file, f"{key}.image", section.image, read_image)
-            image, step = _pixels(stored, dtype, device), stored.step
-    if isinstance(section.background, Path):
-        with problems.collecting():
-            stored = read_referenced(
-                scene_file, f"{key}.background", section.background, read_image
-            )
-            background = _pixels(stored, dtype, device)
-    if section.mask is not None:
-        with problems.collecting():
-            mask = torch.from_numpy(
-                read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
-            ).to(device, dtype)
-    size = _size(section.camera, image)
+    pictures, step = dict[str, Tensor](), 0.0
+    for name, read in READERS.items():
+        if isinstance(path := getattr(section, name), Path):
+            with problems.collecting():
+                stored = read_referenced(scene_file, f"{key}.{name}", path, read)
+                pixels = torch.from_numpy(stored.pixels).permute(2, 0, 1).contiguous()
+                pictures[name] = pixels.to(device, dtype)
+                step = stored.step if name == "image" else step
+    size = _size(section.camera, pictures.get("image"))
+    for name, picture in pictures.items():
+        if size is not None and tuple(picture.shape[1:]) != size:
+            (height, width), (rows, columns) = picture.shape[1:], size
+            wrong = f"is {width} x {height} pixels, but {key}.camera has {columns} x {rows}"
+            problems.note(FormatError(getattr(section, name), wrong))
     if size is not None:
-        paths = section.image, section.mask, section.background
-        for path, picture in zip(paths, (image, mask, background), strict=True):
-            if picture is not None and tuple(picture.shape[-2:]) != size:
-                wrong = f"is {_by(picture.shape[-2:])} pixels, but {key}.camera has {_by(size)}"
-                problems.note(FormatError(path, wrong))
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
             _require_unfolded(scene_file, f"{key}.camera", camera)
     problems.raise_any()
-    lens = camera.distortion
-    camera = replace(
-        camera,
-        pose=camera.pose.to(device, dtype),
-        distortion=None if lens is None else lens.to(device, dtype),
-    )
-    if section.background is not None and not isinstance(section.background, Path):
-        background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
-    noise = section.noise
 
     def color(value: Color, default: float) -> Tensor | None:
         """[1] or [3], None where it is the default."""
         tensor = torch.tensor(value, dtype=dtype, device=device).view(-1)
         return None if value == default else tensor
 
+    background = pictures.get("background")
+    if background is None and isinstance(section.background, float | tuple):
+        background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
+    lens, noise = camera.distortion, section.noise
     return View(
         section.name,
-        camera,
-        image,
-        mask,
+        replace(
+            camera,
+            pose=camera.pose.to(device, dtype),
+            distortion=None if lens is None else lens.to(device, dtype),
+        ),
+        pictures.get("image"),
+        pictures["mask"][0] if "mask" in pictures else None,
         section.split == "test",
         section.weight,
         color(section.exposure, 1.0),
@@ -132,11 +110,6 @@ def _build_view(
     )
 
 
-def _pixels(image: Image, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The pixels of `image`, [3, h, w]."""
-    return torch.from_numpy(image.pixels).permute(2, 0, 1).contiguous().to(device, dtype)
-
-
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:
     """(height, width): what the scene says, else the image's; None if that could not be read."""
     if camera.resolution is not None:
@@ -144,36 +117,31 @@ def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None
     return None if image is None else (image.shape[1], image.shape[2])
 
 
-def _by(size: Sequence[int]) -> str:
-    return f"{size[1]} x {size[0]}"
-
-
 def _build_camera(
     scene_file: SceneFile, key: str, section: CameraSection, size: tuple[int, int]
 ) -> Camera:
     """The camera in float64 on the CPU."""
-    try:
-        pose = _pose(section)
-    except ValueError as error:
-        raise scene_file.refused(key, str(error)) from error
-    if isinstance(section, PerspectiveSection):
-        return Camera(
-            pose,
-            size,
-            math.tan(math.radians(section.fov) / 2),
-            True,
-            section.principal_point,
-            section.pixel_aspect,
-            *_lens(section.distortion),
-        )
-    return Camera(pose, size, section.width / 2, False, pixel_aspect=section.pixel_aspect)
-
-
-def _lens(section: LensSection | None) -> tuple[str | None, Tensor | None]:
-    """The model of a lens and its coefficients, float64."""
-    if section is None:
-        return None, None
-    return section.type, torch.tensor(astuple(section), dtype=torch.float64)
+    if section.matrix is not None:
+        pose = torch.tensor(section.matrix, dtype=torch.float64)[:3]
+    else:
+        vectors = section.origin, section.target, section.up
+        try:
+            pose = look_at(*(torch.tensor(vector, dtype=torch.float64) for vector in vectors))
+        except ValueError as error:
+            raise scene_file.refused(key, str(error)) from error
+    if not isinstance(section, PerspectiveSection):
+        return Camera(pose, size, section.width / 2, False, pixel_aspect=section.pixel_aspect)
+    lens = section.distortion
+    return Camera(
+        pose,
+        size,
+        math.tan(math.radians(section.fov) / 2),
+        True,
+        section.principal_point,
+        section.pixel_aspect,
+        None if lens is None else lens.type,
+        None if lens is None else torch.tensor(astuple(lens), dtype=torch.float64),
+    )
 
 
 def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
@@ -191,17 +159,6 @@ def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
             f"folds over within the image: no one direction is seen at pixel ({int(columns[x])},"
             f" {int(rows[y])}); check its coefficients and the focal length, or crop the picture",
         )
-
-
-def _pose(section: CameraSection) -> Tensor:
-    if section.matrix is not None:
-        return torch.tensor(section.matrix, dtype=torch.float64)[:3]
-    return look_at(
-        *(
-            torch.tensor(vector, dtype=torch.float64)
-            for vector in (section.origin, section.target, section.up)
-        )
-    )
 
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
@@ -232,39 +189,26 @@ CONVENTIONS: dict[str, Callable[[Tensor], Tensor]] = {
 """What poses may be instead of camera to world with OpenGL axes, and what makes these of them."""
 
 
-def explain_blindness(cameras: Sequence[Camera], grid: Grid, seeing: Sequence[Camera] = ()) -> str:
-    """Why, most likely, none of `cameras` sees the box of `grid`.
+def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: Grid) -> str:
+    """Why, most likely, none of the `blind` ones of a scene's `cameras` sees the box of `grid`.
 
-    `seeing` are those of the scene that do, which they may by chance.
+    Others may see it by chance.
     """
-    middle = grid.center_xyz
-    if all(_looks_at(camera, grid) for camera in cameras):
+    if all(_looks_at(camera, grid) for camera in blind):
         return (
             "it is in the picture, but smaller than a pixel: are volume.bounds and the cameras in"
             " the same unit?"
         )
-    for group in ([*cameras, *seeing], cameras):
-        for what, convert in CONVENTIONS.items() if len(group) > 1 else ():
-            if all(_looks_at(replace(one, pose=convert(one.pose)), grid) for one in group):
-                return f"it would with matrices read otherwise; they seem to be {what}"
-    if len(cameras) > 1 and (place := _meeting_place(cameras)) is not None:
-        return (
-            f"the cameras look at about ({', '.join(f'{x:.3g}' for x in place.tolist())}), but the"
-            f" middle of volume.bounds is ({', '.join(f'{x:.3g}' for x in middle)}): are both in"
-            " the same units and axes?"
-        )
-    (low, high), pose = grid.bounds_xyz, cameras[0].pose.double()
-    center = pose.new_tensor(middle)
-    if torch.dot(center - pose[:, 3], -pose[:, 2]) < 0:
-        return (
-            "the volume lies behind the camera, which looks along its -z axis with +y up, as in"
-            " OpenGL: where poses are in OpenCV's axes, negate the second and third column of each"
-            " matrix"
-        )
-    away = torch.dist(center, pose[:, 3]) / torch.dist(pose.new_tensor(low), pose.new_tensor(high))
+    for what, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
+        turned = [replace(camera, pose=convert(camera.pose)) for camera in cameras]
+        if all(_looks_at(camera, grid) for camera in turned):
+            return f"it would with matrices read otherwise; they seem to be {what}"
+    pose = blind[0].pose.double()
+    is_behind = torch.dot(pose.new_tensor(grid.center_xyz) - pose[:, 3], -pose[:, 2]) < 0
     return (
-        f"the camera looks past it, from {away:.3g} diagonals of the box away: check volume.bounds"
-        " (are they in the units of the cameras?), its target, and its field of view or width"
+        f"the camera looks {'away from' if is_behind else 'past'} it: check its target, field of"
+        " view or width, and that volume.bounds has the units and axes of the cameras, whose"
+        " matrices are camera to world with x right, y up and z backward (OpenGL's axes)"
     )
 
 
@@ -279,14 +223,3 @@ def _looks_at(camera: Camera, grid: Grid) -> bool:
     (column, row), _ = (values[0] for values in project(camera, center))
     height, width = camera.size
     return bool((column >= 0) & (column <= width) & (row >= 0) & (row <= height))
-
-
-def _meeting_place(cameras: Sequence[Camera]) -> Tensor | None:
-    """The point (x, y, z) nearest to the axes of `cameras`; None where they are parallel."""
-    poses = torch.stack([camera.pose.double() for camera in cameras])
-    axes, origins = poses[:, :, 2:3], poses[:, :, 3:]
-    across = torch.eye(3, dtype=poses.dtype) - axes @ axes.mT
-    total = across.sum(0)
-    if torch.linalg.eigvalsh(total)[0] < 1e-3 * len(cameras):
-        return None
-    return torch.linalg.solve(total, (across @ origins).sum(0))[:, 0]

@@ -14,32 +14,27 @@ import torch
 from torch import Tensor
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.grid import Grid, Triple
+from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mie import scatter_droplets
-from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
-from ddrecon.memory import make_room, needs_of
 from ddrecon.numerics.angle_table import at_even_angles
-from ddrecon.scene_file.choices import choose_rounds
 from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import (
-    Color,
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
     TableSection,
     TwoLobeSection,
-    VolumeSection,
 )
-from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import FIELDS, PHASE, kind_of, split_name
+from ddrecon.settings import FieldFile
+from ddrecon.variables.kinds import FIELDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
 FAR_OFF = 0.01
@@ -48,76 +43,46 @@ BY_ANGLE = "g", "phase.weight"
 """Quantities that belong to the phase function."""
 
 
-def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Volume:
-    """The volume of the scene in `dtype` on `device`.
+def build_media(
+    scene_file: SceneFile, dtype: torch.dtype, device: torch.device
+) -> dict[str, Volume]:
+    """The media of the scene in `dtype` on `device`, by name, "" where there is one.
 
-    Raises SceneError with all its problems, or FormatError.
+    A density that is the same everywhere takes no memory yet. Raises SceneError with all their
+    problems, or FormatError.
     """
-    media, problems = list[_Medium](), Problems()
+    media, problems = dict[str, _Medium](), Problems()
     for name, section in scene_file.tree.media.items():
+        key = f"volume.media.{name}" if name else "volume"
         with problems.collecting():
-            media.append(_read_medium(scene_file, name, section))
+            media[name] = _Medium(key, section, _read_fields(scene_file, key, section))
     problems.raise_any()
-    grid = _agree_on_grid(scene_file, {key: field for each in media for key, field in each.by_key})
-    phases = [_build_phase(scene_file, each, dtype, device) for each in media]
-    first, *others = phases
-    blend = Blend(first, others[0], torch.tensor(0.5, dtype=dtype)) if others else first
-    tree = scene_file.tree
-    optimized = tree.optimize.parameters if tree.optimize else {}
-    colors = max(each.colors for each in media)
-    sizes = [view.camera.resolution for view in tree.views if view.camera.resolution is not None]
-    needs = needs_of(
-        grid,
-        blend,
-        colors,
-        torch.empty(0, dtype=dtype, device=device),
-        choose_rounds(tree, blend),
-        # Views that are as large as their images count as nothing: those are not read yet.
-        pixels=sum(width * height for width, height in sizes),
-        lights=len(tree.lights),
-        optimized=optimized,
-        varied=sum(_varied(name, one, media, colors) for name, one in optimized.items()),
+    grid = _agree_on_grid(
+        scene_file, dict(at for each in media.values() for at in each.fields.values())
     )
-    if too_much := make_room(needs, device):
-        raise scene_file.refused("volume.resolution", too_much)
-    volumes = {
-        each.name: each.build(grid, phase, dtype, device)
-        for each, phase in zip(media, phases, strict=True)
+    return {
+        name: each.build(grid, _build_phase(scene_file, each, dtype, device), dtype, device)
+        for name, each in media.items()
     }
-    return volumes[""] if "" in volumes else mix_media(volumes)
 
 
 @dataclass(frozen=True)
 class _Medium:
-    """What the scene says at `key` of the medium `name`, "" where it is the only one.
+    """What the scene says at `key` of a medium.
 
     `fields` are those of its files by variable, and where the scene names them.
     """
 
-    name: str
     key: str
-    section: VolumeSection | MediumSection
+    section: MediumSection
     fields: Mapping[str, tuple[str, Field]]
-
-    @property
-    def by_key(self) -> list[tuple[str, Field]]:
-        """Its fields, by where the scene names their files."""
-        return list(self.fields.values())
-
-    @property
-    def colors(self) -> int:
-        """3 where one of its quantities differs by color, else 1."""
-        given = [value for _, value in _quantities(self.section).values()]
-        of_files = [field.values.ndim == 4 for _, field in self.by_key]
-        return 3 if any(of_files) or any(isinstance(value, tuple) for value in given) else 1
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
         if name in self.fields:
             values = torch.from_numpy(self.fields[name][1].values).double()
             return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
-        value: Color = getattr(self.section, name)
-        return torch.tensor([value] if isinstance(value, float) else value, dtype=torch.float64)
+        return torch.tensor(getattr(self.section, name), dtype=torch.float64).view(-1)
 
     def build(
         self, grid: Grid, phase: PhaseFunction, dtype: torch.dtype, device: torch.device
@@ -132,74 +97,48 @@ class _Medium:
             sigma.expand(colors, *sigma.shape[1:]).contiguous().to(device, dtype)
             for sigma in sigmas
         )
-        density = self.values("density")
-        density = (
-            density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
-        )
-        return Volume(grid, density.to(device, dtype), sigma_a, sigma_s, phase)
+        density = self.values("density").to(device, dtype)[0].expand(grid.shape)
+        return Volume(grid, density, sigma_a, sigma_s, phase)
 
 
-def _varied(name: str, settings: ParameterSettings, media: list[_Medium], colors: int) -> int:
-    """How many numbers a cell the parameter `name` has."""
-    medium, last = split_name(name)
-    kind = kind_of(name)
-    if last == "density":
-        return 1
-    is_field = settings.field
-    if is_field is None:
-        of_file = any(each.name == medium[6:-1] and last in each.fields for each in media)
-        is_field = of_file or isinstance(settings.init, FieldFile)
-    return (colors if kind.is_color else 1) if kind.is_cellwise and is_field else 0
-
-
-def _read_medium(
-    scene_file: SceneFile, name: str, section: VolumeSection | MediumSection
-) -> _Medium:
-    place = f"volume.media.{name}" if name else "volume"
-    problems, fields = Problems(), {}
-    for variable, (key, value) in _quantities(section).items():
+def _read_fields(
+    scene_file: SceneFile, key: str, section: MediumSection
+) -> dict[str, tuple[str, Field]]:
+    """The quantities at `key` that files give cell by cell, by variable; and where it says so."""
+    given = {name: (name, getattr(section, name)) for name in FIELDS if hasattr(section, name)}
+    if isinstance(section.phase, HenyeyGreensteinSection):
+        given["g"] = "phase.g", section.phase.g
+    elif isinstance(section.phase, TwoLobeSection):
+        given["phase.weight"] = "phase.weight", section.phase.weight
+    problems, found = Problems(), {}
+    for variable, (name, value) in given.items():
         if isinstance(value, FieldFile):
             called = value.name or variable.removeprefix(PHASE)
             read = partial(_read_quantity, name=variable, called=called)
             with problems.collecting():
-                at = f"{place}.{key}.file"
-                fields[variable] = at, read_referenced(scene_file, at, value.file, read)
+                at = f"{key}.{name}.file"
+                found[variable] = at, read_referenced(scene_file, at, value.file, read)
     problems.raise_any()
-    return _Medium(name, place, section, fields)
-
-
-def _quantities(section: VolumeSection | MediumSection) -> dict[str, tuple[str, Any]]:
-    """The key and the value of each quantity that a file may give cell by cell, by variable."""
-    found = {name: (name, getattr(section, name)) for name in FIELDS if hasattr(section, name)}
-    if isinstance(section.phase, HenyeyGreensteinSection):
-        found["g"] = "phase.g", section.phase.g
-    elif isinstance(section.phase, TwoLobeSection):
-        found["phase.weight"] = "phase.weight", section.phase.weight
     return found
 
 
 def _read_quantity(path: Path, name: str, called: str) -> Field:
     """The quantity `name`, which the file has as `called`."""
-    field = read_field(path, called)
-    kind = kind_of(name)
+    field, kind = read_field(path, called), kind_of(name)
     if not kind.is_color and field.values.ndim != 3:
         raise FormatError(
             path,
             f"{called} has shape {list(field.values.shape)}; expected [z, y, x]:"
             " colors belong to the cross sections",
         )
-    for bound, is_beyond, side in (
-        (kind.low, field.values < np.float32(kind.low), "below"),
-        (kind.high, field.values > np.float32(kind.high), "above"),
-    ):
-        if is_beyond.any():
-            z, y, x = np.argwhere(is_beyond)[0, :3]
-            worst = field.values.min() if side == "below" else field.values.max()
-            raise FormatError(
-                path,
-                f"{called} is {side} {bound:g} at cell (x, y, z) = ({x}, {y}, {z}) "
-                f"(the {'lowest' if side == 'below' else 'highest'} is {worst:g})",
-            )
+    low, high = np.float32(kind.low), np.float32(kind.high)
+    beyond = (field.values < low) | (field.values > high)
+    if beyond.any():
+        place = tuple(np.argwhere(beyond)[0])
+        side = f"below {low:g}" if field.values[place] < low else f"above {high:g}"
+        z, y, x = place[:3]
+        what = f"{called} is {side} at cell (x, y, z) = ({x}, {y}, {z}): {field.values[place]:g}"
+        raise FormatError(path, what)
     return field
 
 
@@ -209,59 +148,35 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
     Raises SceneError with all that do not agree, or where nothing says what the grid is.
     """
     section, problems = scene_file.tree.volume, Problems()
-    sizes: dict[str, tuple[int, int, int]] = {key: f.resolution for key, f in fields.items()}
-    boxes = {key: _corners(f.bounds) for key, f in fields.items() if f.bounds is not None}
-    if section.resolution is not None:
-        sizes = {"volume.resolution": section.resolution} | sizes
+    box = None
     if section.bounds is not None:
-        boxes = {"volume.bounds": (section.bounds.min, section.bounds.max)} | boxes
-    for key, size in sizes.items():
-        first = next(iter(sizes))
-        if size != sizes[first]:
-            problems.note(
-                scene_file.refused(
-                    key, f"has {_by(size)} cells in x, y, z, but {first} has {_by(sizes[first])}"
-                )
-            )
-    for key, box in boxes.items():
-        first = next(iter(boxes))
-        if not _same_box(box, boxes[first]):
-            problems.note(
-                scene_file.refused(
-                    key, f"its bounds are {_box(box)}, but {first} says {_box(boxes[first])}"
-                )
-            )
-    for name, known in (("resolution", sizes), ("bounds", boxes)):
+        box = np.array([section.bounds.min, section.bounds.max])
+    sizes = {"volume.resolution": section.resolution} | {k: f.resolution for k, f in fields.items()}
+    boxes = {"volume.bounds": box} | {key: field.bounds for key, field in fields.items()}
+    for what, given in (("resolution", sizes), ("bounds", boxes)):
+        known = {key: np.array(value) for key, value in given.items() if value is not None}
         if not known:
-            problems.note(
-                scene_file.refused(
-                    "volume", f"missing key {name!r}, which no field file gives either"
-                )
-            )
+            missing = f"missing key {what!r}, which no field file gives either"
+            problems.note(scene_file.refused("volume", missing))
+            continue
+        first, right = next(iter(known.items()))
+        # Files may hold bounds in single precision.
+        tolerance = 1e-5 * np.ptp(right, axis=0) if what == "bounds" else 0
+        for key, value in known.items():
+            if (np.abs(value - right) > tolerance).any():
+                words = f"has the {what} {_show(value)}, but {first} has {_show(right)}"
+                problems.note(scene_file.refused(key, words))
     problems.raise_any()
-    return Grid.from_xyz(next(iter(sizes.values())), *next(iter(boxes.values())))
+    size = next(size for size in sizes.values() if size is not None)
+    low, high = next(box for box in boxes.values() if box is not None).tolist()
+    return Grid.from_xyz(size, tuple(low), tuple(high))
 
 
-def _corners(bounds: np.ndarray) -> tuple[Triple, Triple]:
-    (lx, ly, lz), (ux, uy, uz) = bounds.tolist()
-    return (lx, ly, lz), (ux, uy, uz)
-
-
-def _same_box(one: tuple[Triple, Triple], other: tuple[Triple, Triple]) -> bool:
-    """Whether the corners agree to a hundred-thousandth of the box's sides.
-
-    Files may hold them in single precision.
-    """
-    tolerance = 1e-5 * (np.array(other[1]) - np.array(other[0]))
-    return bool((np.abs(np.array(one) - np.array(other)) <= tolerance).all())
-
-
-def _by(size: tuple[int, int, int]) -> str:
-    return " x ".join(map(str, size))
-
-
-def _box(box: tuple[Triple, Triple]) -> str:
-    return " to ".join(f"({', '.join(f'{side:g}' for side in corner)})" for corner in box)
+def _show(value: np.ndarray) -> str:
+    """A resolution or a box in words."""
+    if value.ndim == 1:
+        return " x ".join(map(str, value))
+    return " to ".join(f"({', '.join(f'{side:g}' for side in corner)})" for corner in value)
 
 
 def _build_phase(
@@ -299,24 +214,14 @@ def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:
     means = Tabulated(values).mean
     if bool(((means - 1).abs() > FAR_OFF).any()):
         found = ", ".join(f"{mean:.4g}" for mean in means.tolist())
-        warnings.warn(
-            f"{section.file}: its mean over the sphere is {found}; it is divided by that",
-            DataWarning,
-            4,
-        )
+        what = f"its mean over the sphere is {found}; it is divided by that"
+        warnings.warn(f"{section.file}: {what}", DataWarning, 4)
     return values
 
 
 def _droplets(section: MieSection) -> Tensor:
     """Values at even angles of each color, [C, steps + 1]."""
-    pairs = zip(*_same_length(section.wavelength, section.refractive_index), strict=True)
+    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
     sizes = section.effective_radius, section.effective_variance
-    return torch.from_numpy(np.stack([scatter_droplets(*pair, *sizes) for pair in pairs]))
-
-
-def _same_length(one: Color, other: Color) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Both as so many colors as the more colorful has."""
-    wide = [each if isinstance(each, tuple) else (each,) for each in (one, other)]
-    count = max(map(len, wide))
-    first, second = (each if len(each) == count else each * count for each in wide)
-    return first, second
+    values = [scatter_droplets(float(length), float(n), *sizes) for length, n in colors]
+    return torch.from_numpy(np.stack(values))

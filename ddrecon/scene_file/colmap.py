@@ -10,44 +10,35 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import (
-    FisheyeSection,
-    LensSection,
-    Matrix,
-    OpencvSection,
-    PerspectiveSection,
-    ViewSection,
-)
+from ddrecon.scene_file.schema import ViewSection
+from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera
 
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 """The camera models that are read, in the order of their numbers in binary files, with their
 parameters in order.
 """
-MOST_VIEWS, LARGEST_SIDE = 10**5, 16384
+MOST_VIEWS = 10**5
 
 
-@dataclass(frozen=True)
-class Posed:
+class Posed(NamedTuple):
     """An image of a model: its `name`, its camera's number, and the rotation and shift to it."""
 
     name: str
     camera: int
-    rotation: tuple[float, ...]
-    shift: tuple[float, ...]
+    pose: Sequence[float]
 
 
 def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
@@ -61,9 +52,9 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
         raise node.refused(
             f"{folder} has no COLMAP model; expected cameras.txt and images.txt, or .bin"
         )
-    with guard_reading(folder / f"cameras.{suffix}"):
-        cameras = dict(READERS[suffix][0](folder / f"cameras.{suffix}"))
-    path = folder / f"images.{suffix}"
+    path, of_cameras = folder / f"images.{suffix}", folder / f"cameras.{suffix}"
+    with guard_reading(of_cameras):
+        cameras = dict(READERS[suffix][0](of_cameras))
     with guard_reading(path):
         posed = sorted(READERS[suffix][1](path), key=lambda image: image.name)
     if not posed:
@@ -77,72 +68,45 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
             raise FormatError(
                 path, f"image {image.name!r} leaves the folder of pictures; rename it"
             )
-        camera = replace(cameras[image.camera], matrix=_matrix(path, image))
+        frame = cameras[image.camera] | {"transform_matrix": _matrix(path, image)}
+        with in_file(of_cameras):
+            said = node_of(f"camera {image.camera}", str(of_cameras), frame)
+            camera = read_camera(said, said.entries(), folder)
         views.append(ViewSection(camera=camera, image=images / picture))
     return views
 
 
-def _matrix(path: Path, image: Posed) -> Matrix:
+def _matrix(path: Path, image: Posed) -> list[list[float]]:
     """Camera to world with OpenGL axes."""
     import numpy as np
 
-    quaternion, shift = np.array(image.rotation), np.array(image.shift)
+    quaternion, shift = np.array(image.pose[:4]), np.array(image.pose[4:])
     norm = math.sqrt(float(quaternion @ quaternion))
     if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):
         raise FormatError(path, f"image {image.name!r}: its pose is not finite, or no rotation")
     w, x, y, z = quaternion / norm
-    to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    to_world = np.eye(3) - 2 * w * cross + 2 * cross @ cross
     pose = np.eye(4)
-    pose[:3, :3] = to_camera.T * (1, -1, -1)
-    pose[:3, 3] = -to_camera.T @ shift
-    a, b, c, d = (tuple(float(entry) for entry in row) for row in pose)
-    return a, b, c, d  # type: ignore[return-value]
+    pose[:3, :3] = to_world * (1, -1, -1)
+    pose[:3, 3] = -to_world @ shift
+    return pose.tolist()
 
 
 def _camera(
     path: Path, number: int, model: str, size: tuple[int, int], parameters: Sequence[float]
-) -> PerspectiveSection:
-    """Camera `number`, whose pose is still to come."""
-    where = f"camera {number}"
+) -> dict[str, Any]:
+    """Camera `number` in the words of transforms.json."""
+    names = MODELS.get(model, ())
     if model not in MODELS:
-        raise FormatError(
-            path,
-            f"{where}: lens model {model} is not known; undistort the pictures"
-            " (COLMAP: image_undistorter) and give the model that this makes",
-        )
-    names, (width, height) = MODELS[model], size
+        raise FormatError(path, f"camera {number}: lens model {model} is not known; {REMEDY}")
     if len(parameters) != len(names):
-        raise FormatError(path, f"{where}: {model} has {len(names)} parameters, {', '.join(names)}")
-    if not all(1 <= side <= LARGEST_SIDE for side in size):
-        raise FormatError(path, f"{where}: {width} x {height} is no size of an image")
+        what = f"{model} has {len(names)} parameters, {', '.join(names)}"
+        raise FormatError(path, f"camera {number}: {what}")
     given = dict(zip(names, parameters, strict=True))
-    focal_x = given.get("fx", given.get("f", 0.0))
-    focal_y = given.get("fy", focal_x)
-    if not (all(map(math.isfinite, parameters)) and focal_x > 0 and focal_y > 0):
-        raise FormatError(path, f"{where}: its focal lengths must be above 0, all finite")
-    return PerspectiveSection(
-        matrix=None,
-        resolution=size,
-        fov=2 * math.degrees(math.atan(width / 2 / focal_x)),
-        principal_point=(given["cx"] / width, given["cy"] / height),
-        pixel_aspect=focal_x / focal_y,
-        distortion=_lens(model, given),
-    )
-
-
-def _lens(model: str, given: dict[str, float]) -> LensSection | None:
-    terms: dict[str, Any] = {
-        name: value for name, value in given.items() if name[0] in "kp" and value != 0
-    }
-    if model == "OPENCV_FISHEYE":
-        return FisheyeSection(**terms)
-    return OpencvSection(**terms) if terms else None
+    focal = given.pop("f", 0.0)
+    lens = {"camera_model": model, "w": size[0], "h": size[1], "fl_x": focal, "fl_y": focal}
+    return lens | given
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -153,7 +117,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, line.strip()
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, PerspectiveSection]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     for number, line in _lines(path):
         if not line:
             continue
@@ -182,11 +146,11 @@ def _text_images(path: Path) -> Iterator[Posed]:
                 path,
                 f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
             ) from error
-        yield Posed(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+        yield Posed(name, camera, pose)
         next(lines, None)
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, PerspectiveSection]]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     with path.open("rb") as stream:
         for _ in range(_count(path, stream)):
             number, model, width, height = _unpack(path, stream, "<iiQQ")
@@ -204,7 +168,7 @@ def _binary_images(path: Path) -> Iterator[Posed]:
                 name += letter
             (points,) = _unpack(path, stream, "<Q")
             stream.seek(24 * points, 1)
-            yield Posed(name.decode(), camera, tuple(pose[:4]), tuple(pose[4:]))
+            yield Posed(name.decode(), camera, pose)
 
 
 def _count(path: Path, stream: BinaryIO) -> int:

@@ -6,10 +6,11 @@ Most come of lengths in different units: bounds in millimeters, cameras in meter
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import extinction_of, with_values
 
@@ -30,32 +31,35 @@ def find_doubts(scene: Scene) -> list[str]:
 
     Where the density starts as nothing, optical depths are those of a density of 1.
     """
-    return [*_doubt_depth(scene), *_doubt_faces(scene), *_doubt_cameras(scene)]
+    volume = with_values(scene, scene.starts).volume
+    extinction = extinction_of(volume).amax(0)
+    return [
+        *_doubt_depth(volume, extinction),
+        *_doubt_faces(volume, extinction, scene.diffusion.angles),
+        *_doubt_cameras(scene),
+    ]
 
 
-def _doubt_depth(scene: Scene) -> list[str]:
-    scene = with_values(scene, scene.starts)
-    grid, density = scene.volume.grid, scene.volume.density
-    where = "through the densest part"
+def _doubt_depth(volume: Volume, extinction: Tensor) -> list[str]:
+    density, where = volume.density, "through the densest part"
     if not bool(density.any()):
         density, where = torch.ones_like(density), "at a density of 1"
-    extinction = extinction_of(scene.volume).amax(0) * density
     # The thickest line of cells along each axis.
-    depths = [float(extinction.sum(axis).max()) * size for axis, size in enumerate(grid.spacing)]
+    lines = [float((extinction * density).sum(axis).max()) for axis in range(3)]
+    depths = [line * size for line, size in zip(lines, volume.grid.spacing, strict=True)]
     if min(depths) > THICKEST or max(depths) < THINNEST:
         return [f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"]
     return []
 
 
-def _doubt_faces(scene: Scene) -> list[str]:
+def _doubt_faces(volume: Volume, extinction: Tensor, angles: int) -> list[str]:
     """Whether a medium that scatters is thick in cells at the faces of the box.
 
     What counts is the depth without the forward peak, and more of it where light is absorbed.
     """
-    volume = with_values(scene, scene.starts).volume
     if not bool((volume.sigma_s > 0).any()):
         return []
-    medium = scale_medium(volume, scene.diffusion.angles)
+    medium = scale_medium(volume, angles)
     lost = medium.extinction.value
     lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
     thickest, whole = (
@@ -64,7 +68,7 @@ def _doubt_faces(scene: Scene) -> list[str]:
             for axis, size in enumerate(volume.grid.spacing)
             for end in (0, -1)
         )
-        for field in (lost, extinction_of(volume).amax(0) * volume.density)
+        for field in (lost, extinction * volume.density)
     )
     if thickest <= THICK_FACES:
         return []
@@ -80,33 +84,27 @@ def _doubt_faces(scene: Scene) -> list[str]:
 
 def _doubt_cameras(scene: Scene) -> list[str]:
     grid, lines = scene.volume.grid, []
-    inside = [view.name for view in scene.views if _is_inside(view.camera, grid)]
-    if inside:
-        lines.append(f"views: within the box, not outside of it: {_names(inside)}; {UNITS}")
-    small = [view.name for view in scene.views if _pixels_across(view.camera, grid) < SMALLEST]
-    if small:
-        lines.append(f"views: the box is smaller than a pixel or two to {_names(small)}; {UNITS}")
+    for what, is_doubted in (
+        ("within the box, not outside of it:", _is_inside),
+        ("the box is smaller than a pixel or two to", _is_far),
+    ):
+        if names := [view.name for view in scene.views if is_doubted(view.camera, grid)]:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            lines.append(f"views: {what} camera {names[0]}{more}; {UNITS}")
     return lines
 
 
-def _names(views: list[str]) -> str:
-    """The cameras of `views` in words."""
-    return f"camera {views[0]}" if len(views) == 1 else f"{len(views)} cameras ({views[0]}, ...)"
-
-
 def _is_inside(camera: Camera, grid: Grid) -> bool:
-    low, high = grid.bounds_xyz
-    place = camera.pose[:, 3].tolist()
-    return camera.is_perspective and all(
-        a < x < b for a, x, b in zip(low, place, high, strict=True)
-    )
+    low, high = (camera.pose.new_tensor(corner) for corner in grid.bounds_xyz)
+    place = camera.pose[:, 3]
+    return camera.is_perspective and bool(((low < place) & (place < high)).all())
 
 
-def _pixels_across(camera: Camera, grid: Grid) -> float:
-    """How many pixels of `camera` the diagonal of the box would take, seen from the side."""
+def _is_far(camera: Camera, grid: Grid) -> bool:
+    """Whether the diagonal of the box, seen from the side, takes hardly any pixels of `camera`."""
     low, high = (camera.pose.new_tensor(corner).double() for corner in grid.bounds_xyz)
     distance = 1.0
     if camera.is_perspective:
         distance = float(torch.dist((low + high) / 2, camera.pose[:, 3].double()))
     width = 2 * float(camera.half_width) * distance
-    return float(torch.dist(low, high)) / max(width, 1e-30) * camera.size[1]
+    return float(torch.dist(low, high)) * camera.size[1] < SMALLEST * width

@@ -19,8 +19,7 @@ from ddrecon.scene_file.nodes import resolve
 
 def describe(scene_file: SceneFile) -> dict[str, Any]:
     """The resolved scene in plain mappings, lists, numbers and text."""
-    described: dict[str, Any] = _plain(scene_file.tree)
-    return described
+    return dict(_plain(scene_file.tree))
 
 
 def dump_scene(scene_file: SceneFile, path: Path) -> None:
@@ -42,34 +41,16 @@ def write_described(described: dict[str, Any], path: Path) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def find_expert_keys(value: Any, key: str = "") -> dict[str, Any]:
-    """The keys for experts that are not at their default in `value`, a tree or a part at `key`."""
-    found, inner = {}, dict[str, Any]()
-    if isinstance(value, Mapping):
-        inner = dict(value)
-    elif isinstance(value, tuple):
-        inner = {str(index): entry for index, entry in enumerate(value)}
-    elif is_dataclass(value):
-        inner = {field.name: getattr(value, field.name) for field in fields(value)}
-        found = {
-            f"{key}.{field.name}": inner[field.name]
-            for field in fields(value)
-            if field.metadata.get("expert") and inner[field.name] != field.default
-        }
-    for name, entry in inner.items():
-        found |= find_expert_keys(entry, f"{key}.{name}".strip("."))
-    return found
-
-
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         tag = {"type": value.type} if hasattr(value, "type") else {}
-        kept = {
-            field.name: getattr(value, field.name)
-            for field in fields(value)
-            if field.name not in _left_out(value)
+        left_out = _left_out(value)
+        given = {field.name: getattr(value, field.name) for field in fields(value)}
+        return tag | {
+            name: _plain(entry)
+            for name, entry in given.items()
+            if entry is not None and name not in left_out
         }
-        return tag | {name: _plain(entry) for name, entry in kept.items() if entry is not None}
     if isinstance(value, Mapping):
         return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, tuple):

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.io.files.reading import require_stored
-from ddrecon.scene_file.nodes import Node, parse
-from ddrecon.scene_file.overrides import override
-from ddrecon.scene_file.parameters import require_parameters
-from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse
+from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
 from ddrecon.scene_file.view_sources import name_listed, views_of
-from ddrecon.settings import ParameterSettings
+from ddrecon.settings import ParameterSettings, Violation
+from ddrecon.variables.kinds import (
+    CROSS_SECTIONS,
+    EXTINCTION_AND_ALBEDO,
+    KINDS,
+    kind_of,
+    pattern_of,
+    split_name,
+)
 
 T = TypeVar("T")
-FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
-    (Mapping, ParameterSettings): require_parameters,
-    (tuple, ViewSection): name_listed,
-    ViewSource: views_of,
-}
-"""What is made of all records of a list or mapping, or of one that stands for others."""
-
+PARAMETERS = "optimize.parameters"
+"""Where keys are the names of variables, dots and all."""
 MAX_BYTES = 2**20
 """A scene file is no larger; thousands of views fit."""
 
@@ -59,23 +61,18 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
 
     Raises SceneError with one line per problem.
     """
-    path = Path(path)
-    problems = Problems()
-    try:
+    path, problems = Path(path), Problems()
+    root = tree = None
+    with problems.collecting():
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
-    except SceneError as error:
-        raise SceneError([*problems.lines, *error.problems]) from None
-    if root.value is None:
-        raise root.refused("is empty")
-    for text in overrides:
-        with problems.collecting():
-            override(root, text, problems)
-    try:
-        rule = Rule(SceneTree, path.absolute().parent, {}, FINISH)
-        tree = read_record(root, SceneTree, rule).named_once()
-    except SceneError as error:
-        raise SceneError([*problems.lines, *error.problems]) from None
+        if root.value is None:
+            raise root.refused("is empty")
+        for text in overrides:
+            with problems.collecting():
+                override(root, text, problems)
+        tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     problems.raise_any()
+    assert root is not None and tree is not None
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 
@@ -98,6 +95,106 @@ def _text(path: Path) -> str:
         raise SceneError(f"{path}:{line}:{column}: is not UTF-8 text") from error
 
 
+def override(root: Node, text: str, problems: Problems) -> None:
+    """Puts the value of `text` (`key.path=value`, in YAML) into the tree under `root`.
+
+    Mappings are made as needed; a list is entered by index. Where keys themselves have dots, as
+    those of parameters do, the longest one present or legal is taken. Raises SceneError.
+    """
+    where = f"-D {text}"
+    path, separator, value = text.partition("=")
+    if not separator or not all(path.split(".")):
+        raise SceneError(f"{where}: expected key.path=value")
+    if path.count(".") > MAX_DEPTH:
+        raise SceneError(f"{where}: nested more than {MAX_DEPTH} deep")
+    parent = root
+    while path:
+        name, path = _step(parent, path, where)
+        key = parent.child_key(name)
+        child = Node(key, where, where, {} if path else None)
+        if not path and value.strip():
+            child = parse(value, lambda line, column: where, problems, key)
+        if isinstance(parent.value, list):
+            at = int(name)
+            parent.value[at] = child if not path else parent.value[at]
+            parent = parent.value[at]
+        elif isinstance(parent.value, dict):
+            parent.value[name] = child if not path else parent.value.get(name, child)
+            parent = parent.value[name]
+
+
+def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
+    """The part of `path` that leads to a child of `parent`, and what is left of it."""
+    parts, what = path.split("."), ""
+    if isinstance(parent.value, dict):
+        for count in range(len(parts), 0, -1):
+            name = ".".join(parts[:count])
+            if name in parent.value or (parent.key == PARAMETERS and pattern_of(name) in KINDS):
+                return name, ".".join(parts[count:])
+    elif not isinstance(parent.value, list):
+        what = f"{parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
+    elif not re.fullmatch("[0-9]{1,9}", parts[0]) or int(parts[0]) >= len(parent.value):
+        what = f"no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
+    if what:
+        raise SceneError(f"{where}: {parent.child_key(parts[0])}: {what}")
+    return parts[0], ".".join(parts[1:])
+
+
+def require_parameters(
+    node: Node, parameters: dict[str, ParameterSettings], folder: Path
+) -> dict[str, ParameterSettings]:
+    """`parameters` of `node`, by names of variables, of one pair of cross sections at most.
+
+    Raises SceneError with all that is wrong with them.
+    """
+    problems, entries = Problems(), node.entries()
+    if not parameters:
+        raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
+    for name, settings in parameters.items():
+        own = entries[name]
+        for key, what in _violations(name, settings, parameters):
+            problems.note(own.entries()[key].refused(what) if key else own.key_refused(what))
+    problems.raise_any()
+    return parameters
+
+
+def _violations(
+    name: str, settings: ParameterSettings, parameters: Collection[str]
+) -> Iterator[Violation]:
+    """What is wrong with the parameter `name`, beside others, and at which of its keys."""
+    if pattern_of(name) not in KINDS:
+        yield "", f"unknown parameter{suggestion(pattern_of(name), KINDS)}"
+        return
+    kind, (medium, last) = kind_of(name), split_name(name)
+    if settings.support is not None and name != "density":
+        yield "support", f"{settings.support!r} is for density alone"
+    for key in ("min", "max", "init"):
+        value = getattr(settings, key)
+        numbers = [
+            one
+            for one in (value if isinstance(value, tuple) else [value])
+            if isinstance(one, float)
+        ]
+        if beyond := [one for one in numbers if not kind.low <= one <= kind.high]:
+            limits = f"at least {kind.low:g} and at most {kind.high:g}"
+            yield key, f"must be {limits}, found {beyond[0]:g}"
+    for key in ("field", "tv"):
+        if getattr(settings, key) and not kind.is_cellwise:
+            yield key, "it is not a field, so it has none"
+    others = [medium + other for other in CROSS_SECTIONS if medium + other in parameters]
+    if last in EXTINCTION_AND_ALBEDO and others:
+        pairs = "take sigma_a and sigma_s, or sigma_t and albedo"
+        yield "", f"cannot be optimized beside {others[0]}: {pairs}"
+
+
+FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
+    (Mapping, ParameterSettings): require_parameters,
+    (tuple, ViewSection): name_listed,
+    ViewSource: views_of,
+}
+"""What is made of all records of a list or mapping, or of one that stands for others."""
+
+
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:
     """The content of the file `path` named at `key`, as `read` returns it.
 
@@ -112,24 +209,36 @@ def require(scene_file: SceneFile, key: str, path: Path) -> None:
     try:
         is_file, exists = path.is_file(), path.exists()
     except OSError as error:
-        raise scene_file.refused(
-            key, f"{path} cannot be reached: {error.strerror or error}"
-        ) from error
+        what = f"{path} cannot be reached: {error.strerror or error}"
+        raise scene_file.refused(key, what) from error
     if not is_file:
         raise scene_file.refused(key, f"{path} {'is not a file' if exists else 'does not exist'}")
 
 
 def referenced_files(scene_file: SceneFile) -> list[Path]:
     """Every file that the scene names, each once, in the order of the scene."""
-    return list(dict.fromkeys(_paths(scene_file.tree)))
+    return list(dict.fromkeys(one for _, one in walk(scene_file.tree) if isinstance(one, Path)))
 
 
-def _paths(value: Any) -> Iterator[Path]:
-    if isinstance(value, Path):
-        yield value
+def find_expert_keys(tree: SceneTree) -> dict[str, Any]:
+    """The keys for experts that are not at their default in `tree`."""
+    return {
+        f"{key}.{field.name}": value
+        for key, record in walk(tree)
+        for field in (fields(record) if is_dataclass(record) else ())
+        if field.metadata.get("expert") and (value := getattr(record, field.name)) != field.default
+    }
+
+
+def walk(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """`value`, a tree or what is at `key` of it, and all below, each with its key."""
+    yield key, value
+    inner: Iterable[tuple[object, Any]] = ()
+    if isinstance(value, Mapping):
+        inner = value.items()
+    elif isinstance(value, tuple):
+        inner = enumerate(value)
     elif is_dataclass(value):
-        for field in fields(value):
-            yield from _paths(getattr(value, field.name))
-    elif isinstance(value, Mapping | tuple):
-        for entry in value.values() if isinstance(value, Mapping) else value:
-            yield from _paths(entry)
+        inner = [(field.name, getattr(value, field.name)) for field in fields(value)]
+    for name, entry in inner:
+        yield from walk(entry, f"{key}.{name}".strip("."))

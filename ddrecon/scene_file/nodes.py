@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import yaml
 
@@ -24,12 +23,8 @@ MAX_DEPTH = 32
 MAX_COPIES = 10_000
 """So many values may come of aliases: a few of these could stand for billions."""
 MERGE = "<<"
-FAST = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
-SHORT = 2**17
-"""What the parser in C refuses the other one looks at, if it has no more characters: its messages
-are better, and it takes all of JSON.
-"""
 
 Locate = Callable[[int, int], str]
 """Tells where a 1-based line and column are: `file:line:column`, or the override they belong to."""
@@ -46,9 +41,7 @@ class Node:
 
     def refused(self, what: str) -> SceneError:
         """The error that says `what` is wrong with this value."""
-        return SceneError(
-            f"{self.where}: {self.key}: {what}" if self.key else f"{self.where}: {what}"
-        )
+        return SceneError(": ".join(filter(None, (self.where, self.key, what))))
 
     def key_refused(self, what: str) -> SceneError:
         """The error that says `what` is wrong with the key of this value."""
@@ -87,12 +80,7 @@ def describe_found(node: Node) -> str:
         return "nothing"
     if isinstance(node.value, bool):
         return str(node.value).lower()
-    return show_value(node.value)
-
-
-def show_value(value: Scalar) -> str:
-    """`value` in one short line."""
-    text = repr(value)
+    text = repr(node.value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
@@ -104,34 +92,18 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
-        return _parse(text, locate, problems, key)
+        return _Composer(text, locate, problems).document(key)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
-        raise SceneError(
-            f"{where}: not YAML: {', '.join(filter(None, (error.context, error.problem)))}"
-        ) from error
-    except UnicodeEncodeError as error:
-        raise SceneError(f"{locate(1, 1)}: is not UTF-8 text") from error
+        what = ", ".join(filter(None, (error.context, error.problem)))
+    except UnicodeEncodeError:
+        where, what = locate(1, 1), "its text is not UTF-8"
     except yaml.reader.ReaderError as error:
-        before = text[: error.position]
+        before = text.encode(errors="replace")[: error.position].decode(errors="ignore")
         where = locate(before.count("\n") + 1, len(before) - before.rfind("\n"))
-        raise SceneError(
-            f"{where}: not YAML: the character {error.character!r} is not allowed"
-        ) from error
-
-
-def _parse(text: str, locate: Locate, problems: Problems, key: str) -> Node:
-    """The tree as the parser in C sees it, or the other one where that refuses a short text."""
-    repeated = Problems()
-    try:
-        root = _Composer(text, locate, repeated, FAST).document(key)
-    except (yaml.YAMLError, UnicodeEncodeError):
-        if len(text) > SHORT:
-            raise
-        return _Composer(text, locate, problems, yaml.BaseLoader).document(key)
-    problems.lines.extend(repeated.lines)
-    return root
+        what = f"the character {error.character!r} is not allowed"
+    raise SceneError(f"{where}: not YAML: {what}")
 
 
 class _Composer:
@@ -140,8 +112,8 @@ class _Composer:
     `anchors` are the nodes that aliases may stand for, by name; `copies` counts what they became.
     """
 
-    def __init__(self, text: str, locate: Locate, problems: Problems, loader: Any):
-        self.events = yaml.parse(text, Loader=loader)
+    def __init__(self, text: str, locate: Locate, problems: Problems):
+        self.events = yaml.parse(text, Loader=LOADER)
         self.locate, self.problems = locate, problems
         self.anchors: dict[str, Node] = {}
         self.copies = 0
@@ -152,11 +124,8 @@ class _Composer:
             raise SceneError(f"{self.locate(1, 1)}: is empty")
         root = self.node(next(self.events), key, None, 0)
         next(self.events)
-        after = next(self.events)
-        if not isinstance(after, yaml.StreamEndEvent):
-            raise SceneError(
-                f"{self.where(after)}: a second document begins here; only one is allowed"
-            )
+        if not isinstance(after := next(self.events), yaml.StreamEndEvent):
+            raise SceneError(f"{self.where(after)}: a second document begins; only one is allowed")
         return root
 
     def node(self, event: yaml.Event, key: str, key_where: str | None, depth: int) -> Node:
@@ -165,47 +134,44 @@ class _Composer:
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 raise node.refused(f"*{event.anchor} stands for nothing: no &{event.anchor} before")
-            return self.copy(self.anchors[event.anchor], node, node, depth)
-        if tag := getattr(event, "tag", None):
+            return self.copy(self.anchors[event.anchor], node, depth)
+        tag, anchor = getattr(event, "tag", None), getattr(event, "anchor", None)
+        if tag:
             raise node.refused(f"tags such as {tag!r} are not supported")
         if depth > MAX_DEPTH:
             raise node.refused(f"nested more than {MAX_DEPTH} deep")
         if isinstance(event, yaml.ScalarEvent):
-            node.value = resolve(event.value) if not event.style else _join(event.value)
+            node.value = event.value if event.style else resolve(event.value)
         elif isinstance(event, yaml.SequenceStartEvent):
-            node.value = list(self.items(node, depth))
+            node.value = entries = list[Node]()
+            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
+                entries.append(self.node(event, node.child_key(len(entries)), None, depth + 1))
         else:
             node.value = self.mapping(node, depth)
-        if anchor := getattr(event, "anchor", None):
+        if anchor:
             self.anchors[anchor] = node
         return node
 
-    def copy(self, source: Node, place: Node, alias: Node, depth: int) -> Node:
-        """`source` with all that is below it, for the `place` that an `alias` leads to."""
+    def copy(self, source: Node, node: Node, depth: int) -> Node:
+        """`node`, an alias of `source` or below one, with copies of all that is below `source`."""
         self.copies += 1
-        if self.copies > MAX_COPIES:
-            raise alias.refused(
-                f"aliases stand for more than {MAX_COPIES:,} values; write the value out"
+        if self.copies > MAX_COPIES or depth > MAX_DEPTH:
+            raise node.refused(
+                f"aliases stand for more than {MAX_COPIES:,} values, or are nested more than"
+                f" {MAX_DEPTH} deep; write the value out"
             )
-        if depth > MAX_DEPTH:
-            raise alias.refused(f"nested more than {MAX_DEPTH} deep")
 
         def below(name: object, child: Node) -> Node:
-            inner = Node(place.child_key(name), child.where, child.key_where, None)
-            return self.copy(child, inner, alias, depth + 1)
+            place = Node(node.child_key(name), child.where, child.key_where, None)
+            return self.copy(child, place, depth + 1)
 
-        value = source.value
-        if isinstance(value, dict):
-            value = {name: below(name, child) for name, child in value.items()}
-        elif isinstance(value, list):
-            value = [below(index, child) for index, child in enumerate(value)]
-        return Node(place.key, place.where, place.key_where, value)
-
-    def items(self, parent: Node, depth: int) -> Iterator[Node]:
-        index = 0
-        while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
-            yield self.node(event, parent.child_key(index), None, depth + 1)
-            index += 1
+        if isinstance(source.value, dict):
+            node.value = {name: below(name, child) for name, child in source.value.items()}
+        elif isinstance(source.value, list):
+            node.value = [below(index, child) for index, child in enumerate(source.value)]
+        else:
+            node.value = source.value
+        return node
 
     def mapping(self, parent: Node, depth: int) -> dict[str, Node]:
         entries, merged = dict[str, Node](), dict[str, Node]()
@@ -215,7 +181,11 @@ class _Composer:
                     f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text"
                 )
             if event.value == MERGE and not event.style:
-                merged = self.merged(parent, self.where(event), depth) | merged
+                child = self.node(next(self.events), parent.key, self.where(event), depth)
+                if not isinstance(child.value, dict):
+                    what = f"takes the entries of one mapping, found {describe_found(child)}"
+                    raise child.key_refused(f"{MERGE} {what}")
+                merged = child.value | merged
                 continue
             name = event.value if event.value.isprintable() else repr(event.value)
             child = self.node(
@@ -229,23 +199,9 @@ class _Composer:
                 entries[name] = child
         return merged | entries
 
-    def merged(self, parent: Node, where: str, depth: int) -> dict[str, Node]:
-        """The entries of the mapping that follows a merge key in `parent`."""
-        child = self.node(next(self.events), parent.key, where, depth)
-        if not isinstance(child.value, dict):
-            raise child.key_refused(
-                f"{MERGE} takes the entries of one mapping, found {describe_found(child)}"
-            )
-        return child.value
-
     def where(self, event: yaml.Event) -> str:
         mark = event.start_mark
         return self.locate(mark.line + 1, mark.column + 1) if mark else self.locate(1, 1)
-
-
-def _join(text: str) -> str:
-    r"""`text` with the surrogate pairs that JSON writes as \ud83d\ude00 made one character each."""
-    return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 _WORDS: dict[str, Scalar] = {
@@ -253,26 +209,20 @@ _WORDS: dict[str, Scalar] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
     **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
-    **{
-        sign + word: float(sign + "inf")
-        for sign in ("", "+", "-")
-        for word in (".inf", ".Inf", ".INF")
-    },
+    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), math.inf),
+    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), -math.inf),
 }
-_INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
-_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,30}")
-_OCTAL = re.compile(r"0o[0-7]{1,30}")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_NUMBERS: Mapping[str, Callable[[str], Scalar]] = {
+    r"[-+]?[0-9]{1,30}": int,
+    r"0x[0-9a-fA-F]{1,30}": lambda text: int(text, 16),
+    r"0o[0-7]{1,30}": lambda text: int(text, 8),
+    r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?": float,
+}
 
 
 def resolve(text: str) -> Scalar:
     """The value of the unquoted scalar `text`."""
     if text in _WORDS:
         return _WORDS[text]
-    if _INTEGER.fullmatch(text):
-        return int(text)
-    if _HEXADECIMAL.fullmatch(text):
-        return int(text, 16)
-    if _OCTAL.fullmatch(text):
-        return int(text, 8)
-    return float(text) if _FLOAT.fullmatch(text) else text
+    read = next((read for form, read in _NUMBERS.items() if re.fullmatch(form, text)), str)
+    return read(text)

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from ddrecon.errors import FormatError, SceneError
 
-PLACED = re.compile(r".*?: (?P<key>\S+[.][0-9]+\S*): (?P<what>.*)")
-"""A problem of an entry of a list, after the file and the place where it is."""
-ALIKE = 4
-"""So many lines that differ but in their places are told as one."""
-MOST = 100
-"""Problems that are told in one go."""
+MOST = 30
+"""Problems that are named in one go."""
 LONGEST = 60
 """Names of more characters are not compared with those that are known."""
 
@@ -28,7 +23,7 @@ class Problems:
 
     @property
     def are_many(self) -> bool:
-        """Whether there are more than are told: no need to look for others."""
+        """Whether there are more than are named: no need to look for others."""
         return len(self.lines) > MOST
 
     def note(self, error: SceneError | FormatError) -> None:
@@ -52,7 +47,7 @@ class Problems:
         It is a FormatError where only files are to blame, else a SceneError.
         """
         files = dict.fromkeys(line for error in self.unusable for line in error.lines)
-        lines = [*_group(dict.fromkeys(self.lines)), *files]
+        lines = [*dict.fromkeys(self.lines), *files]
         if len(lines) > MOST:
             lines[MOST:] = ["and more: mend these first"]
         if self.lines:
@@ -60,23 +55,6 @@ class Problems:
         if self.unusable:
             first = self.unusable[0]
             raise FormatError(first.path, first.reason, lines[1:])
-
-
-def _group(lines: Iterable[str]) -> list[str]:
-    """`lines` with those that say the same of several entries of a list made one.
-
-    It is the first of them, which tells how many follow it.
-    """
-    groups: dict[str, list[str]] = {}
-    for line in lines:
-        match = PLACED.match(line)
-        kind = re.sub("[.][0-9]+", ".N", match["key"]) + match["what"] if match else line
-        groups.setdefault(kind, []).append(line)
-    return [
-        line
-        for same in groups.values()
-        for line in (same if len(same) < ALIKE else [f"{same[0]} ({len(same) - 1} more like this)"])
-    ]
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

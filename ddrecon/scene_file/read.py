@@ -39,9 +39,7 @@ WORDS = {
     str: "text",
     Path: "a file",
 }
-WORDS[Path] = "a file"
 PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numbers": "rows of 4"}
-TRIPLE = (float, float, float)
 
 
 class Rule(NamedTuple):
@@ -80,7 +78,7 @@ def _describe(kind: Any, kinds: Sequence[Any]) -> str:
     if get_origin(kind) is Literal:
         return " or ".join(arguments)
     if get_origin(kind) is tuple:
-        if float in kinds and arguments == TRIPLE:
+        if float in kinds and arguments == (float, float, float):
             return "[r, g, b]"
         if arguments[-1] is Ellipsis and arguments[0] is not float:
             return "a list with at least one entry"
@@ -123,13 +121,12 @@ def read_value(node: Node, rule: Rule) -> Any:
 
 
 def _refused(node: Node, rule: Rule) -> Exception:
-    if str in alternatives(rule.hint) and node.value is not None:
+    kinds = alternatives(rule.hint)
+    if str in kinds and node.value is not None:
         _check_choice(node, rule.limits.get("choices", ()), rule)
-    is_text = {str, Path} & set(alternatives(rule.hint)) and isinstance(node.value, int | float)
-    quoting = " (put it in quotes)" if is_text else ""
-    return node.refused(
-        f"expected {describe_type(rule.hint)}, found {describe_found(node)}{quoting}"
-    )
+    is_number = {str, Path} & set(kinds) and isinstance(node.value, int | float)
+    found = describe_found(node) + (" (put it in quotes)" if is_number else "")
+    return node.refused(f"expected {describe_type(rule.hint)}, found {found}")
 
 
 def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
@@ -224,12 +221,11 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
     Raises SceneError with everything wrong in it.
     """
     entries, hints = node.entries(), type_hints(kind)
-    all_fields = fields(kind)  # type: ignore[arg-type]
-    declared: dict[str, Field[Any]] = {field.name: field for field in all_fields}
+    declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
     retired = getattr(kind, "RETIRED", {})
     problems, values = Problems(), {}
-    for what in _absences(kind, declared, entries):
+    for what in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
@@ -238,9 +234,7 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
                     retired.get(name) or f"unknown key{suggestion(name, known)}"
                 )
             if name in declared:
-                limits: Mapping[str, Any] = declared[name].metadata
-                if retired:
-                    limits = {**limits, "retired": retired}
+                limits = {**declared[name].metadata, "retired": retired}
                 hint = reduce(or_, limits.get("also", ()), hints[name])
                 values[name] = read_value(child, rule._replace(hint=hint, limits=limits))
         if problems.are_many:
@@ -254,31 +248,26 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
 
 
 def _absences(
-    kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
+    declared: Mapping[str, Field[Any]],
+    groups: Sequence[tuple[str, ...]],
+    entries: Mapping[str, Node],
 ) -> list[str]:
-    """What is wrong with the set of keys given: required ones and one group of alternatives."""
-    groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
-    given = [
-        group
-        for group in groups
-        if any(name in entries and entries[name].value is not None for name in group)
-    ]
-    required = {
+    """What is wrong with the set of keys given: required ones and one of the alternative `groups`.
+
+    Of a group, what has no default is required with it.
+    """
+    given = {name for name, entry in entries.items() if entry.value is not None}
+    needed = [[name for name in group if declared[name].default is None] for group in groups]
+    chosen = [names for group, names in zip(groups, needed, strict=True) if given & set(group)]
+    absent = [
         name
         for name, field in declared.items()
-        if field.default is MISSING and field.default_factory is MISSING
-    }
-    # of a group, what has no default is required with it
-    needed = [[name for name in group if declared[name].default is None] for group in groups]
-    wrong = [f"missing key {name!r}" for name in declared if name in required - set(entries)]
-    if len(given) == 1:
-        names = needed[groups.index(given[0])]
-        wrong += [
-            f"missing key {name!r}"
-            for name in names
-            if name not in entries or entries[name].value is None
-        ]
-    elif groups:
+        if field.default is field.default_factory is MISSING and name not in entries
+    ]
+    if len(chosen) == 1:
+        absent += [name for name in chosen[0] if name not in given]
+    wrong = [f"missing key {name!r}" for name in absent]
+    if groups and len(chosen) != 1:
         words = " or ".join(" and ".join(names) for names in needed)
-        wrong.append(f"{'give only one of' if given else 'missing'} {words}")
+        wrong.append(f"{'give only one of' if chosen else 'missing'} {words}")
     return wrong

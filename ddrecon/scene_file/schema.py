@@ -47,10 +47,6 @@ TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
 """Names that output files of other views have: their components, and previews by iteration."""
 
 
-BOTH = "g is the short form of a phase function: give only one of g or phase"
-"""What is wrong where both are given."""
-
-
 @dataclass(frozen=True)
 class HenyeyGreensteinSection:
     """`g`: mean cosine of the scattering angle."""
@@ -122,31 +118,6 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class VolumeSection:
-    """`bounds` and `resolution` may be left out where a field's file has them."""
-
-    ALTERNATIVES: ClassVar = PAIRS
-    RETIRED: ClassVar = GONE
-
-    density: Density = limited(minimum=0)
-    bounds: Bounds | None = None
-    resolution: Count | None = optional(minimum=1, maximum=4096)
-    sigma_a: Quantity | None = optional(minimum=0)
-    sigma_s: Quantity | None = optional(minimum=0)
-    sigma_t: Quantity | None = optional(minimum=0)
-    albedo: Quantity | None = optional(minimum=0, maximum=1)
-    g: Density = bounded(0.0, above=-1, below=1)
-    phase: PhaseSection | None = None
-
-    def violations(self) -> Iterator[Violation]:
-        if self.phase is not None and self.g != 0:
-            yield "phase", BOTH
-        x, y, z = self.resolution or (1, 1, 1)
-        if x * y * z > MAX_CELLS:
-            yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
-
-
-@dataclass(frozen=True)
 class MediumSection:
     """One of the two media of a mixture; its phase function is the same in all cells."""
 
@@ -163,9 +134,25 @@ class MediumSection:
 
     def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
-            yield "phase", BOTH
-        if isinstance(getattr(self.phase, "g", None), FieldFile):
+            yield "phase", "g is short for a phase function: give only one of g or phase"
+        if type(self) is MediumSection and isinstance(getattr(self.phase, "g", None), FieldFile):
             yield "phase", "the g of a medium is the same in all cells where there are two"
+
+
+@dataclass(frozen=True)
+class VolumeSection(MediumSection):
+    """`bounds` and `resolution` may be left out where a field's file has them."""
+
+    g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
+    phase: PhaseSection | None = None  # type: ignore[assignment]
+    bounds: Bounds | None = None
+    resolution: Count | None = optional(minimum=1, maximum=4096)
+
+    def violations(self) -> Iterator[Violation]:
+        yield from super().violations()
+        x, y, z = self.resolution or (1, 1, 1)
+        if x * y * z > MAX_CELLS:
+            yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
 
 
 @dataclass(frozen=True)
@@ -182,9 +169,6 @@ class MixtureSection:
         for name in self.media:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
-
-
-AnyVolume = VolumeSection | MixtureSection
 
 
 @dataclass(frozen=True)
@@ -266,17 +250,15 @@ class PoseSection:
 def _rigidity(matrix: Matrix) -> Iterator[Violation]:
     """Why `matrix` is no rotation and shift, where it is not."""
     *rows, last = matrix
-    *axes, _ = zip(*rows, strict=True)
-    products = [sum(map(mul, axes[i], axes[j])) - (i == j) for i in range(3) for j in range(i, 3)]
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = axes
+    x, y, z, _ = zip(*rows, strict=True)
+    lengths = [sum(map(mul, one, other)) for one, other in ((x, x), (y, y), (z, z))]
+    across = [sum(map(mul, one, other)) for one, other in ((x, y), (y, z), (z, x))]
+    volume = sum(x[i] * (y[i - 2] * z[i - 1] - y[i - 1] * z[i - 2]) for i in range(3))
     if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:
         yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif not all(abs(product) <= 1e-4 for product in products):
-        yield (
-            "matrix",
-            "must be rigid, but its first three columns are not of unit length and perpendicular",
-        )
-    elif ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0:
+    elif not all(abs(error) <= 1e-4 for error in (*across, *(one - 1 for one in lengths))):
+        yield "matrix", "must be rigid: its first three columns of unit length and perpendicular"
+    elif volume < 0:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
@@ -427,7 +409,7 @@ class SceneTree:
     A ring of views is already the views it stands for, and paths are absolute.
     """
 
-    volume: AnyVolume
+    volume: VolumeSection | MixtureSection
     lights: tuple[LightSection, ...]
     views: tuple[ViewSection, ...] = field(metadata={"also": (ViewSource,)})
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -439,21 +421,10 @@ class SceneTree:
         """The sections of media by name, "" where there is one medium."""
         return {"": self.volume} if isinstance(self.volume, VolumeSection) else self.volume.media
 
-    def own_name(self, name: str) -> str:
-        """`name`, or `g` for `phase.g` where both are that of Henyey and Greenstein."""
-        medium, last = split_name(name)
-        section = self.media.get(medium.removeprefix("media.").strip("."))
-        has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
-        return f"{medium}g" if last == "phase.g" and has_one else name
-
-    def named_once(self) -> SceneTree:
-        """The same with each parameter by its own name."""
-        if self.optimize is None:
-            return self
-        named = {self.own_name(name): what for name, what in self.optimize.parameters.items()}
-        return replace(self, optimize=replace(self.optimize, parameters=named))
-
     def violations(self) -> Iterator[Violation]:
-        parameters = self.optimize.parameters if self.optimize else {}
-        if len(set(map(self.own_name, parameters))) < len(parameters):
-            yield "optimize", "g and phase.g are the same number: name it once"
+        for name in self.optimize.parameters if self.optimize else ():
+            medium, last = split_name(name)
+            section = self.media.get(medium.removeprefix("media.").strip("."))
+            has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
+            if last == "phase.g" and has_one:
+                yield "optimize", f"parameters.{name} is called {medium}g here"

@@ -12,7 +12,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.read import read_as
@@ -64,28 +66,34 @@ def read_transforms(
     for path in paths:
         with problems.collecting():
             document = _document(node, path)
-            try:
+            with in_file(path):
                 views += _file_views(document, path, test_every)
-            except SceneError as error:
-                first, *others = error.problems
-                raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
     problems.raise_any()
     return tuple(views)
+
+
+@contextmanager
+def in_file(path: Path) -> Iterator[None]:
+    """What is wrong with nodes in the block is the fault of the file at `path`."""
+    try:
+        yield
+    except SceneError as error:
+        first, *others = error.problems
+        raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
 
 
 def _document(node: Node, path: Path) -> Node:
     if not path.is_file():
         raise node.refused(f"{path} does not exist, or is not a file")
-    try:
+    with guard_reading(path):
         if path.stat().st_size > MAX_BYTES:
             raise FormatError(
                 path, f"is larger than {MAX_BYTES // 2**20} MiB; it holds more than cameras"
             )
-        return _node("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise FormatError(path, f"not JSON: {error}") from error
+        try:
+            return node_of("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
+        except (ValueError, RecursionError) as error:
+            raise FormatError(path, f"not JSON: {error}") from error
 
 
 def _whole(digits: str) -> int | float:
@@ -93,13 +101,15 @@ def _whole(digits: str) -> int | float:
     return int(digits) if len(digits) < 300 else float(digits)
 
 
-def _node(key: str, where: str, value: Any) -> Node:
+def node_of(key: str, where: str, value: Any) -> Node:
     """`value`, as JSON has it, as a node at `key` and all those below it."""
     node = Node(key, where, where, value)
     if isinstance(value, dict):
-        node.value = {name: _node(node.child_key(name), where, one) for name, one in value.items()}
+        node.value = {
+            name: node_of(node.child_key(name), where, one) for name, one in value.items()
+        }
     elif isinstance(value, list):
-        node.value = [_node(node.child_key(index), where, one) for index, one in enumerate(value)]
+        node.value = [node_of(node.child_key(index), where, one) for index, one in enumerate(value)]
     return node
 
 
@@ -113,17 +123,15 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
         raise frames.refused("expected a list with at least one frame")
     splits = _listed_splits(root, frames.value)
     problems, views = Problems(), []
-    for frame, split in zip(frames.value, splits or frames.value, strict=True):
+    for frame, split in zip(frames.value, splits or [""] * len(frames.value), strict=True):
         if split is not None:
             with problems.collecting():
-                views.append(_frame_view(frame, root.value, folder))
+                view = _frame_view(frame, root.value, folder)
+                views.append(replace(view, split=split) if split else view)
     problems.raise_any()
-    if splits:
-        kept = filter(None, splits)
-        return [replace(view, split=split) for view, split in zip(views, kept, strict=True)]
     if is_test := TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem):
         test_every = 1 if is_test.re is TEST_NAME else None
-    return split_views(views, test_every)
+    return views if splits else split_views(views, test_every)
 
 
 def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
@@ -131,61 +139,51 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
 
     It is None for one that they leave out, as nerfstudio does.
     """
-    entries = root.entries()
-    if not any(name in entries for name in LISTS):
+    lists = {name: root.entries()[name] for name in LISTS if name in root.entries()}
+    if not lists:
         return []
-    names = [_name(frame) for frame in frames]
-    train, test, val = (_listed(entries.get(name), names) for name in LISTS)
-    is_open = "train_filenames" not in entries
-    splits = [
-        "test" if name in test | val else "train" if is_open or name in {*train, None} else None
-        for name in names
+    named = [
+        frame.value.get("file_path") if isinstance(frame.value, dict) else None for frame in frames
     ]
+    names = [None if one is None else Path(str(one.value)) for one in named]
+    listed = {name: set[Path]() for name in LISTS}
+    for name, node in lists.items():
+        for entry in node.children():
+            path = Path(read_as(entry, str, Path()))
+            if path not in names:
+                raise entry.refused(f"no frame has the file_path {entry.value!r}")
+            listed[name].add(path)
+    train, *tests = listed.values()
+    splits = list[str | None]()
+    for own in names:
+        is_test = any(own in test for test in tests)
+        is_train = own is None or own in train or LISTS[0] not in lists
+        splits.append("test" if is_test else "train" if is_train else None)
     if not any(splits):
         raise root.refused("its lists of files name no frame")
     return splits
 
 
-def _name(frame: Node) -> Path | None:
-    """What lists call the `frame`, if anything."""
-    name = frame.value.get("file_path") if isinstance(frame.value, dict) else None
-    return Path(name.value) if name is not None and isinstance(name.value, str) else None
-
-
-def _listed(node: Node | None, names: Sequence[Path | None]) -> set[Path]:
-    """The frames that a list of the file names; raises SceneError for one that there is not."""
-    listed = set()
-    for entry in node.children() if node is not None else ():
-        name = Path(read_as(entry, str, Path()))
-        if name not in names:
-            raise entry.refused(f"no frame has the file_path {entry.value!r}")
-        listed.add(name)
-    return listed
-
-
 def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     """The view of a `frame` of a file in `folder`, whose `shared` entries hold for all frames."""
+    from ddrecon.io.images.table import READERS  # here, as it loads numpy
+
     own = frame.entries()
     image, mask = (
         read_as(own[name], Path, folder) if name in own else None
         for name in ("file_path", "mask_path")
     )
-    camera = _read_camera(frame, {**shared, **own}, folder)
+    camera = read_camera(frame, {**shared, **own}, folder)
     if image is None and camera.resolution is None:
         raise frame.refused(
             "has neither file_path nor w and h, so that its number of pixels is unknown"
         )
-    return ViewSection(camera=camera, image=image and _with_suffix(image), mask=mask)
+    if image is not None and image.suffix.lower() not in READERS:
+        image = image.with_name(f"{image.name}.png")
+    return ViewSection(camera=camera, image=image, mask=mask)
 
 
-def _with_suffix(image: Path) -> Path:
-    """The frame's `image`, a .png where its name has no suffix of an image."""
-    from ddrecon.io.images.table import READERS
-
-    return image if image.suffix.lower() in READERS else image.with_name(f"{image.name}.png")
-
-
-def _read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
+def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
     """The camera that `entries` describe, those of `frame` and of its file.
 
     Raises SceneError for what is wrong.
@@ -193,12 +191,20 @@ def _read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSect
     if "transform_matrix" not in entries:
         raise frame.refused("missing key 'transform_matrix'")
     matrix = read_as(entries["transform_matrix"], Matrix, folder)
-    lens = _intrinsics(frame, entries)
-    lens["distortion"] = _distortion(entries)
+    lens = _intrinsics(frame, entries) | {"distortion": _distortion(entries)}
     camera = PerspectiveSection(matrix=matrix, **lens)
     for _, what in camera.violations():
         raise entries["transform_matrix"].refused(what)
     return camera
+
+
+NUMBERS: Mapping[str, Mapping[str, float]] = {
+    **{f"camera_angle_{axis}": {"above": 0, "below": math.pi} for axis in "xy"},
+    **{f"fl_{axis}": {"above": 0} for axis in "xy"},
+    **{side: {"minimum": 1, "maximum": 16384} for side in "wh"},
+    **{f"c{axis}": {} for axis in "xy"},
+}
+"""What a camera says of its picture, and within which limits."""
 
 
 def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
@@ -206,31 +212,33 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
 
     That is `resolution`, `principal_point` and `pixel_aspect`.
     """
-
-    def number(name: str, **limits: float) -> float | None:
-        return read_as(entries[name], float, Path(), **limits) if name in entries else None
-
-    angle_x, angle_y = (number(f"camera_angle_{axis}", above=0, below=math.pi) for axis in "xy")
-    focal_x, focal_y = (number(f"fl_{axis}", above=0) for axis in "xy")
-    if focal_x is None and angle_x is None:
+    given = {
+        name: read_as(entries[name], float, Path(), **limits)
+        for name, limits in NUMBERS.items()
+        if name in entries
+    }
+    if not {"fl_x", "camera_angle_x"} & set(given):
         raise frame.refused("has neither fl_x nor camera_angle_x")
-    width, height = (number(name, minimum=1, maximum=16384) for name in ("w", "h"))
-    if width is None or height is None:
-        if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in entries]:
+    tangents = [math.tan(given.get(f"camera_angle_{axis}", 0) / 2) for axis in "xy"]
+    if not {"w", "h"} <= set(given):
+        if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in given]:
             raise entries[needing[0]].refused(
                 "is in pixels, but w and h do not say how many there are"
             )
-        return {"fov": math.degrees(angle_x or 0)}
-    for name, side in (("w", width), ("h", height)):
-        if not side.is_integer():
-            raise entries[name].refused(f"expected a whole number, found {side:g}")
-    focal_x = focal_x or width / 2 / math.tan((angle_x or 0) / 2)
-    focal_y = focal_y or (height / 2 / math.tan(angle_y / 2) if angle_y else focal_x)
-    x, y = number("cx"), number("cy")
+        return {"fov": math.degrees(given["camera_angle_x"])}
+    width, height = given["w"], given["h"]
+    for name in ("w", "h"):
+        if not given[name].is_integer():
+            raise entries[name].refused(f"expected a whole number, found {given[name]:g}")
+    focal_x = given.get("fl_x") or width / 2 / tangents[0]
+    focal_y = given.get("fl_y") or (height / 2 / tangents[1] if tangents[1] else focal_x)
     return {
         "fov": 2 * math.degrees(math.atan(width / 2 / focal_x)),
         "resolution": (int(width), int(height)),
-        "principal_point": (0.5 if x is None else x / width, 0.5 if y is None else y / height),
+        "principal_point": (
+            given.get("cx", width / 2) / width,
+            given.get("cy", height / 2) / height,
+        ),
         "pixel_aspect": focal_x / focal_y,
     }
 
@@ -267,21 +275,22 @@ def export_transforms(
     parallel projection.
     """
     require_free_files([path], may_exist=may_exist)
-    frames = []
+    frames, folder, splits = [], path.absolute().parent, {name: list[str]() for name in LISTS}
     for view, section in zip(scene.views, scene_file.tree.views, strict=True):
         files = {"file_path": section.image, "mask_path": section.mask}
-        frames.append(
-            {key: _relative(file, path) for key, file in files.items() if file is not None}
-            | _camera(view)
-        )
+        names = {
+            key: Path(os.path.relpath(file, folder)).as_posix()
+            for key, file in files.items()
+            if file is not None
+        }
+        frames.append(names | _camera(view))
+        for name in LISTS[1:] if view.is_test else LISTS[:1]:
+            splits[name] += [names["file_path"]] if "file_path" in names else []
     models = {frame.get("camera_model", "PINHOLE") for frame in frames}
     model = models.pop() if len(models) == 1 else "PINHOLE"
-    write_json(path, {"camera_model": model, **_splits(scene.views, frames), "frames": frames})
+    lists = splits if any(view.is_test for view in scene.views) else {}
+    write_json(path, {"camera_model": model, **lists, "frames": frames})
     return [path]
-
-
-def _relative(file: Path, path: Path) -> str:
-    return Path(os.path.relpath(file, path.absolute().parent)).as_posix()
 
 
 def _camera(view: View) -> dict[str, Any]:
@@ -304,16 +313,3 @@ def _camera(view: View) -> dict[str, Any]:
         coefficients = zip(LENSES[camera.lens], camera.distortion.tolist(), strict=True)
         intrinsics |= {"camera_model": NAMES[camera.lens]} | dict(coefficients)
     return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
-
-
-def _splits(views: list[View], frames: list[dict[str, Any]]) -> dict[str, list[str]]:
-    """Which images are trained on and which are not, where some are not, in nerfstudio's words."""
-    if not any(view.is_test for view in views):
-        return {}
-    named = [
-        (frame["file_path"], view.is_test)
-        for frame, view in zip(frames, views, strict=True)
-        if "file_path" in frame
-    ]
-    train, test = ([name for name, is_test in named if is_test == kind] for kind in (False, True))
-    return {"train_filenames": train, "val_filenames": test, "test_filenames": test}

@@ -25,28 +25,27 @@ from ddrecon.scene_file.transforms import read_transforms
 def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection, ...]:
     """The views that `source` stands for, which `node` of a scene in `folder` says."""
     entries = node.entries()
-    if source.ring is not None:
-        cameras = ring_cameras(source.ring)
-        images: list[Path] | list[None] = [None] * len(cameras)
-        if source.images is not None:
-            images = match_files(source.images, folder)
-            if len(images) != len(cameras):
-                raise entries["images"].refused(
-                    f"{source.images!r} matches {len(images)} files, but the ring has"
-                    f" {len(cameras)} cameras"
-                )
-        ring = [
-            ViewSection(name=f"ring_{index:02d}", camera=camera, image=image)
-            for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
-        ]
-        return tuple(split_views(ring, source.test_every))
+    every = source.test_every
+    if source.transforms is not None:
+        paths = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
+        return name_by_images(read_transforms(entries["transforms"], paths, every))
     if source.colmap is not None:
-        folder_of_images = (folder / (source.images or "")).absolute()
-        read = read_colmap(entries["colmap"], source.colmap, folder_of_images)
-        return name_by_images(split_views(read, source.test_every))
-    files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
-    paths = tuple(filter(None, files))
-    return name_by_images(read_transforms(entries["transforms"], paths, source.test_every))
+        pictures = (folder / (source.images or "")).absolute()
+        read = read_colmap(entries["colmap"], source.colmap, pictures)
+        return name_by_images(split_views(read, every))
+    assert source.ring is not None
+    cameras = ring_cameras(source.ring)
+    images: list[Path] | list[None] = [None] * len(cameras)
+    if source.images is not None:
+        images = match_files(source.images, folder)
+        if len(images) != len(cameras):
+            what = f"{source.images!r} matches {len(images)} files, but the ring has"
+            raise entries["images"].refused(f"{what} {len(cameras)} cameras")
+    views = [
+        ViewSection(name=f"ring_{index:02d}", camera=camera, image=image)
+        for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    return tuple(split_views(views, every))
 
 
 def name_listed(
@@ -85,22 +84,14 @@ def _in_names(text: str) -> str:
 
 def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
     """Camera i of n stands at target + (r sin(2 pi i/n), height, r cos(2 pi i/n))."""
-    x, y, z = ring.target
-    turns = [2 * math.pi * index / ring.count for index in range(ring.count)]
-    return [
-        PerspectiveSection(
-            origin=(
-                x + ring.radius * math.sin(turn),
-                y + ring.height,
-                z + ring.radius * math.cos(turn),
-            ),
-            target=ring.target,
-            up=ring.up,
-            fov=ring.fov,
-            resolution=ring.resolution,
-        )
-        for turn in turns
-    ]
+    (x, y, z), cameras = ring.target, []
+    for index in range(ring.count):
+        turn = 2 * math.pi * index / ring.count
+        right, forth = ring.radius * math.sin(turn), ring.radius * math.cos(turn)
+        origin = x + right, y + ring.height, z + forth
+        camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
+        cameras.append(replace(camera, origin=origin, target=ring.target, up=ring.up))
+    return cameras
 
 
 def match_files(pattern: str, folder: Path) -> list[Path]:

@@ -51,22 +51,6 @@ def test_a_broken_bound_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None
     assert json.loads(Path("report.json").read_text())["passed"] is False
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ([*BENCH, "-D", "volume.g=0"], "-D changes a scene file; name one"),
-        ([*BENCH, "scene.yaml"], "--hard has cases of its own"),
-        (["bench", "gone.yaml"], "gone.yaml"),
-        ([*BENCH, "--json", "gone/report.json"], "there is no folder"),
-        ([*BENCH, "-o", "scene.yaml"], "is a file"),
-    ],
-)
-def test_what_cannot_be_done_is_refused(
-    refuse: Callable[..., list[str]], arguments: list[str], told: str
-) -> None:
-    assert told in refuse(2, *arguments)[-1]
-
-
 def test_a_scene_is_measured_by_every_variant(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise MissingExtraError("no Mitsuba here")

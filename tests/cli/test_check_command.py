@@ -99,16 +99,6 @@ def test_keys_for_experts_are_told_where_they_are_not_at_their_default(succeed: 
     assert not json.loads(succeed("check", "scene.yaml", "--json").stdout)["expert_keys"]
 
 
-def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
-    def memory(*arguments: str) -> int:
-        return json.loads(succeed("check", "scene.yaml", "--json", *arguments).stdout)[
-            "memory_bytes"
-        ]
-
-    resolution = ["-D", "volume.resolution=[60, 50, 40]"]
-    assert 0 < memory() < memory(*resolution) < memory(*resolution, "--dtype", "float64")
-
-
 def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     scene = Path("scene.yaml")
     scene.write_text(

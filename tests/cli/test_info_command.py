@@ -30,18 +30,6 @@ def test_a_volume(succeed: Run, suffix: str) -> None:
     ]
 
 
-def test_a_volume_without_a_box(succeed: Run) -> None:
-    np.savez("two.npz", density=np.ones((2, 3, 4)), sigma_a=colored())
-    lines = succeed("info", "two.npz").stdout.splitlines()
-    assert lines[0] == "cells: 4 x 3 x 2 (x, y, z), no box: the scene's volume.bounds will be taken"
-    assert [line.split(":")[0] for line in lines[1:]] == ["density", "sigma_a"]
-
-
-def test_no_fields(succeed: Run) -> None:
-    np.savez("none.npz", bounds=BOUNDS)
-    assert succeed("info", "none.npz").stdout == "no fields\n"
-
-
 def test_json(succeed: Run) -> None:
     report = json.loads(succeed("info", "density.npz", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
@@ -68,11 +56,3 @@ def test_an_image(succeed: Run) -> None:
         succeed("info", "picture.npy").stdout
         == "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
     )
-
-
-def test_refusals(refuse: Refuse) -> None:
-    Path("notes.txt").write_text("hello")
-    Path("bad.npz").write_text("hello")
-    assert "unknown image format '.txt'" in refuse(3, "info", "notes.txt")[-1]
-    assert "not a complete .npz" in refuse(3, "info", "bad.npz")[-1]
-    assert "cannot be read" in refuse(3, "info", "nothing.vol")[-1]

@@ -28,10 +28,3 @@ def test_it_prints_what_it_would_write(run: Run, folder: Path, command: list[str
     assert Path("scene.yaml").read_text() == scene
     assert run(*command, "scene.yaml", "--json=other").exit_code == 0
     assert Path("other").read_bytes() == Path("report.json").read_bytes()
-
-
-def test_a_folder_that_is_not_there_is_said_first(
-    refuse: Callable[..., list[str]], folder: Path
-) -> None:
-    (line,) = refuse(2, "check", "gone.yaml", "--json", "gone/report.json")
-    assert "there is no folder" in line

@@ -13,8 +13,6 @@ from click.testing import Result
 Run = Callable[..., Result]
 SCENE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0", "--iterations", "4"]
 RANK = ["-q", "--tolerance", "0.9", "--noise", "0.05", "--next-view", "ring"]
-
-
 COUNT = 4
 """Pictures that are ranked here."""
 

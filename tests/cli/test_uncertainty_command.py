@@ -103,9 +103,3 @@ def test_a_run_says_it_at_its_end(
     short = ["-D", "optimize.iterations=1", *FAST]
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--uncertainty", *short)
     assert json.loads((folder / "run/uncertainty/uncertainty.json").read_text())["samples"] == 2
-
-
-def test_what_is_no_run_is_refused(refuse: Refuse) -> None:
-    (line,) = refuse(2, "uncertainty", "nowhere", "-o", "sure")
-    assert "nowhere: holds no run" in line
-    assert "-o names the run itself" in refuse(2, "uncertainty", "run", "-o", "./run")[-1]

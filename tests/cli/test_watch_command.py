@@ -77,20 +77,6 @@ def test_a_port_that_is_taken() -> None:
             listen(port)
 
 
-def test_a_run_that_is_watched(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says where, its page is served by another process, and that ends with the run."""
-    monkeypatch.setattr("ddrecon.cli.watch.LAST_LOOK", 0.0)
-    told = succeed("optimize", "scene.yaml", "-o", "out", "--iterations", "2", "--watch").stderr
-    (url,) = re.findall(r"(http://127.0.0.1:\d+/) shows the run", told)
-    with pytest.raises(OSError):
-        http.client.HTTPConnection(url.split("/")[2], timeout=5).request("GET", "/")
-
-
-def test_what_is_no_run_is_refused(refuse: Callable[..., list[str]]) -> None:
-    (line,) = refuse(2, "watch", ".")
-    assert line == ".: holds no run, as `ddrecon optimize -o` makes it"
-
-
 def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """As containers and `script` open them: 0 columns, 0 rows; another's are left to tqdm."""
     reader, writer = pty.openpty()

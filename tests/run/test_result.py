@@ -120,7 +120,7 @@ def test_a_result_renders_as_what_was_found(
 @pytest.mark.parametrize(
     ("phase", "parameters"),
     [
-        ("{type: henyey_greenstein, g: 0.3}", "phase.g: {}"),
+        ("{type: henyey_greenstein, g: 0.3}", "g: {}"),
         (
             "{type: two_lobe, g: [0.6, -0.2], weight: [0.7, 0.5, 0.3]}",
             "phase.g: {}, phase.weight: {}",

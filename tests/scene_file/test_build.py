@@ -15,7 +15,6 @@ from example_scene import SCENE, changed
 
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.io.volumes.table import write_field, write_fields
-from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.scene_file.build import load_scene
 
 Write = Callable[[str], Path]
@@ -38,11 +37,6 @@ def problems(path: Path, *overrides: str) -> list[str]:
     with pytest.raises(SceneError) as caught:
         load_scene(path, overrides=overrides)
     return [line.replace(f"{path.parent}/", "") for line in caught.value.problems]
-
-
-def problem(path: Path, *overrides: str) -> str:
-    (line,) = problems(path, *overrides)
-    return line
 
 
 def save_field(folder: Path, name: str, *shape: int, bounds: np.ndarray = BOUNDS) -> np.ndarray:
@@ -81,38 +75,13 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_from_thick_cells(
     assert (chosen.rounds, chosen.angles) == (expected[0], 5)
 
 
-def test_lights_keep_their_own_number_of_colors(write: Write):
-    sun, sky = load_scene(write(SCENE)).lights
-    assert (
-        isinstance(sun, DirectionalLight)
-        and sun.direction.tolist() == [-2, -2, -1]
-        and sun.irradiance.tolist() == pytest.approx([3.14159])
-    )
-    assert isinstance(sky, AmbientLight) and sky.radiance.tolist() == pytest.approx([0.2, 0.3, 0.5])
-
-
-def test_gray_scenes_have_one_color(write: Write):
-    scene = load_scene(write(volume(sigma_s=9)))
-    assert scene.volume.sigma_a.shape == scene.volume.sigma_s.shape == (1,)
-
-
 def test_every_tensor_has_the_type_asked_for(write: Write):
     scene = load_scene(write(SCENE), dtype=torch.float64)
-    tensors = [
-        scene.volume.density,
-        scene.volume.sigma_a,
-        scene.volume.sigma_s,
-        scene.volume.g,
-        scene.views[0].camera.pose,
-    ]
-    assert {
-        tensor.dtype
-        for tensor in [
-            *tensors,
-            *(value for light in scene.lights for value in vars(light).values()),
-        ]
-    } == {torch.float64}
-    assert scene.volume.sigma_a[0].item() == 0.6
+    volume, camera = scene.volume, scene.views[0].camera
+    tensors = [volume.density, volume.sigma_a, volume.sigma_s, volume.g, camera.pose]
+    tensors += [value for light in scene.lights for value in vars(light).values()]
+    assert {tensor.dtype for tensor in tensors} == {torch.float64}
+    assert volume.density.is_contiguous() and volume.sigma_a[0].item() == 0.6
 
 
 def test_extinction_and_albedo(write: Write):
@@ -166,71 +135,9 @@ def test_an_absent_file_is_the_scenes_mistake(write: Write):
     ]
 
 
-def test_an_overlong_path_is_the_scenes_mistake(write: Write):
-    assert "volume.density.file" in problem(write(volume(density={"file": "n" * 5000})))
-
-
-def test_an_unusable_file_is_a_format_error(write: Write, tmp_path: Path):
-    (tmp_path / "a.npz").write_bytes(b"junk")
-    with pytest.raises(FormatError) as caught:
-        load_scene(write(volume(density={"file": "a.npz"})))
-    assert caught.value.exit_code == 3
-    np.save(tmp_path / "a.npy", np.full((6, 8, 3), np.nan))
-    with pytest.raises(FormatError, match="NaN at row 0, column 0"):
-        load_scene(write(view(image="a.npy")))
-
-
-def test_density_has_no_color_and_albedo_is_at_most_one(write: Write, tmp_path: Path):
-    save_field(tmp_path, "density", 4, 3, 2, 3)
-    with pytest.raises(FormatError, match="colors belong"):
-        load_scene(write(volume(density={"file": "density.npz"})))
-    values = np.zeros((4, 3, 2))
-    values[1, 2, 0] = 1.5
-    write_field(tmp_path / "albedo.npz", "albedo", values, BOUNDS)
-    with pytest.raises(FormatError, match=r"above 1 at cell \(x, y, z\) = \(0, 2, 1\)"):
-        load_scene(write(volume(("sigma_a", "sigma_s"), sigma_t=1, albedo={"file": "albedo.npz"})))
-
-
-def test_resolutions_must_agree(write: Write, tmp_path: Path):
-    save_field(tmp_path, "density", 5, 4, 3)
-    save_field(tmp_path, "sigma_a", 5, 4, 2)
-    text = volume(density={"file": "density.npz"}, sigma_a={"file": "sigma_a.npz"})
-    lines = problems(write(text))
-    assert (
-        len(lines) == 2
-        and "volume.density.file: has 3 x 4 x 5 cells in x, y, z, but volume.resolution"
-        " has 2 x 3 x 4"
-        in lines[0]
-    )
-    assert "volume.sigma_a.file: has 2 x 4 x 5 cells" in lines[1]
-    text = volume(("resolution",), density={"file": "density.npz"}, sigma_a={"file": "sigma_a.npz"})
-    assert (
-        "volume.sigma_a.file: has 2 x 4 x 5 cells in x, y, z, but volume.density.file has 3 x 4 x 5"
-        in problem(write(text))
-    )
-
-
-def test_bounds_must_agree_to_single_precision(write: Write, tmp_path: Path):
+def test_bounds_agree_to_single_precision(write: Write, tmp_path: Path):
     save_field(tmp_path, "density", 4, 3, 2, bounds=BOUNDS * (1 + 1e-7))
-    text = volume(density={"file": "density.npz"})
-    load_scene(write(text))
-    save_field(tmp_path, "density", 4, 3, 2, bounds=2 * BOUNDS)
-    assert (
-        "volume.density.file: its bounds are (-1, -1.5, -1) to (1, 1.5, 1), but"
-        " volume.bounds says (-0.5," in problem(write(text))
-    )
-
-
-def test_resolution_and_bounds_must_come_from_somewhere(write: Write, tmp_path: Path):
-    lines = problems(write(volume(("resolution", "bounds"))))
-    assert [line.split("volume: ")[1] for line in lines] == [
-        "missing key 'resolution', which no field file gives either",
-        "missing key 'bounds', which no field file gives either",
-    ]
-    np.savez(tmp_path / "density.npz", density=np.ones((2, 2, 2)))
-    assert "'bounds'" in problem(
-        write(volume(("resolution", "bounds"), density={"file": "density.npz"}))
-    )
+    assert load_scene(write(volume(density={"file": "density.npz"}))).volume.density.shape[0] == 4
 
 
 def test_images_become_channels_first_and_give_the_resolution(write: Write, tmp_path: Path):
@@ -281,44 +188,11 @@ def test_cameras(write: Write):
     assert orthographic.camera.pixel_aspect == 1.25
 
 
-@pytest.mark.parametrize("changes", [{"target": [0, 0.3, 3.2]}, {"up": [0, 0.3, 3.2]}])
-def test_cameras_need_a_view_direction(write: Write, changes: dict[str, list[float]]):
-    path = write(view(VIEW["camera"] | changes))
-    line = problem(path)
-    assert "views.0.camera: origin, target and up do not span a view" in line
-
-
-@pytest.mark.parametrize(
-    ("target", "cause"), [([0, 0.3, 6], "behind the camera"), ([3, 0, 0], "looks past it")]
-)
-def test_cameras_that_miss_the_volume_are_named_with_the_cause(
-    write: Write, target: list[float], cause: str
-):
-    line = problem(write(view(VIEW["camera"] | {"target": target})))
-    assert (
-        "views.0.camera: no pixel of view 'front' looks through the volume" in line
-        and cause in line
-    )
-
-
-def test_problems_of_volume_and_views_are_told_together(write: Write):
-    lines = problems(
-        write(SCENE.replace("  resolution: [2, 3, 4]\n", "")), "views.0.image=none.exr"
-    )
-    assert len(lines) == 2 and "'resolution'" in lines[0] and "none.exr" in lines[1]
-
-
 def test_cameras_that_all_miss_the_volume_are_one_problem(write: Write):
     ring = {"count": 3, "radius": 3, "fov": 20, "target": [9, 0, 0], "resolution": [4, 4]}
     (line,) = problems(write(changed(views={"ring": ring})))
-    assert line.startswith("scene.yaml:") and "views: none looks through the volume" in line
-    assert "the cameras look at about (9, " in line
-
-
-def test_a_box_smaller_than_a_pixel_is_not_taken_for_turned_cameras(write: Write):
-    ring = {"count": 3, "radius": 900, "fov": 20, "target": [0, 0, 0], "resolution": [16, 16]}
-    (line,) = problems(write(changed(views={"ring": ring})))
-    assert "views: none looks through the volume; it is in the picture, but smaller" in line
+    assert line.startswith("scene.yaml:")
+    assert "no pixel of view 'ring_00' and 2 more looks through the volume; the camera" in line
 
 
 def test_a_field_may_have_another_name_in_its_file(write: Write, tmp_path: Path):

@@ -55,7 +55,7 @@ def test_what_is_found_of_a_medium_is_put_into_it(
 ) -> None:
     optimize = {"parameters": {"media.cloud.albedo": {"init": 0.5}, "media.air.sigma_s": {}}}
     path = write(changed(volume={"media": {"cloud": CLOUD, "air": AIR}}, optimize=optimize))
-    scene_file = read_scene(path, ["optimize.parameters.media.cloud.phase.g.init=0.3"])
+    scene_file = read_scene(path, ["optimize.parameters.media.cloud.g.init=0.3"])
     scene = build_scene(scene_file)
     assert scene.starts["media.cloud.g"] == torch.tensor(0.3)
     assert float(scene.starts["media.cloud.albedo"]) == 0.5
@@ -68,44 +68,3 @@ def test_what_is_found_of_a_medium_is_put_into_it(
     assert media is not None and media["cloud"].g == torch.tensor(0.4)
     assert media["air"].sigma_s.tolist() == pytest.approx([0.3, 0.2, 0.1])
     assert float(media["cloud"].sigma_s) == pytest.approx(18)
-
-
-MIXED = {"type": "two_lobe", "g": [0, 0], "weight": 0.5}
-REFUSED = {
-    "one": ({"cloud": CLOUD}, "media: expected two media, found 1"),
-    "none": ({}, "media: expected two media, found 0"),
-    "name": ({"cloud": CLOUD, "the air": AIR}, "'the air' is no name"),
-    "missing": ({"cloud": CLOUD, "air": {"density": 1}}, "media.air: missing sigma_a and sigma_s"),
-    "mixture": ({"cloud": CLOUD | {"phase": MIXED, "g": 0}, "air": AIR}, "expected one of henyey"),
-    "both": ({"cloud": CLOUD | {"phase": {"type": "rayleigh"}}, "air": AIR}, "only one of g or ph"),
-    "cells": (
-        {"cloud": {"density": 1, "sigma_t": 1, "albedo": 1, "g": {"file": "g.npz"}}, "air": AIR},
-        "media.cloud.g: expected a number",
-    ),
-}
-
-
-@pytest.mark.parametrize(("media", "line"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_is_wrong_is_said_at_its_key(
-    media: dict[str, Any], line: str, refusal: Callable[..., list[str]]
-) -> None:
-    (found,) = refusal(text_of(**media))
-    assert "volume.media" in found and line in found
-
-
-def test_numbers_of_media_are_named_by_them(refusal: Callable[..., list[str]]) -> None:
-    for parameters, line in (
-        ({"media.cloud.g": {"field": True}}, "it is not a field"),
-        ({"media.cloud.albedo": {}, "media.cloud.sigma_s": {}}, "beside media.cloud.sigma_s"),
-        ({"media.cloud.rho": {}}, "unknown parameter"),
-    ):
-        text = changed(
-            volume={"media": {"cloud": CLOUD, "air": AIR}}, optimize={"parameters": parameters}
-        )
-        assert line in refusal(text)[0]
-
-
-def test_a_file_on_another_grid_is_refused_at_its_key(write: Callable[[str], Path]) -> None:
-    volume = {"media": {"cloud": CLOUD, "air": AIR}, "resolution": [2, 3, 5]}
-    with pytest.raises(Exception, match=r"volume\.media\.cloud\.density\.file: has 2 x 3 x 4"):
-        load_scene(write(changed(volume=volume, optimize=None)))

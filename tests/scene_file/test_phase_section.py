@@ -12,7 +12,7 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.errors import DataWarning, FormatError, SceneError
+from ddrecon.errors import DataWarning
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
@@ -62,65 +62,24 @@ def test_g_is_short_for_henyey_greenstein(write: Callable[[str], Path]) -> None:
         changed(volume=VOLUME | {"g": 0.4}, optimize=None),
         scene_with(type="henyey_greenstein", g=0.4),
     )
-    scenes = [write_and_load(write, text) for text in texts]
+    scenes = [load_scene(write(text)) for text in texts]
     assert scenes[0].volume.g == scenes[1].volume.g == torch.tensor(0.4)
-
-
-def write_and_load(write: Callable[[str], Path], text: str) -> Any:
-    return load_scene(write(text))
-
-
-def test_phase_g_is_optimized_as_g(write: Callable[[str], Path]) -> None:
-    parameters = {"parameters": {"phase.g": {"init": 0.1}}}
-    phase = {"phase": {"type": "henyey_greenstein", "g": 0.4}}
-    scene = load_scene(write(changed(volume=VOLUME | phase, optimize=parameters)))
-    assert list(scene.starts) == ["g"] and scene.starts["g"] == torch.tensor(0.1)
-
-
-def test_lobes_start_from_a_list(write: Callable[[str], Path]) -> None:
-    parameters = {"parameters": {"phase.g": {"init": [0.5, -0.1]}, "phase.weight": {"init": 0.5}}}
-    phase = {"phase": {"type": "two_lobe", "g": [0.8, -0.3], "weight": 0.7}}
-    starts = load_scene(write(changed(volume=VOLUME | phase, optimize=parameters))).starts
-    torch.testing.assert_close(starts["phase.g"], torch.tensor([0.5, -0.1]))
-    assert starts["phase.weight"] == 0.5
 
 
 def test_a_table_of_another_scale_is_divided_with_a_warning(
     write: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    known = write_and_load(write, scene_with(type="table", file="table.csv")).volume.phase
+    known = load_scene(write(scene_with(type="table", file="table.csv"))).volume.phase
     lines = (tmp_path / "table.csv").read_text().splitlines()
     rows = [line.split(", ") for line in lines[1:]]
     scaled = [f"{angle}, {4 * float(value)}" for angle, value in rows]
     (tmp_path / "table.csv").write_text("\n".join([lines[0], *scaled]))
     with pytest.warns(DataWarning, match=r"table.csv: its mean over the sphere is 4"):
-        found = write_and_load(write, scene_with(type="table", file="table.csv")).volume.phase
+        found = load_scene(write(scene_with(type="table", file="table.csv"))).volume.phase
     cosine = torch.linspace(-1, 1, 9)
     torch.testing.assert_close(found.value(cosine), known.value(cosine))
     exact = 0.75 * (1 + cosine**2)
     torch.testing.assert_close(found.value(cosine)[0], exact, rtol=0, atol=2e-3)
-
-
-REFUSED = {
-    "both": ({"g": 0.2, "phase": {"type": "rayleigh"}}, "give only one of g or phase"),
-    "unknown": ({"phase": {"type": "two_lobes"}}, "did you mean 'two_lobe'"),
-    "beyond": ({"phase": {"type": "two_lobe", "g": [1, 0], "weight": 0.5}}, "must be below 1"),
-    "weight": ({"phase": {"type": "two_lobe", "g": [0, 0], "weight": 2}}, "must be at most 1"),
-    "retired": ({"phase": {"type": "blend"}}, "blend went: write two media, volume.media"),
-}
-
-
-@pytest.mark.parametrize(("section", "line"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_is_wrong_is_said_at_its_key(
-    section: dict[str, Any], line: str, refusal: Callable[..., list[str]]
-) -> None:
-    (found,) = refusal(changed(volume=VOLUME | section, optimize=None))
-    assert "volume.phase" in found and line in found
-
-
-def test_one_number_is_named_once(refusal: Callable[..., list[str]]) -> None:
-    optimize = {"parameters": {"g": {}, "phase.g": {}}}
-    assert "the same number" in refusal(changed(volume=VOLUME | {"g": 0.2}, optimize=optimize))[0]
 
 
 def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], Path]) -> None:
@@ -136,11 +95,6 @@ def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], 
         np.testing.assert_allclose(ours, one, rtol=0.15, atol=0.01)
         *_, mean_cosine = miepython.efficiencies_mx(1.33, size)
         assert float(found.moments(2)[color, 1]) == pytest.approx(mean_cosine, abs=0.01)
-
-
-def test_a_missing_file_is_the_scene_s_mistake(write: Callable[[str], Path]) -> None:
-    with pytest.raises(SceneError, match=r"volume\.phase\.file"):
-        load_scene(write(scene_with(type="table", file="nowhere.csv")))
 
 
 CELLS = (6, 5, 4)
@@ -184,31 +138,6 @@ def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
     dump_scene(scene_file, tmp_path / "again.yaml")
     again = load_scene(tmp_path / "again.yaml").volume.phase.cells
     assert again is not None and torch.equal(again, cells)
-
-
-def test_g_of_a_cell_may_be_negative_and_a_weight_not(
-    write: Callable[[str], Path], tmp_path: Path
-) -> None:
-    write_cells(tmp_path / "cells.npz", g=-0.6, weight=-0.6, steep=0.995, much=1.5)
-    phase = load_scene(write(cells_scene(g={"file": "cells.npz"}))).volume.phase
-    assert float(phase.moments(2)[0, 1].min()) == pytest.approx(-0.6)
-    lobes = {"type": "two_lobe", "g": [0.8, -0.3]}
-    for volume, told in (
-        ({"phase": lobes | {"weight": {"file": "cells.npz"}}}, "weight is negative"),
-        ({"phase": lobes | {"weight": {"file": "cells.npz", "name": "much"}}}, "much is above 1"),
-        ({"g": {"file": "cells.npz", "name": "steep"}}, "steep is above 0.99"),
-    ):
-        with pytest.raises(FormatError, match=told):
-            load_scene(write(cells_scene(**volume)))
-
-
-def test_cells_of_another_grid_are_refused_at_their_key(
-    write: Callable[[str], Path], tmp_path: Path
-) -> None:
-    write_cells(tmp_path / "cells.npz", weight=0.6)
-    phase = {"type": "two_lobe", "g": [0.8, -0.3], "weight": {"file": "cells.npz"}}
-    with pytest.raises(SceneError, match=r"volume\.phase\.weight\.file: has 6 x 5 x 4 cells"):
-        load_scene(write(cells_scene(phase=phase, resolution=[6, 5, 5])))
 
 
 def test_a_number_of_each_cell_is_optimized_from_one(write: Callable[[str], Path]) -> None:

@@ -13,7 +13,6 @@ import torch
 from example_scene import SCENE
 from torch import Tensor
 
-from ddrecon.errors import SceneError
 from ddrecon.io.volumes.table import write_field
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -28,16 +27,6 @@ def load(write: Write) -> Callable[[str], Scene]:
     return lambda parameters: load_scene(
         write(f"{SCENE}optimize: {{parameters: {parameters}}}\n"), dtype=torch.float64
     )
-
-
-@pytest.fixture
-def refused(write: Write, tmp_path: Path) -> Callable[[str], list[str]]:
-    def problems(parameters: str) -> list[str]:
-        with pytest.raises(SceneError) as caught:
-            load_scene(write(f"{SCENE}optimize: {{parameters: {parameters}}}\n"))
-        return [line.replace(f"{tmp_path}/", "") for line in caught.value.problems]
-
-    return problems
 
 
 def expect(value: Tensor, wanted: object) -> None:
@@ -89,85 +78,4 @@ def test_a_start_from_a_file(
     expect(
         start,
         values if name == "density" else values.transpose(3, 0, 1, 2) if colors else values[None],
-    )
-
-
-@pytest.mark.parametrize(
-    ("parameters", "problem"),
-    [
-        ("{densty: {}}", "optimize.parameters.densty: unknown parameter; did you mean 'density'?"),
-        (
-            "{lights.7.irradiance: {}}",
-            "optimize.parameters.lights.7.irradiance: the scene has no such number; did you mean"
-            " 'lights.0.irradiance'?",
-        ),
-        (
-            "{lights.0.radiance: {}}",
-            "optimize.parameters.lights.0.radiance: the scene has no such number",
-        ),
-        (
-            "{views.back.camera: {}}",
-            "optimize.parameters.views.back.camera: the scene has no such number; did you mean"
-            " 'views.front.camera'?",
-        ),
-        (
-            "{albedo: {init: 1.5}}",
-            "optimize.parameters.albedo.init: must be at least 0 and at most 1, found 1.5",
-        ),
-        (
-            "{g: {max: 1}}",
-            "optimize.parameters.g.max: must be at least -0.99 and at most 0.99, found 1",
-        ),
-        (
-            "{sigma_s: {init: [1, 2]}}",
-            "optimize.parameters.sigma_s.init: expected one number or [r, g, b], found a list of 2",
-        ),
-        (
-            "{lights.0.direction: {init: 3}}",
-            "optimize.parameters.lights.0.direction.init: expected a list of 3 numbers",
-        ),
-        (
-            "{lights.0.irradiance: {field: true}}",
-            "optimize.parameters.lights.0.irradiance.field: it is not a field, so it has none",
-        ),
-        (
-            "{lights.1.radiance: {tv: 1}}",
-            "optimize.parameters.lights.1.radiance.tv: it is not a field, so it has none",
-        ),
-        (
-            "{albedo: {}, sigma_s: {}}",
-            "optimize.parameters.albedo: cannot be optimized beside sigma_s",
-        ),
-        (
-            "{lights.0.irradiance: {init: {file: scene.yaml}}}",
-            "optimize.parameters.lights.0.irradiance.init.file: lights.0.irradiance is not a field",
-        ),
-    ],
-)
-def test_what_is_refused(
-    refused: Callable[[str], list[str]], parameters: str, problem: str
-) -> None:
-    (line,) = refused(parameters)
-    assert line.startswith("scene.yaml:13:") and problem in line
-
-
-def test_a_file_of_another_size_is_refused(
-    refused: Callable[[str], list[str]], tmp_path: Path
-) -> None:
-    write_field(tmp_path / "start.npz", "sigma_a", np.ones((2, 2, 2)), BOUNDS)
-    (line,) = refused("{sigma_a: {init: {file: start.npz}}}")
-    assert (
-        "optimize.parameters.sigma_a.init.file: has [2, 2, 2] cells [z, y, x], but the volume"
-        " has [4, 3, 2]" in line
-    )
-
-
-def test_a_field_is_not_made_one_number_in_silence(
-    refused: Callable[[str], list[str]], tmp_path: Path
-) -> None:
-    write_field(tmp_path / "start.npz", "sigma_a", np.random.default_rng(0).random(SHAPE), BOUNDS)
-    (line,) = refused("{sigma_a: {init: {file: start.npz}, field: false}}")
-    assert (
-        "optimize.parameters.sigma_a: differs from cell to cell where it starts; give init: number"
-        in line
     )

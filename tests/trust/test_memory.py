@@ -26,7 +26,7 @@ from ddrecon.light.lights import PointLight
 from ddrecon.memory import Needs, is_shortage, memory_of
 from ddrecon.renderer import render_each
 from ddrecon.run import render_folder
-from ddrecon.scene_file import build_volume
+from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
 
@@ -112,7 +112,7 @@ def test_the_prediction_is_the_estimate(
     bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
     write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
     predicted: list[Needs] = []
-    monkeypatch.setattr(build_volume, "make_room", lambda needs, _: predicted.append(needs))
+    monkeypatch.setattr(build, "make_room", lambda needs, _: predicted.append(needs))
     scene = load_scene("scene.yaml", overrides=overrides)
     assert memory_of(predicted[0]) == memory_estimate(scene) > 0
 

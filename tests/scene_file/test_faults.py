@@ -1,0 +1,228 @@
+"""What is wrong with a scene is one line: the place, the key, what to do; one table of it all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_scene import SCENE
+
+from ddrecon.errors import FormatError, SceneError
+from ddrecon.io.volumes.table import write_fields
+from ddrecon.scene_file.build import load_scene
+
+BOX = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
+MEDIA = "volume={bounds: {min: [0, 0, 0], max: [1, 1, 1]}, resolution: [1, 1, 1], media: "
+MEDIUM = "{density: 1, sigma_t: 1, albedo: 1}"
+RING = "views={ring: {count: 3, radius: 3, fov: 30, resolution: [8, 6]}"
+"""What rows of the table begin with, which close the brace themselves."""
+
+SCENES = f"""
+volume.g=-1 => volume.g: must be above -1
+volume.g=.nan => volume.g: expected a finite number
+volume.g=1e400 => volume.g: expected a finite number
+volume.g=2 => -D volume.g=2: volume.g: must be below 1, found 2
+volume.density=[1, 2, 3] => density: expected a number or {{file: ...}}, found a list of 3
+volume.density={{constant: -1}} => volume.density.constant: must be at least 0
+volume.density={{constant: 1, file: a.npz}} => volume.density.constant: unknown key
+volume.density={{file: 3}} => density.file: expected a file, found 3 (put it in quotes)
+volume.density={{file: "a\\0"}} => volume.density.file: expected text that can be printed
+volume.density={{file: gone.npz}} => volume.density.file: gone.npz does not exist
+volume.density={{file: {"n" * 5000}}} => -D volume.density={{file: nnn
+volume.sigma_a=[1, 2] => sigma_a: expected a number, [r, g, b] or {{file: ...}}, found a list of 2
+volume.sigma_a=red => sigma_a: expected a number, [r, g, b] or {{file: ...}}, found 'red'
+volume.sigma_a=true => volume.sigma_a: expected a number, [r, g, b] or {{file: ...}}, found true
+volume.sigma_a=-0.1 => volume.sigma_a: must be at least 0
+volume.densty=1 => volume.densty: unknown key; did you mean 'density'?
+volume.albedo=0.5 => volume: give only one of sigma_a and sigma_s or sigma_t and albedo
+volume={{density: 1}} => volume: missing sigma_a and sigma_s or sigma_t and albedo
+volume={{density: 1, sigma_t: 1}} => volume: missing key 'albedo'
+volume={{density: 1, sigma_t: 1, albedo: ~}} => volume: missing key 'albedo'
+volume={{density: 1, sigma_t: 1, albedo: 1.5}} => volume.albedo: must be at most 1
+volume={{density: 1, sigma_t: 1, albedo: 1, resolution: [1, 1, 1]}} => missing key 'bounds'
+volume={{density: {{file: boxless.npz}}, sigma_t: 1, albedo: 1}} => missing key 'bounds'
+volume.resolution=~ => volume: missing key 'resolution', which no field file gives either
+volume.resolution=[2, 0, 2] => volume.resolution.1: must be at least 1
+volume.resolution=[2.0, 2, 2] => volume.resolution.0: expected a whole number, found 2.0
+volume.resolution=[6, 9] => volume.resolution: expected a list of 3 whole numbers, found a list of 2
+volume.resolution=[4096, 4096, 4096] => volume.resolution: 6.9e+10 cells are too many
+volume.bounds={{min: [0, 0, 0]}} => volume.bounds: missing key 'max'
+volume.bounds.max=[0.5, -0.75, 1] => volume.bounds.max: -0.75 along y is not above min, -0.75
+volume.density={{file: wide.npz}} => has the resolution 3 x 2 x 2, but volume.resolution has
+volume.density={{file: moved.npz}} => density.file: has the bounds (-1, -1.5, -1) to (1, 1.5, 1)
+volume=3 => volume: expected a mapping, found 3
+volume.phase={{type: rayleigh}} => volume.phase: g is short for a phase function: give only one
+volume.phase={{type: two_lobes}} => did you mean 'two_lobe'?
+volume.phase={{type: two_lobe, g: [1, 0], weight: 0.5}} => volume.phase.g.0: must be below 1
+volume.phase={{type: two_lobe, g: [0, 0], weight: 2}} => volume.phase.weight: must be at most 1
+volume.phase={{type: blend}} => blend went: write two media, volume.media
+{MEDIA}{{cloud: {MEDIUM}}}}} => volume.media: expected two media, found 1
+{MEDIA}{{}}}} => volume.media: expected two media, found 0
+{MEDIA}{{cloud: {MEDIUM}, the air: {MEDIUM}}}}} => volume.media: 'the air' is no name
+{MEDIA}{{cloud: {MEDIUM}, air: {{density: 1}}}}}} => volume.media.air: missing sigma_a and sigma_s
+{MEDIA}{{a: {MEDIUM}, b: {MEDIUM[:-1]}, phase: {{type: two_lobe}}}}}}}} => expected one of henyey
+{MEDIA}{{a: {MEDIUM}, b: {MEDIUM[:-1]}, g: {{file: g.npz}}}}}}}} => media.b.g: expected a number
+lights=[] => lights: expected a list with at least one entry, found a list of 0
+lights=[{{radiance: 1}}] => lights.0: missing key 'type', one of directional, ambient,
+lights=[{{type: ambien, radiance: 1}}] => found 'ambien'; did you mean 'ambient'?
+lights=[{{type: point, position: [0, 0, 0]}}] => lights.0: missing key 'intensity'
+lights=[{{type: point, position: [0, 1], intensity: 1}}] => position: expected a list of 3 numbers
+lights=[{{type: environment}}] => lights.0: missing key 'file'
+lights=[{{type: environment, file: gone.exr}}] => lights.0.file: gone.exr does not exist
+lights=[{{type: environment, file: sky.npy, directions: 0}}] => directions: must be at least 1
+lights.0.direction=[0, 0, 0] => lights.0.direction: must not be zero
+lights.0.irradiance=-1 => lights.0.irradiance: must be at least 0
+lights.5.radiance=1 => lights.5: no such entry: lights is a list of 2, counted from 0
+views=[] => views: expected a list with at least one entry
+views=ring => views: expected a list with at least one entry or a mapping, found 'ring'
+views={{images: "*.exr"}} => views: missing ring or transforms or colmap
+{RING}, image: "*.exr"}} => views.image: unknown key; did you mean 'images'?
+{RING}, images: "*.npz"}} => views.images: '*.npz' matches 5 files, but the ring has 3 cameras
+{RING}, transforms: t.json}} => views: give only one of ring or transforms
+{RING}, test_every: 1}} => views.test_every: must be at least 2
+views={{ring: {{count: 3, radius: 1, fov: 30}}}} => views.ring: missing key 'resolution'
+views={{transforms: gone.json}} => views.transforms: gone.json does not exist, or is not a file
+views={{transforms: t.json, images: "*.png"}} => views.images: is for a ring or COLMAP
+views={{colmap: gone, images: p}} => gone has no COLMAP model; expected cameras
+views={{colmap: gone}} => colmap: missing key 'images', the folder of its pictures
+views.0.name= => views.0.name: expected text, found nothing
+views.0.name='' => views.0.name: expected text that can be printed, found ''
+views.0.name='..' => views.0.name: '..' is not a file name
+views.0.name='a b' => views.0.name: 'a b' is not a file name
+views.0.name=front.single => views.0.name: 'front.single' ends in .single
+views.0.split=valid => views.0.split: expected one of train, test, found 'valid'
+views.0.image=gone.exr => views.0.image: gone.exr does not exist
+views.0.mask=. => is not a file
+views.0.camera.fov=0 => views.0.camera.fov: must be above 0
+views.0.camera.fov=180 => views.0.camera.fov: must be below 180
+views.0.camera.resolution=[8, 6, 3] => resolution: expected a list of 2 whole numbers
+views.0.camera.resolution=~ => views.0.camera: missing key 'resolution'
+views.0.camera.width=1 => views.0.camera.width: unknown key
+views.0.camera={{type: orthographic, origin: [0, 0, 1], target: [0, 0, 0]}} => missing key 'width'
+views.0.camera={{type: perspective, fov: 30}} => views.0.camera: missing matrix or origin and target
+views.0.camera={{type: perspective, fov: 30, target: [0, 0, 0]}} => missing key 'origin'
+views.0.camera.matrix=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]] => give only one of matrix or origin
+views.0.camera.target=[0, 0.3, 3.2] => views.0.camera: origin, target and up do not span a view
+views.0.camera.up=[0, 0.3, 3.2] => views.0.camera: origin, target and up do not span a view
+render.samples_per_pixel=0 => render.samples_per_pixel: must be at least 1
+render.samples_per_pixel=true => samples_per_pixel: expected a whole number, found true
+render.background=yes => render.background: expected true or false, found 'yes'
+render={{background: true, background: true}} => render.background: repeated key
+diffusion.model=p2 => diffusion.model: expected one of none, p1, flux_limited, found 'p2'
+diffusion={{model: flux_limited, scheme: printed}} => 'printed' is for diffusion.model p1
+diffusion.transport_directions=50 => directions follow from diffusion.degree: write degree: 3
+diffusion.degree=4 => diffusion.degree: expected one of 1, 3, 5, 7, found 4
+diffusion.transport_rounds=17 => diffusion.transport_rounds: must be at most 16
+diffusion={{model: flux_limited, transport_rounds: 1}} => rounds begin at model p1 with scheme
+diffusion={{scheme: printed, transport_rounds: 1}} => rounds begin at model p1 with scheme
+diffusion.tolerance=0.6 => diffusion.tolerance: must be at most 0.5
+difusion.model=p1 => difusion: unknown key; did you mean 'diffusion'?
+optimize.optimizer=adam => optimize.optimizer: unknown key; known: parameters, iterations, loss,
+optimize={{iterations: 10}} => optimize: missing key 'parameters'
+optimize.parameters={{}} => optimize.parameters: names no parameter; known: density
+optimize.iterations=0 => optimize.iterations: must be at least 1
+optimize.loss=l3 => optimize.loss: expected one of l2, l1, huber, relative_l2, display, photon
+optimize.refine_at=[0.6, 0.3] => optimize.refine_at: must increase
+optimize.refine_at=[0.5, 0.5] => optimize.refine_at: must increase
+optimize.refine_at=[0, 0.5] => optimize.refine_at.0: must be above 0
+optimize.refine_at=[1.0] => optimize.refine_at.0: must be below 1
+optimize.parameters.densty={{}} => parameters.densty: unknown parameter; did you mean 'density'?
+optimize.parameters={{media.cloud.rho: {{}}}} => media.cloud.rho: unknown parameter
+optimize.parameters.media.cloud.g={{field: true}} => it is not a field, so it has none
+optimize.parameters.phase.g={{}} => parameters.phase.g is called g here
+optimize.parameters.density.support=0.1 => density.support: expected one of masks, auto
+optimize.parameters.g.support=auto => g.support: 'auto' is for density alone
+optimize.parameters.density.even_until=0.3 => even_until: cells are free from the start
+optimize.parameters.density.lr=0 => optimize.parameters.density.lr: must be above 0
+optimize.parameters.density.tv=-1 => optimize.parameters.density.tv: must be at least 0
+optimize.parameters.density={{min: 2, max: 1}} => density.max: 1 is not above min, 2
+optimize.parameters.density={{init: 3, max: 1}} => density.init: 3 is not between min and max
+optimize.parameters.density={{init: {{file: gone.npz}}}} => init.file: gone.npz does not exist
+optimize.parameters.albedo={{init: 1.5}} => albedo.init: must be at least 0 and at most 1, found 1.5
+optimize.parameters.g={{max: 1}} => g.max: must be at least -0.99 and at most 0.99, found 1
+optimize.parameters.sigma_s={{init: [1, 2]}} => expected one number or [r, g, b], found a list of 2
+optimize.parameters.sigma_a={{init: {{file: wide.npz}}}} => has [2, 2, 3] cells [z, y, x], but
+optimize.parameters.sigma_a={{init: {{file: cells.npz}}, field: false}} => differs from cell to cell
+optimize.parameters={{albedo: {{}}, sigma_s: {{}}}} => albedo: cannot be optimized beside sigma_s
+optimize.parameters.lights.7.irradiance={{}} => did you mean 'lights.0.irradiance'?
+optimize.parameters.lights.0.radiance={{}} => lights.0.radiance: the scene has no such number
+optimize.parameters.lights.0.direction={{init: 3}} => direction.init: expected a list of 3 numbers
+optimize.parameters.lights.0.irradiance={{field: true}} => irradiance.field: it is not a field
+optimize.parameters.lights.1.radiance={{tv: 1}} => radiance.tv: it is not a field
+optimize.parameters.lights.0.irradiance={{init: {{file: cells.npz}}}} => irradiance is not a field
+optimize.parameters.views.back.camera={{}} => no such number; did you mean 'views.front.camera'?
+volume.g => -D volume.g: expected key.path=value
+=3 => -D =3: expected key.path=value
+volume..g=3 => -D volume..g=3: expected key.path=value
+volume.g.x=3 => -D volume.g.x=3: volume.g.x: volume.g is 0.3, not a mapping or list
+lights.x=3 => lights.x: no such entry: lights is a list of 2, counted from 0
+volume.g=[1 => -D volume.g=[1: not YAML: while parsing a flow sequence, did not find
+volume.g=*x => -D volume.g=*x: volume.g: *x stands for nothing: no &x before
+"""
+"""Overrides of the small scene, and what its one line says: the user mends the scene."""
+
+FILES = """
+volume.density={file: junk.npz} => junk.npz: not a complete .npz archive
+volume.density={file: cells.npz, name: rain} => cells.npz: has no field 'rain'; it has
+volume.density={file: cells.npz, name: colors} => colors belong to the cross sections
+volume.density={file: cells.npz, name: below} => below is
+volume={density: 1, sigma_t: 1, albedo: {file: cells.npz, name: two}} => two is above 1 at cell
+volume.g={file: cells.npz, name: steep} => steep is above 0.99 at cell (x, y, z) = (0, 0, 0)
+views.0.image=nan.npy => nan.npy: NaN at row 0, column 0
+views.0.image=sky.npy => sky.npy: is 6 x 4 pixels, but views.0.camera has 8 x 6
+views.0.mask=sky.npy => sky.npy: is 6 x 4 pixels, but views.0.camera has 8 x 6
+lights=[{type: environment, file: narrow.npy}] => at least 3 x 2 pixels, and this is 2 x 4
+views={transforms: bad.json} => bad.json: not JSON
+"""
+"""The same where a file is to blame."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the scene, and files that are good or bad in one way each."""
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "scene.yaml").write_text(SCENE)
+    cells = np.random.default_rng(0).uniform(0.1, 0.9, (4, 3, 2))
+    fields = {"density": cells, "sigma_a": cells, "steep": cells + 2, "two": cells + 2}
+    fields |= {"colors": np.stack([cells] * 3, -1), "g": cells, "below": cells}
+    write_fields(folder / "cells.npz", fields, BOX)
+    damaged = dict(np.load(folder / "cells.npz")) | {"below": (cells - 1).astype(np.float32)}
+    np.savez(folder / "cells.npz", **damaged)
+    wide = {"density": np.ones((2, 2, 3)), "sigma_a": np.ones((2, 2, 3))}
+    write_fields(folder / "wide.npz", wide, BOX)
+    write_fields(folder / "moved.npz", {"density": cells}, 2 * BOX)
+    np.savez(folder / "boxless.npz", density=np.ones((2, 2, 2)))
+    np.save(folder / "nan.npy", np.full((6, 8, 3), np.nan))
+    np.save(folder / "sky.npy", np.ones((4, 6, 3)))
+    np.save(folder / "narrow.npy", np.ones((4, 2, 3)))
+    (folder / "junk.npz").write_bytes(b"junk")
+    (folder / "t.json").write_text("{}")
+    (folder / "bad.json").write_text("[" * 10**5)
+    return folder
+
+
+def rows(table: str) -> list[tuple[str, str]]:
+    return [
+        (one, other) for one, _, other in (row.partition(" => ") for row in table.split("\n")[1:-1])
+    ]
+
+
+@pytest.mark.parametrize(("override", "line"), rows(SCENES))
+def test_what_is_wrong_with_a_scene(folder: Path, override: str, line: str) -> None:
+    overrides = [override]
+    if override.startswith("optimize.") and not override.startswith("optimize.parameters={"):
+        overrides.insert(0, "optimize={parameters: {density: {}}}")
+    with pytest.raises(SceneError) as caught:
+        load_scene(folder / "scene.yaml", overrides=overrides)
+    (found,) = caught.value.problems
+    assert line in found.replace(f"{folder}/", "")
+    assert found.startswith(("-D ", f"{folder}/scene.yaml:"))
+
+
+@pytest.mark.parametrize(("override", "line"), rows(FILES))
+def test_what_is_wrong_with_a_file(folder: Path, override: str, line: str) -> None:
+    with pytest.raises(FormatError) as caught:
+        load_scene(folder / "scene.yaml", overrides=[override])
+    (found,) = caught.value.lines
+    assert line in found.replace(f"{folder}/", "") and found.startswith(f"{folder}/")
