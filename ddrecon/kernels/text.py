@@ -35,6 +35,7 @@ _TYPES = {
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
 }
+_INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;
 """
@@ -175,21 +176,21 @@ def include(header: str) -> Any:
 
     They are experimental in Warp 1.19, and named here alone.
     """
-    line, root = f'#include "ddrecon/{header}"\n', Path(__file__).parents[2]
-    return wp.ModuleBuildOptions(
-        extra_cpu_include_dirs=[str(root)],
-        extra_cuda_include_dirs=[str(root)],
-        extra_cpu_preamble=line,
-        extra_cuda_preamble=line,
-        extra_build_dependencies=sorted(map(str, _included(root / "ddrecon" / header, root))),
-    )
+    text = "".join(_texts(header).values())
+    return wp.ModuleBuildOptions(extra_cpu_preamble=text, extra_cuda_preamble=text)
 
 
 @functools.cache
-def _included(header: Path, root: Path) -> frozenset[Path]:
-    """`header` and those it includes: modules are compiled anew where one of them has changed."""
-    names = re.findall(r'#include "(.*)"', header.read_text(encoding="utf-8"))
-    return frozenset({header}).union(*(_included(root / name, root) for name in names))
+def _texts(header: str) -> dict[str, str]:
+    """The text of a `header` after those of what it includes, by path.
+
+    Given by text, not by path, a kernel is the same wherever the package lies.
+    """
+    text, found = (Path(__file__).parents[1] / header).read_text(encoding="utf-8"), {}
+    for included in _INCLUDE.findall(text):
+        found |= _texts(included)
+    text = _INCLUDE.sub("", text.removeprefix("#pragma once"))
+    return found | {header: f'#line 1 "ddrecon/{header}"\n{text}'}
 
 
 @dataclass(frozen=True)
