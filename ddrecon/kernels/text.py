@@ -102,16 +102,14 @@ class TextKernel:
         made: Mapping[str, Any],
         threads: int | None = None,
         shares: Sequence[Mapping[str, Any]] = (),
-        work: int | None = None,
     ) -> None:
         """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
 
         Those that are made are contiguous. A thread has what is in its own of `shares` as well.
-        `work` as of `launch.launch`.
         """
         bound = self.bind(given, made)
         if not shares:
-            bound.launch(count, threads, work)
+            bound.launch(count, threads)
             return
         own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
         for record, share in zip(own, shares, strict=True):
@@ -202,13 +200,11 @@ class Bound:
     held: Any
     like: Tensor
 
-    def launch(
-        self, count: int, threads: int | None = None, work: int | None = None, **changed: Any
-    ) -> None:
+    def launch(self, count: int, threads: int | None = None, **changed: Any) -> None:
         """Does `count` items, with numbers and contiguous arrays `changed`."""
         for name, value in changed.items():
             self.kernel.write(self.record, name, value)
-        launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads)
 
 
 def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:

@@ -100,7 +100,7 @@ def _blend(
     That is what is `new`, and theta times what was `swept` of higher degree.
     """
     if is_fused() and not medium.is_cellwise:
-        from ddrecon.diffusion.rounds.fused.blend import blend_fused
+        from ddrecon.diffusion.rounds.fused.gain import blend_fused
 
         length = _share_length(medium, degree)
         return blend_fused(medium, light, new, swept, factor, length)
@@ -148,13 +148,8 @@ def _gain(
     source = source if off is None else source - share * off.mean
     if change.flux is None:
         return gain, source, None
-    return gain, source, recompute(_turned, share, cosine, change.flux)
-
-
-def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
-    """theta p_1 (L1' - L1)."""
-    z, y, x = (share * cosine * along for along in change)
-    return z, y, x
+    z, y, x = (share * cosine * along for along in change.flux)
+    return gain, source, (z, y, x)
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
