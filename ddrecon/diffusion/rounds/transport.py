@@ -106,11 +106,8 @@ def _blend(
         return blend_fused(medium, light, new, swept, factor, length)
     share = recompute(_transport_share, medium, degree)
     new = replace(new, higher=share * swept)
-    return light.plus(_times(new.plus(_times(light, -1)), factor))
-
-
-def _times(light: Moments, factor: Tensor | float) -> Moments:
-    return light.scaled(factor, factor, factor)
+    change = new.plus(light.scaled(-1.0, -1.0, -1.0))
+    return light.plus(change.scaled(factor, factor, factor))
 
 
 def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:

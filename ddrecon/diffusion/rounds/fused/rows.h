@@ -310,8 +310,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         const Line<N> light = line(here.s, here.t, LIGHT, group->before);
         F* const begin = found_row(here);
         const F* taken[COUNT];
-        F *found[COUNT], first = value_of(inflow), *lines = light.at;
-        if constexpr (IS_CHANGED) first = inflow.by[0], lines = light.change;
+        F *found[COUNT], first = change_of(inflow), *lines = light.at;
+        if constexpr (IS_CHANGED) lines = light.change;
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i];
             const bool is_known = k < 4 && !job.piece;

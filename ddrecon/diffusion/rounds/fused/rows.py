@@ -20,6 +20,7 @@ from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import TextKernel, declarations
 
+_ROOM = "diffusion/rounds/fused"
 MARGIN = 16
 """Cells before an array of rows, which begin where vectors do."""
 NUMBERS = 7
@@ -67,9 +68,9 @@ class Rows:
         shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
         saved = self.like.new_empty(shape) if is_saved else None
         kinds = 2 if self.changes is None else 4
-        made = self._zeros(lines=self._line_count(kinds, self.height + 2))
+        lines = self.like.new_zeros(self._line_count(kinds, self.height + 2))
         kind = "F" if self.changes is None else "Dual<F>"
-        return self._run(f"follow_rows<{kind}, ", "", {}, {"saved": saved, **made}), saved
+        return self._run(f"follow_rows<{kind}, ", "", {}, {"saved": saved, "lines": lines}), saved
 
     def transpose(
         self, saved: Tensor, bars: Sequence[Tensor | None], varies_numbers: bool
@@ -86,7 +87,7 @@ class Rows:
         made = {
             "saved": saved, "sums": sums, "e_bar": fields[0], "sc_bar": fields[-1],
             "lines": self.like.new_empty(self._line_count(2, (self.slab + 1) * self.height)),
-            **self._zeros(returning=self._line_count(2 + len(fields), self.height + 2)),
+            "returning": self.like.new_zeros(self._line_count(2 + len(fields), self.height + 2)),
         }  # fmt: skip
         flag = f", {str(varies_numbers).lower()}"
         found = self._run("return_rows<", flag, {"bars": bars}, made)
@@ -99,17 +100,6 @@ class Rows:
     def _line_count(self, kinds: int, places: int) -> int:
         return self.lanes * (kinds * self.tables["most"] * self.pitch * places + MARGIN)
 
-    def _zeros(self, **sizes: int) -> dict[str, Tensor]:
-        """Zeros by their names, with what kernels work in."""
-        sizes |= {"scratch": self.lanes * self._scratch_rows * self.pitch}
-        whole = {name: -(-size // MARGIN) * MARGIN for name, size in sizes.items()}
-        parts = self.like.new_zeros(sum(whole.values())).split(list(whole.values()))
-        return dict(zip(whole, parts, strict=True))
-
-    @property
-    def _scratch_rows(self) -> int:
-        return NUMBERS + self.tables["most"] + self.count
-
     def _run(
         self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]
     ) -> Tensor:
@@ -119,6 +109,8 @@ class Rows:
         shape = self.pieces, self.count, *self.like.shape
         sums = self.like.new_empty(shape) if shape[0] == 1 else self.like.new_zeros(shape)
         numbers = self.tables["chunks"].shape[2]
+        scratch_rows = NUMBERS + self.tables["most"] + self.count
+        scratch = self.like.new_zeros(self.lanes * scratch_rows * self.pitch)
         given = given | self.tables | {
             "light_parts": swept.light, "source_parts": swept.source, "factors": swept.factors,
             "beam_factors": swept.beam_factors, "scales": swept.scales,
@@ -128,7 +120,7 @@ class Rows:
             "depth": self.depth, "height": self.height, "width": self.width,
             "pitch": self.pitch, "margin": MARGIN, "colors": self.colors,
             "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
-            "scratch_rows": self._scratch_rows, "pieces": self.pieces, "chunk_count": numbers,
+            "scratch_rows": scratch_rows, "pieces": self.pieces, "chunk_count": numbers,
             "together": self.together,
         }  # fmt: skip
         if (changes := self.changes) is not None:
@@ -139,7 +131,7 @@ class Rows:
         degree, shares_field = round(self.count**0.5) - 1, str(swept.scattering is None).lower()
         whole = f"{function}{degree}, {shares_field}{flags}>"
         bound = _kernel(whole, torch.finfo(self.like.dtype).bits).bind(
-            given, made | {"found": sums}
+            given, made | {"found": sums, "scratch": scratch}
         )
         halves = (1, 0) if "bars" in given else (0, 1)
         firsts = range(0, self.colors, self.together)
@@ -160,32 +152,38 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
     the first field that steps to these cells meet.
     """
     _, depth, height, width = fields[0].shape
-    larger, is_met = [], torch.zeros(depth, height, width, dtype=torch.bool)
+    larger, rows = list[Tensor](), fields[0].new_empty(3, depth, height)
     for field in fields:
         flat = field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch)
-        inner = flat[MARGIN:].view(-1, depth + 2, height + 2, pitch)[:, 1:-1, 1:-1, :width]
-        inner.copy_(field.detach())
-        for channel in field:
-            is_met |= channel != 0
+        given = {
+            "field": field.detach(), "channels": len(field), "is_first": not larger,
+            "depth": depth, "height": height, "width": width, "pitch": pitch,
+        }  # fmt: skip
+        made = {"inner": flat[MARGIN + (height + 3) * pitch :], "rows": rows}
+        _surround_kernel(torch.finfo(field.dtype).bits).launch(depth * height, given, made)
         larger.append(flat)
-    # Of each row, how far cells of a medium reach to either end, and the largest value.
-    up = torch.arange(1, width + 1, dtype=torch.int16 if width < 2**15 else torch.int32)
-    reach = [(is_met * numbers).amax(-1).to(fields[0]) for numbers in (up, up.flip(0))]
-    rows = torch.stack([*reach, fields[0].detach().amax((0, 3))])
-    ranges, densest = [], []
-    for cells in (1, 2):
-        # Light at the ends of a step is a cell away at most, along each axis.
+    # Light at the ends of a step is a cell away at most, along each axis.
+    reached = []
+    for _ in range(2):
         for dim in (1, 2):
-            ends = rows.narrow(dim, 0, 1), rows, rows.narrow(dim, -1, 1)
-            longer = torch.cat(ends, dim)
+            longer = torch.cat([rows.narrow(dim, 0, 1), rows, rows.narrow(dim, -1, 1)], dim)
             for start in (0, 2):
                 rows = rows.maximum(longer.narrow(dim, start, rows.shape[dim]))
-        high, low, top = rows
-        first = (width - low - cells).clamp(min=0).div(MARGIN, rounding_mode="floor") * MARGIN
-        last = ((high + cells) / MARGIN).ceil().mul(MARGIN).clamp(max=width)
-        ranges += [first * (high > 0), last * (high > 0)]
-        densest.append(top)
-    return larger, torch.stack(ranges, -1).int(), densest[0]
+        reached.append(rows)
+    low, high, top = torch.stack(reached, -1)
+    cells = torch.arange(1.0, 3.0)
+    first = (width - low - cells).clamp(min=0).div(MARGIN, rounding_mode="floor")
+    last = ((high + cells) / MARGIN).ceil()
+    ranges = torch.stack([first, last], -1).mul(MARGIN).clamp(max=width) * (high > 0)[..., None]
+    return larger, ranges.flatten(2).int(), top[..., 0].contiguous()
+
+
+@functools.cache
+def _surround_kernel(bits: int) -> TextKernel:
+    names = "field, channels, depth, height, width, pitch, is_first, inner, rows"
+    given = "F *field, *inner, *rows; int channels, depth, height, width, pitch; bool is_first"
+    text, header = f"surround_row(item, {names});", f"{_ROOM}/surround.h"
+    return TextKernel("surround_row", bits, text, given, "inner rows", header)
 
 
 @functools.cache
@@ -210,5 +208,5 @@ def _kernel(function: str, bits: int) -> TextKernel:
         f"{function}(item, Sweep<F>{{{', '.join(values)}}});",
         given,
         " ".join(one for _, _, one, _ in declarations(made)),
-        f"diffusion/rounds/fused/{'rows' if name == 'follow_rows' else 'returning'}.h",
+        f"{_ROOM}/{'rows' if name == 'follow_rows' else 'returning'}.h",
     )

@@ -36,12 +36,13 @@ def sweep_fused(
     The first two less those of `light`. `directions`: how many the quadrature has.
     """
     colors, beam_factors = len(light.mean), None
-    if is_forward():
+    if is_forward():  # where a beam and its factors may both change
         source = source.spelled()
     if source.beam is not None:
         beam, each = source.beam
-        source, units = Moments(beam), _units_of(factors)
-        beam_factors = (units * each).expand(-1, colors)
+        # The parts of light are so many times its moments.
+        units = units_of_parts(len(factors) - 1)[:, None].to(factors)
+        source, beam_factors = Moments(beam), (units * each).expand(-1, colors)
     shares_field = medium.remaining.field is medium.extinction.field
     fields = medium.extinction.field, None if shares_field else medium.remaining.field
     mean, z, y, x, higher, _ = _Sweep.apply(
@@ -73,12 +74,6 @@ def _spread_factors(factors: Tensor, colors: int) -> Tensor:
     return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
 
 
-@remember
-def _units_of(factors: Tensor) -> Tensor:
-    """How many times the moments that have `factors` the parts of light are, [K, 1]."""
-    return units_of_parts(len(factors) - 1)[:, None].to(factors)
-
-
 class _Sweep(torch.autograd.Function):
     """The parts of light, and their derivatives by all tensors of `Swept`.
 
@@ -106,7 +101,7 @@ class _Sweep(torch.autograd.Function):
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
         _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
         needs_beam_factors, *needs_parts = needs_more
-        *parts, _ = bars
+        parts = bars[:-1]
         scales_bar, moments_bar, fields = Rows(swept).transpose(ctx.saved, parts, needs_scales)
         extinction_bar, *scattering_bar = fields
         return (

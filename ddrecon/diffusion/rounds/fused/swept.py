@@ -76,7 +76,10 @@ class Swept:
     @staticmethod
     def of(grid: Grid, directions: int, *tensors: Any) -> Swept:
         """From tensors as autograd must be given them: one by one."""
-        return Swept(grid, directions, *tensors[:5], tensors[5 : 5 + PARTS], tensors[5 + PARTS :])
+        scales, extinction, scattering, factors, beams, *parts = tensors
+        light, source = tuple(parts[:PARTS]), tuple(parts[PARTS:])
+        coefficients = scales, extinction, scattering
+        return Swept(grid, directions, *coefficients, factors, beams, light, source)
 
     @property
     def like(self) -> Tensor:
