@@ -65,9 +65,11 @@ def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
 def has_kernels(part: str, is_on_gpu: bool, has_slabs: bool = False) -> bool:
     """Whether warp has kernels for `part` on such a device, of whole grids or in slabs.
 
-    On a GPU multigrid is torch's; sweeps go through whole grids alone.
+    Multigrid and sweeps go through rows, on a processor; sweeps go through whole grids alone.
     """
-    return not (is_on_gpu if part == "diffusion" else part == "transport rounds" and has_slabs)
+    if part == "transport rounds":
+        return not (is_on_gpu or has_slabs)
+    return not (is_on_gpu and part == "diffusion")
 
 
 def name_engines(engines: Mapping[str, str]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.jobs import piece_numbers
+from ddrecon.diffusion.rounds.fused.directions import piece_numbers
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.kernels import shares

@@ -88,18 +88,17 @@ def tangent(
         return forward.unpack_dual(image(scene, duals, engine)).tangent
 
 
-@pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_tangents_of_both_engines_agree(case: str, moves: bool) -> None:
+def test_tangents_of_both_engines_agree(case: str) -> None:
     scene = scene_of(case)
-    values = variables_of(scene, moves)
+    values = variables_of(scene, moves=True)
     changes = changes_of(values)
     known, found = (tangent(scene, values, changes, engine) for engine in ("torch", "warp"))
     assert float((found - known).norm()) <= 1e-11 * float(known.norm())
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_tangents_agree_in_single_precision(case: str) -> None:
+def test_tangents_agree_in_single_precision() -> None:
+    case = "forward, degree 3"
     exact, scene = scene_of(case), scene_of(case, torch.float32)
     values = variables_of(exact)
     changes = changes_of(values)
@@ -129,7 +128,7 @@ def test_tangents_are_transposes_of_adjoints_and_slopes(case: str) -> None:
     assert float((slope - along).norm()) <= 1e-6 * float(along.norm())
 
 
-@pytest.mark.parametrize("name", ["density", "sigma_s", "g", "lights.0.irradiance"])
+@pytest.mark.parametrize("name", ["density", "g"])
 def test_torch_func_finds_the_same_tangents(name: str) -> None:
     scene = scene_of("forward, degree 1")
     value = value_of(scene, name).detach()

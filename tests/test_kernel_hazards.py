@@ -29,7 +29,7 @@ from ddrecon.settings import ParameterSettings, RenderSettings
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.kernels import launch, spare
+from ddrecon.kernels import launch
 
 pytestmark = pytest.mark.slow
 
@@ -187,19 +187,6 @@ def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ValueError, match="no"):
         launch.launch(None, 2, [], like, threads=2)
     assert done.is_set()
-
-
-def test_memory_is_given_back_wherever_the_garbage_collector_begins():
-    """Also where this thread itself holds the list of spare memory."""
-
-    def collect() -> None:
-        with spare._lock:
-            spare.give_back(torch.empty(64))
-
-    collecting = threading.Thread(target=collect, daemon=True)
-    collecting.start()
-    collecting.join(10)
-    assert not collecting.is_alive()
 
 
 def test_threads_are_there_after_a_fork():

@@ -1,17 +1,15 @@
 """Kernels are compiled once, then come from Warp's cache; those of a computation side by side.
 
 Which ones a computation needs is known once it has come to each. So it is rehearsed: launches tell
-what they would launch and do nothing, and what kernels would make is zero. Then it begins at once,
-and compiles what it comes to, while other threads compile the rest from its end.
+what they would launch and do nothing, and what kernels would make is zero.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import logging
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
 from typing import Any
 
@@ -27,42 +25,33 @@ COMPILED = 0.5
 _compiled: list[float] = []
 """How long each took to load [s]; a line says so of the first."""
 _rehearsed: dict[tuple[Any, str], None] | None = None
-"""Kernels that a rehearsal came to, with their devices; None while there is none."""
-_loading: dict[tuple[Any, str], Future[None]] = {}
-"""Kernels that other threads make ready, until a launch needs them."""
+"""Kernels that a rehearsal came to, with their devices, in that order; None while there is none."""
 
 
 def compile_rehearsed(computation: Callable[[], object]) -> None:
     """Has the kernels of `computation` made ready, where this process has loaded none yet.
 
-    They are compiled in as many threads as torch has, of which this is one: it goes on meanwhile.
-    `computation` is called in rehearsal, so it is to work on what nobody else reads.
+    They are compiled in as many threads as torch has. `computation` is called in rehearsal, so it
+    is to work on what nobody else reads.
     """
     if load.cache_info().currsize:
         return
-    with _rehearsal() as kernels:
-        try:
-            computation()
-        except Exception as error:
-            # It goes wrong again in earnest, and is told there; or it came of the zeros, and what
-            # the rehearsal did not come to is compiled when it is needed.
-            LOG.debug("the rehearsal ended early, by %s: %s", type(error).__name__, error)
-    if kernels and (others := torch.get_num_threads() - 1):
-        pool = ThreadPoolExecutor(others, "compiling")
-        # Adjoints, which come last, take longest.
-        _loading.update((each, pool.submit(_load, *each)) for each in reversed(kernels))
-        pool.shutdown(wait=False)
-
-
-@contextlib.contextmanager
-def _rehearsal() -> Iterator[dict[tuple[Any, str], None]]:
-    """Kernels that a rehearsal comes to, and their devices, in that order."""
     global _rehearsed
-    _rehearsed = {}
+    kernels = _rehearsed = {}
     try:
-        yield _rehearsed
+        computation()
+    except Exception as error:
+        # It goes wrong again in earnest, and is told there; or it came of the zeros, and what the
+        # rehearsal did not come to is compiled when it is needed.
+        LOG.debug("the rehearsal ended early, by %s: %s", type(error).__name__, error)
     finally:
         _rehearsed = None
+    pool = ThreadPoolExecutor(torch.get_num_threads(), "compiling")
+    try:
+        # Adjoints, which come last, take longest.
+        list(pool.map(lambda each: load(*each), reversed(kernels)))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def is_rehearsed(kernel: Any, device: str) -> bool:
@@ -82,15 +71,6 @@ def clear_in_rehearsal(arrays: Iterable[Any]) -> None:
 
 @functools.cache
 def load(kernel: Any, device: str) -> None:
-    """Returns when `kernel` is ready: another thread has begun to load it, or this one does so."""
-    loading = _loading.pop((kernel, device), None)
-    if loading is None or loading.cancel():
-        _load(kernel, device)
-    else:
-        loading.result()
-
-
-def _load(kernel: Any, device: str) -> None:
     """Has `kernel` compiled where Warp's cache has it not; a line says so of the first."""
     start = perf_counter()
     wp.load_module(kernel.module, device=device)

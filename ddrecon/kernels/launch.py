@@ -54,22 +54,20 @@ def launch(
     arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
     like: Tensor,
     threads: int | None = None,
-    work: int | None = None,
 ) -> None:
     """Runs `kernel` for `count` items where tensor `like` lies.
 
     On a processor the items are cut into so many shares as there are `threads` (None: as many as
     torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
     share is left to chance, and changes no result: the one that asks does those that no other has
-    begun by the time it has done its own. It does all where that was quick last time, but for
-    `threads` that are given without `work`: a number that tells how long it takes, where that of
-    items does not.
+    begun by the time it has done its own. It does all where that was quick last time and no
+    `threads` are given: how long it takes is then told by the number of items.
     """
     if not count:
         return
     if count >= MOST:
         raise too_many(kernel.key, count)
-    goes_by_time = threads is None or work is not None
+    goes_by_time = threads is None
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
     if is_rehearsed(kernel, device.alias):
@@ -83,7 +81,7 @@ def launch(
         _call(kernel, device, bounds[i + 1] - bounds[i], [bounds[i], *given], stream)
 
     # What was seen to be quick is not worth another thread.
-    size = kernel, (count if work is None else work).bit_length()
+    size = kernel, count.bit_length()
     if threads == 1:
         run(0)
     elif goes_by_time and _seconds.get(size, math.inf) < QUICK:

@@ -90,21 +90,21 @@ INLINE N series(N x) {
 // exp(-depth) = 2^n e^r with n whole and |r| < log(2) / 2. Adding and taking away `shift` rounds to
 // a whole number, whose digits are then those at the end of the sum. libm's exp is no vector code.
 // For depths from about -87 to any size, exact to the last digit but one; where it is below about
-// 1e-38 (1e-304 of doubles) it is that. What is not a number stays so.
-template <class F> INLINE F decay(F depth) {
+// 1e-38 (1e-304 of doubles) it is that. What is not a number stays so. N are numbers F or vectors
+// of them, Bits the same of whole numbers.
+template <class F, class Bits, class N> INLINE N decay_of(N depth) {
 #if defined(__CUDA_ARCH__)
     return exp(-depth);
 #else
     typedef Format<F> Own;
-    typedef typename Own::Bits Bits;
-    const F x = depth > Own::most ? -Own::most : (depth < -Own::most ? Own::most : -depth);
-    const F shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
-    const F r = (x - n * Own::log2_high) - n * Own::log2_low;
-    const F p = series<OfExp, F, Own::terms>(r);
-    const Bits exponent = __builtin_bit_cast(Bits, shifted) << Own::digits;
-    return __builtin_bit_cast(F, (Bits)(__builtin_bit_cast(Bits, p) + exponent));
+    const N end = Own::most - N{}, x = depth > end ? -end : (depth < -end ? end : -depth);
+    const N shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
+    const N r = (x - n * Own::log2_high) - n * Own::log2_low;
+    const Bits p = __builtin_bit_cast(Bits, series<OfExp, F, Own::terms>(r));
+    return __builtin_bit_cast(N, p + (__builtin_bit_cast(Bits, shifted) << Own::digits));
 #endif
 }
+template <class F> INLINE F decay(F depth) { return decay_of<F, typename Format<F>::Bits>(depth); }
 
 // The square root of a number that is at least 0: libm's, which tells of others, is no vector code.
 template <class F> INLINE F root(F x) {

@@ -55,7 +55,6 @@ template <class F> struct Packets {
     static INLINE void write(F* p, V x) { *p = x; }
     static INLINE V gather(const F* p, I at) { return p[at]; }
     static INLINE void add(F* p, I at, V x) { atomicAdd(p + at, x); }
-    static INLINE V decay(V depth) { return exp(-depth); }
     static INLINE V log(V x) { return ::log(x); }
     static INLINE void add_one(F* p, F x) { atomicAdd(p, x); }
 #else
@@ -111,16 +110,8 @@ template <class F> struct Packets {
         const V p = series<OfLog, F, Own::log_terms>(s * s);
         return F(2) * s * p + __builtin_convertvector(n, V) * F(0.69314718055994530942);
     }
-    // exp(-depth), as that of numbers.
-    static INLINE V decay(V depth) {
-        const V end = all(Own::most);
-        const V x = pick(depth > end, -end, pick(depth < -end, end, -depth));
-        const V shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
-        const V r = (x - n * Own::log2_high) - n * Own::log2_low;
-        const M p = __builtin_bit_cast(M, series<OfExp, F, Own::terms>(r));
-        return __builtin_bit_cast(V, p + (__builtin_bit_cast(M, shifted) << Own::digits));
-    }
 #endif
+    static INLINE V decay(V depth) { return decay_of<F, M>(depth); }
     // The lanes' sum, in double precision.
     static INLINE double sum(V x) {
         double total = 0.0;

@@ -2,9 +2,7 @@
 
 The system clears a page when it is first written to, a few hundred microseconds for each megabyte,
 and what a large tensor gives up goes back to the system at once. A solve would spend half its time
-on that. On a GPU torch keeps the memory itself.
-
-What torch's own tensors give up is kept as well, where the C library can be told so.
+on that. So what tensors give up is kept, where the C library can be told so.
 """
 
 from __future__ import annotations
@@ -13,14 +11,8 @@ import ctypes
 import functools
 import os
 import sys
-import threading
 from typing import Any
 
-import torch
-from torch import Tensor
-
-MOST_BYTES = 2**28
-"""So much is kept unused at most: of large volumes little, whose memory is needed elsewhere."""
 LARGEST, MOST_FREE = 2**28, 2**30
 """Bytes of arrays that the system gives and takes each time; and so much free stays at most.
 
@@ -31,10 +23,6 @@ GIVEN_BACK = 2**20
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """What GNU's mallopt calls the two."""
 _OWN_CHOICES = "GLIBC_TUNABLES", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"
-_spare: list[tuple[int, Tensor]] = []
-"""Memory that nobody uses, with its number of bytes: asking a tensor takes a microsecond."""
-# Reentrant: the collector of garbage, which may begin anywhere, gives memory back.
-_lock = threading.RLock()
 
 
 @functools.cache
@@ -72,41 +60,3 @@ def _c_function(name: str) -> Any:
         return None
     # Other libraries than GNU's have no such choice, or decide for themselves.
     return getattr(ctypes.CDLL(None), name, None)
-
-
-def borrow(count: int, like: Tensor) -> Tensor:
-    """`count` numbers of any value, of the type of `like` and beside it; for `give_back`."""
-    if like.is_cuda:
-        return like.new_empty(count)
-    size = count * like.element_size()
-    with _lock:
-        most = max(2 * size, 2**20)
-        fitting = [(length, i) for i, (length, _) in enumerate(_spare) if size <= length <= most]
-        best = _spare.pop(min(fitting)[1])[1] if fitting else None
-    # Made in inference mode, it would be of no use outside.
-    with torch.inference_mode(False):
-        memory = like.new_empty(size, dtype=torch.uint8) if best is None else best
-        return memory[:size].view(like.dtype)
-
-
-def give_back(*tensors: Tensor) -> None:
-    """Keeps the memory of `tensors`, which nobody uses any more, for those to come."""
-    with _lock, torch.inference_mode(False):
-        for tensor in tensors:
-            if not tensor.is_cuda:
-                # All of its storage, of which it may be a part: a view, which costs no operation.
-                size = tensor.untyped_storage().nbytes()
-                if size <= MOST_BYTES:
-                    count = size // tensor.element_size()
-                    memory = tensor.detach().as_strided((count,), (1,), 0).view(torch.uint8)
-                    _spare.append((size, memory))
-        while sum(size for size, _ in _spare) > MOST_BYTES:
-            del _spare[0]
-
-
-def _release_lock() -> None:
-    global _lock
-    _lock = threading.RLock()
-
-
-os.register_at_fork(after_in_child=_release_lock)

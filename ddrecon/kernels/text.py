@@ -35,6 +35,7 @@ _TYPES = {
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
 }
+_INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;
 """
@@ -101,16 +102,14 @@ class TextKernel:
         made: Mapping[str, Any],
         threads: int | None = None,
         shares: Sequence[Mapping[str, Any]] = (),
-        work: int | None = None,
     ) -> None:
         """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
 
         Those that are made are contiguous. A thread has what is in its own of `shares` as well.
-        `work` as of `launch.launch`.
         """
         bound = self.bind(given, made)
         if not shares:
-            bound.launch(count, threads, work)
+            bound.launch(count, threads)
             return
         own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
         for record, share in zip(own, shares, strict=True):
@@ -175,21 +174,21 @@ def include(header: str) -> Any:
 
     They are experimental in Warp 1.19, and named here alone.
     """
-    line, root = f'#include "ddrecon/{header}"\n', Path(__file__).parents[2]
-    return wp.ModuleBuildOptions(
-        extra_cpu_include_dirs=[str(root)],
-        extra_cuda_include_dirs=[str(root)],
-        extra_cpu_preamble=line,
-        extra_cuda_preamble=line,
-        extra_build_dependencies=sorted(map(str, _included(root / "ddrecon" / header, root))),
-    )
+    text = "".join(_texts(header).values())
+    return wp.ModuleBuildOptions(extra_cpu_preamble=text, extra_cuda_preamble=text)
 
 
 @functools.cache
-def _included(header: Path, root: Path) -> frozenset[Path]:
-    """`header` and those it includes: modules are compiled anew where one of them has changed."""
-    names = re.findall(r'#include "(.*)"', header.read_text(encoding="utf-8"))
-    return frozenset({header}).union(*(_included(root / name, root) for name in names))
+def _texts(header: str) -> dict[str, str]:
+    """The text of a `header` after those of what it includes, by path.
+
+    Given by text, not by path, a kernel is the same wherever the package lies.
+    """
+    text, found = (Path(__file__).parents[1] / header).read_text(encoding="utf-8"), {}
+    for included in _INCLUDE.findall(text):
+        found |= _texts(included)
+    text = _INCLUDE.sub("", text.removeprefix("#pragma once"))
+    return found | {header: f'#line 1 "ddrecon/{header}"\n{text}'}
 
 
 @dataclass(frozen=True)
@@ -201,13 +200,11 @@ class Bound:
     held: Any
     like: Tensor
 
-    def launch(
-        self, count: int, threads: int | None = None, work: int | None = None, **changed: Any
-    ) -> None:
+    def launch(self, count: int, threads: int | None = None, **changed: Any) -> None:
         """Does `count` items, with numbers and contiguous arrays `changed`."""
         for name, value in changed.items():
             self.kernel.write(self.record, name, value)
-        launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads)
 
 
 def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:

@@ -5,16 +5,6 @@
 
 namespace ddrecon {
 
-// Second differences, themselves interpolated the part `a` of the way from the second neighbor to
-// the third, are the neighbors weighed by these. F are numbers, N what they are of: dual numbers,
-// packets.
-template <class F, class N> INLINE void second_differences(N a, N* weight) {
-    weight[0] = F(1) - a;
-    weight[1] = F(3) * a - F(2);
-    weight[2] = F(1) - F(3) * a;
-    weight[3] = a;
-}
-
 // Within so many cells a place counts as on a cell's center, by its number of digits.
 template <class F> INLINE double kink_width(int size) {
     return 16.0 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23) * size;
@@ -48,7 +38,11 @@ template <class N> struct Taps {
         linear[1] = F(1) - a;
         linear[2] = a;
         if (!is_kink) weight = F(0.5) * a * (F(1) - a);
-        second_differences<F>(a, bend);
+        // Second differences, interpolated the part a of the way, are the values weighed by these.
+        bend[0] = F(1) - a;
+        bend[1] = F(3) * a - F(2);
+        bend[2] = F(1) - F(3) * a;
+        bend[3] = a;
         if constexpr (IS_DUAL<N>) {
             if (is_kink) {
                 const int center = place.a < F(0.5) ? 1 : 2;

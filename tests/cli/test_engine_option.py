@@ -86,7 +86,7 @@ DENSITY = half_empty(3, 4, 5)
 PLACE, POWER = DENSITY.new_tensor([0.9, 0.7, 0.2]), DENSITY.new_tensor([1.0])
 LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
     ({"transport_rounds": 1}, [], False, ()),
-    ({"transport_rounds": 1}, [], True, ("diffusion",)),
+    ({"transport_rounds": 1}, [], True, ("diffusion", "transport rounds")),
     ({"model": "flux_limited"}, [PointLight(PLACE, POWER)], False, ("diffusion", "point lights")),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2}, [], False, ("pairs of beams",)),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2, "directional": None}, [], False, ()),

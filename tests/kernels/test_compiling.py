@@ -1,7 +1,6 @@
 """A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
 
 import logging
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,37 +92,3 @@ def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.Mon
     # Where a process has kernels, nothing is rehearsed.
     compiling.compile_rehearsed(lambda: found.append("again"))
     assert "again" not in found
-
-
-def test_a_launch_waits_for_no_other_kernel(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A computation begins while its last kernel is still compiled."""
-    first, *_, last = fill_kernels()
-    has_begun, may_end = threading.Event(), threading.Event()
-    real = compiling.wp.load_module
-
-    def load_slowly(module: object, **of: object) -> None:
-        if module is last.module:
-            has_begun.set()
-            assert may_end.wait(60)
-        real(module, **of)
-
-    monkeypatch.setattr(compiling.wp, "load_module", load_slowly)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    out = torch.zeros(4, dtype=torch.float64)
-    # In a thread of its own: code that waits for all would never come back.
-    work = [kernel.launch for kernel in (first, last)]
-    rehearsing = threading.Thread(
-        target=compiling.compile_rehearsed,
-        args=(lambda: [launch(4, {}, {"out": out.clone()}) for launch in work],),
-        daemon=True,
-    )
-    rehearsing.start()
-    rehearsing.join(30)
-    is_free = not rehearsing.is_alive() and has_begun.wait(30)
-    if is_free:
-        first.launch(4, {}, {"out": out}, 1)
-    may_end.set()
-    assert is_free and out.all()
-    rehearsing.join()
-    last.launch(4, {}, {"out": out.zero_()}, 1)
-    assert out.all()

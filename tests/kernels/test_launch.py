@@ -47,30 +47,28 @@ def test_shares_that_no_thread_begins_are_done_by_the_one_that_asks(done, busy):
 
 
 def test_quick_launches_have_the_same_shares(done, monkeypatch):
-    kernel, asked = object(), {"threads": 2, "work": COUNT}
-    monkeypatch.setattr(launching, "_seconds", _Seconds(2 * launching.QUICK))
-    launching.launch(kernel, COUNT, lambda i: [i], HERE, **asked)
-    monkeypatch.setattr(launching, "_seconds", _Seconds(launching.QUICK / 2))
-    launching.launch(kernel, COUNT, lambda i: [i], HERE, **asked)
+    kernel = object()
+    monkeypatch.setattr(launching, "thread_count", lambda like: 2)
+    for seconds in (2 * launching.QUICK, launching.QUICK / 2):
+        monkeypatch.setattr(launching, "_seconds", _Seconds(seconds))
+        launching.launch(kernel, COUNT, lambda i: [i], HERE)
     assert sorted(done[:2]) == done[2:] == SHARES
 
 
-@pytest.mark.parametrize(
-    ("asked", "shared"),
-    [({"threads": 2}, 2), ({"threads": 2, "work": COUNT}, 1), ({"threads": 1}, 0)],
-)
-def test_a_quick_launch_is_shared_where_threads_alone_are_given(done, monkeypatch, asked, shared):
+@pytest.mark.parametrize(("threads", "shared"), [(2, 2), (None, 1), (1, 0)])
+def test_a_quick_launch_is_shared_where_threads_are_given(done, monkeypatch, threads, shared):
     """Those of a solve that finds all exact take no time, and the next ones do.
 
     By time goes only the second launch, which the first one told to be quick.
     """
     shares: list[int] = []
     share = launching._share
+    monkeypatch.setattr(launching, "thread_count", lambda like: 2)
     monkeypatch.setattr(launching, "_seconds", {})
     monkeypatch.setattr(launching, "_share", lambda *given: shares.append(1) or 0 * share(*given))
     kernel = object()
     for _ in range(2):
-        launching.launch(kernel, COUNT, lambda i: [i], HERE, **asked)
+        launching.launch(kernel, COUNT, lambda i: [i], HERE, threads)
     assert len(shares) == shared
 
 

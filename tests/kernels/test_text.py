@@ -1,6 +1,7 @@
 """Kernels that are a text in C++: what they are given arrives, whatever threads launch them."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from media import random_values
 pytest.importorskip("warp")
 
 from ddrecon.errors import UsageError
-from ddrecon.kernels.text import BLOCK, TextKernel, cut
+from ddrecon.kernels.text import BLOCK, TextKernel, cut, include
 
 TEXT = """
 for (int i = begin; i < end; ++i) {
@@ -132,6 +133,13 @@ def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
     kernel = TextKernel("find_row", 32, text, given, "place", "march/fused/rays.h")
     kernel.launch(1, {"ray_count": 33_000_000, "row": 71}, {"place": found})
     assert found.item() == 33_000_000 * 71 > 2**31
+
+
+def test_where_the_package_lies_is_no_part_of_a_kernel():
+    """So other checkouts find it compiled."""
+    given = vars(include("diffusion/rounds/fused/gain.h"))
+    assert str(Path(__file__).parents[2]) not in repr(given)
+    assert given["extra_cpu_preamble"].count("struct Dual {") == 1
 
 
 def test_counts_beyond_the_numbers_of_an_int_are_refused(kernel):

@@ -1,22 +1,22 @@
 """One sweep: radiance along every direction of a quadrature, of which only moments are kept (E17).
 
 Directions are gone through one at a time, and computed again one at a time in the backward pass:
-memory does not grow with their number.
+memory does not grow with their number. Through slabs of the grid light goes from one to the next
+(E48): while one rank follows a direction, the next follows that before, and half of the directions
+come from either end, so that all ranks have something to do nearly from the beginning.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction, radiance_along
-from ddrecon.diffusion.rounds.slabs import pass_on
 from ddrecon.engine import has_kernels
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -24,7 +24,8 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
-from ddrecon.slabs.exchange import add_halo
+from ddrecon.ranks import own_rank, rank_count
+from ddrecon.slabs.exchange import add_halo, swap_layers
 from ddrecon.slabs.slab import Slab
 
 DIRECTIONS = {1: 18, 3: 26, 5: 50, 7: 86}
@@ -34,14 +35,6 @@ Of two moments 26 give no better images than 18; 14, along axes and corners of a
 """
 
 
-class Ray(NamedTuple):
-    """A `direction` of the quadrature (array order), its `weight`, and its `harmonics` Y_k [K]."""
-
-    direction: Direction
-    weight: float
-    harmonics: Tensor
-
-
 def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E11, E17).
 
@@ -49,34 +42,75 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
-    rays = list(_rays(degree, source))
-    axis, shape, ways = 0, list(grid.shape), [0] * len(rays)
+    directions, weights, values = _rule(degree, count)
+    values = values.to(source)
+    axis, shape, ways = 0, list(grid.shape), [0] * len(directions)
     nothing = source.new_zeros(())
     if isinstance(grid, Slab):
         axis, shape[grid.axis] = grid.axis, grid.size
-        ways = [Course.of(grid.whole, ray.direction).way_along(axis) for ray in rays]
+        ways = [Course.of(grid.whole, direction).way_along(axis) for direction in directions]
         # It varies as light does: all layers are exchanged alike.
         nothing = torch.zeros_like(source[0].narrow(axis - 3, 0, 1)) + 0 * source.flatten()[0]
     moments = source.new_zeros(count, colors * math.prod(shape))
 
     def add(number: int, entering: Tensor) -> Tensor:
-        ray = rays[number]
-        radiance = recompute(_follow_ray, medium, source, inflow, ray, entering)
-        moments.addr_(ray.weight * ray.harmonics, radiance.flatten())
+        row = values[number]
+        radiance = recompute(
+            _follow_direction, medium, source, inflow, row, directions[number], entering
+        )
+        moments.addr_(weights[number] * row, radiance.flatten())
         leaving = radiance.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
         return leaving if inflow is None else leaving - inflow
 
-    rest = pass_on(ways, nothing, add)
+    rest = _pass_on(ways, nothing, add)
     found = moments.view(count, colors, *shape)
     return add_halo(found + 0 * rest.sum(), grid) if isinstance(grid, Slab) else found
 
 
-def _follow_ray(
-    medium: Medium, source: Tensor, inflow: Tensor | None, ray: Ray, entering: Tensor
+def _follow_direction(
+    medium: Medium,
+    source: Tensor,
+    inflow: Tensor | None,
+    row: Tensor,
+    direction: Direction,
+    entering: Tensor,
 ) -> Tensor:
-    """I along `ray` (E11), of the sum over moments of its harmonics times the `source`."""
-    scatters = torch.tensordot(ray.harmonics, source, 1)
-    return radiance_along(medium, scatters, inflow, ray.direction, entering)
+    """I along `direction` (E11), of the sum over moments of its harmonics `row` times `source`."""
+    scatters = torch.tensordot(row, source, 1)
+    return radiance_along(medium, scatters, inflow, direction, entering)
+
+
+def _pass_on(
+    ways: Sequence[int], nothing: Tensor, follow: Callable[[int, Tensor], Tensor]
+) -> Tensor:
+    """Has directions followed, by number and what enters the slab, as what leaves one goes on.
+
+    `ways`: 1 for directions that go from a slab to the next, -1 to the last, 0 to none; `nothing`
+    enters the first. Returns what nobody took up at the end: derivatives that go through it meet
+    all exchanges, on all ranks in the same order.
+    """
+    for number, way in enumerate(ways):
+        if way == 0:
+            follow(number, nothing)
+    if not any(ways):
+        return nothing
+    upwards, downwards = (
+        [number for number, way in enumerate(ways) if way == one] for one in (1, -1)
+    )
+
+    def take_turn(numbers: Sequence[int], place: int, entering: Tensor) -> Tensor:
+        is_there = 0 <= place < len(numbers)
+        return follow(numbers[place], entering) if is_there else 0 * entering
+
+    to_below = to_above = below = above = nothing
+    rank, last = own_rank(), rank_count() - 1
+    for turn in range(max(len(upwards), len(downwards)) + last):
+        if turn:
+            below, above = swap_layers(to_below, to_above)
+        # Its turn comes to a rank as many turns later as ranks are before it.
+        to_above = take_turn(upwards, turn - rank, below)
+        to_below = take_turn(downwards, turn - (last - rank), above)
+    return to_below + to_above
 
 
 def sweep_change(
@@ -91,36 +125,23 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    runs_fused = is_fused() and has_kernels("transport rounds", *where)
-    if runs_fused and not medium.is_cellwise:
+    if is_fused() and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
+        if medium.is_cellwise:
+            # the kernels' factors are the same everywhere: what scatters is summed before
+            source = light.weighted(factors).plus(source)
+            factors = torch.zeros_like(factors[..., :1, :1, :1])
         return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    if runs_fused:
-        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
-
-        # the kernels' factors are the same everywhere: what scatters was summed
-        whole, ones = Moments.of_harmonics(scatters), torch.ones_like(factors[..., :1, :1, :1])
-        swept = sweep_fused(medium, None, ones, whole, inflow, DIRECTIONS[degree])
-    else:
-        swept = Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
-    less = replace(light, higher=None).scaled(-1.0, -1.0)
-    return swept.plus(less)
-
-
-def _rays(degree: int, source: Tensor) -> Iterator[Ray]:
-    """The rays of the quadrature for `degree`, with a harmonic for each moment of `source`."""
-    directions, weights, values = _rule(degree, len(source))
-    for direction, weight, row in zip(directions, weights, values.to(source), strict=True):
-        yield Ray(direction, weight, row)
+    swept = Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
+    return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
 
 
 @functools.cache
 @torch.inference_mode(False)
-def _rule(degree: int, count: int) -> tuple[tuple[Direction, ...], tuple[float, ...], Tensor]:
+def _rule(degree: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
     """Directions, weights, and the first `count` harmonics [N, K] of each direction."""
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
     values = harmonics(points, degree).T[:, :count].contiguous()
-    directions = tuple((z, y, x) for z, y, x in points.tolist())
-    return directions, tuple(weights.tolist()), values
+    return [(z, y, x) for z, y, x in points.tolist()], weights.tolist(), values

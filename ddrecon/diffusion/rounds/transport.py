@@ -106,13 +106,14 @@ def _blend(
     That is what is `new`, and theta times what was `swept` of higher degree.
     """
     if is_fused() and not medium.is_cellwise:
-        from ddrecon.diffusion.rounds.fused.blend import blend_fused
+        from ddrecon.diffusion.rounds.fused.gain import blend_fused
 
         length = _share_length(medium, degree)
         return blend_fused(medium, light, new, swept, factor, length)
     share = recompute(_transport_share, medium, degree)
     new = replace(new, higher=share * swept)
-    return light.plus(_times(new.plus(_times(light, -1)), factor))
+    change = new.plus(light.scaled(-1.0, -1.0, -1.0))
+    return light.plus(change.scaled(factor, factor, factor))
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
@@ -124,10 +125,6 @@ def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
     """
     p_1 = remaining_moments(medium)[1]
     return p_1 if is_last else p_1 * (1 - p_1) / (2 - p_1)
-
-
-def _times(light: Moments, factor: Tensor | float) -> Moments:
-    return light.scaled(factor, factor, factor)
 
 
 def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
@@ -164,13 +161,8 @@ def _gain(
     source = source if off is None else source - share * off.mean
     if change.flux is None:
         return gain, source, None
-    return gain, source, recompute(_turned, share, cosine, change.flux)
-
-
-def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
-    """theta `cosine` (L1' - L1)."""
-    z, y, x = (share * cosine * along for along in change)
-    return z, y, x
+    z, y, x = (share * cosine * along for along in change.flux)
+    return gain, source, (z, y, x)
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:

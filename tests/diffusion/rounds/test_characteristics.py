@@ -8,7 +8,7 @@ from media import box_grid, half_empty, random_values
 from plain_rays import by_cells
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_along
+from ddrecon.diffusion.rounds.characteristics import radiance_along
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
@@ -101,21 +101,6 @@ def test_radiance_is_never_negative_where_nothing_that_scatters_is(direction):
 
 
 @each_direction
-def test_following_backward_is_the_adjoint_of_following(direction):
-    course = Course.of(box_grid((4, 5, 6)), direction)
-    laid = [
-        course.lay(random_values(colors, 4, 5, 6, seed=seed))
-        for seed, colors in ((0, 1), (1, 3), (2, 3))
-    ]
-    passed, source, received = laid[0], laid[1].requires_grad_(), laid[2]
-    found = follow(passed, source, course)
-    (source_bar,) = torch.autograd.grad(found, source, received)
-    assert (source_bar * source).sum().item() == pytest.approx(
-        (found * received).sum().item(), rel=1e-13
-    )
-
-
-@each_direction
 @pytest.mark.parametrize("colors", [1, 3])
 def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int):
     grid = box_grid((3, 2, 4))
@@ -131,13 +116,4 @@ def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int
 
     assert torch.autograd.gradcheck(
         radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True
-    )
-
-
-def test_steps_across_flat_cells_are_counted_in_cells():
-    course = Course.of(Grid((8, 4, 4), (0.0, 0.0, 0.0), (0.8, 4.0, 4.0)), (0.6, 0.8, 0.0))
-    assert (
-        course.order[0] == 1
-        and course.step == pytest.approx(0.1 / 0.6)
-        and course.drift == (pytest.approx(0.8 / 0.6 * 0.1), 0)
     )

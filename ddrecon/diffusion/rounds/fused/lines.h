@@ -35,14 +35,6 @@ INLINE N gather(const Line<N>* from, const F* part, long long c) {
                part[3] * from[3][c];
 }
 
-template <int POINTS, class F> INLINE F gather(const F* const* from, const F* part, long long c) {
-    if constexpr (POINTS == 1)
-        return from[0][c];
-    else
-        return part[0] * from[0][c] + part[1] * from[1][c] + part[2] * from[2][c] +
-               part[3] * from[3][c];
-}
-
 template <class F> struct Vectors {
     static constexpr int LANES = 64 / sizeof(F);
     typedef F V __attribute__((vector_size(64)));

@@ -32,7 +32,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
     // Of a row and a direction: where light went on to, by slice and row; cotangents of I, which
     // become those of what scatters, and of all else.
     template <int POINTS> struct Back {
-        const F *from[POINTS], *light_from[POINTS];
+        Line<F> from[POINTS];
         F *bar, *returning, *far, *mass, *scattered;
     };
 
@@ -61,7 +61,9 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
           inflow_bar(light.scratch_row(4)) {}
 
     INLINE F* field_bar(F* bars, int channels) const {
-        return bars + (channels > 1 ? job.own_bar : job.shared_bar) * light.cells;
+        const int own = job.piece * of.colors + job.color;
+        const int shared = job.piece * of.together + job.color - of.color_from;
+        return bars + (channels > 1 ? own : shared) * light.cells;
     }
     INLINE F* bar_of(int j) const { return light.scratch_row(5 + j); }
     INLINE F* line(int s, int t, int j) const {
@@ -95,8 +97,9 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             else
                 return_direction<4>(here, begin, j);
         if (VARIES_NUMBERS) {
+            double* own_sums = of.sums + 3 * (2 * of.color_from * of.pieces + job.lane);
             const F* const rows[3] = {scale_bar, strength_bar, inflow_bar};
-            for (int i = 0; i < 3; ++i) of.sums[3 * job.sums_at + i] += total(rows[i], width);
+            for (int i = 0; i < 3; ++i) own_sums[i] += total(rows[i], width);
         }
         to_moments<DEGREE>(light.matrices[1], found, taken, F(0), is_adding, pairs, ahead, width);
     }
@@ -105,19 +108,14 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         const Here& here, const typename Light::Beginnings& begin, int j) const {
         const Steps<POINTS> steps = light.template find_steps<POINTS>(here, begin, j);
         const Course& course = light.course(j);
-        const int x_way = course.signs[2];
+        const int x_way = course.x_way;
         F* own = line(here.s, here.t, j);
-        Back<POINTS> back = {{},
-                             {},
-                             bar_of(j),
-                             own,
-                             own + FAR * pitch,
-                             own + MASS * pitch,
-                             own + (KINDS - 1) * pitch};
+        Back<POINTS> back = {
+            {}, bar_of(j), own, own + FAR * pitch, own + MASS * pitch, own + (KINDS - 1) * pitch};
         for (int kind = 0; kind < KINDS; ++kind)
             own[kind * pitch - 1] = own[kind * pitch + width] = F(0);
         // What returns from the cells to which light went on, but for those of this row.
-        const F* next[4];
+        F* next[4];
         for (int i = 0; i < 4; ++i) {
             const int s = here.s + i / 2, t = here.t + i % 2;
             next[i] = s < of.depth && t < of.height ? line(s, t, j) : nullptr;
@@ -125,8 +123,8 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         UNROLLED
         for (int i = 0; i < POINTS; ++i) {
             const int *point = course.points[i], place = 2 * point[0] + point[1];
-            back.from[i] = (place && next[place] ? next[place] : light.empty) + point[2] * x_way;
-            back.light_from[i] = steps.light_from[i].at;
+            back.from[i] = {place && next[place] ? next[place] : light.empty};
+            back.from[i] = back.from[i] + point[2] * x_way;
         }
         if (course.is_along) {
             carry_back(steps, back, x_way);
@@ -169,7 +167,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             for (int a = 0; a <= (point[0] && here.s == 0); ++a)
                 for (int b = 0; b <= (point[1] && here.t == 0); ++b)
                     if (const F* to = next[2 * (a ? 0 : point[0]) + (b ? 0 : point[1])])
-                        found[count++] = {to, point[2] * course.signs[2], part[i], !a && !b};
+                        found[count++] = {to, point[2] * course.x_way, part[i], !a && !b};
         }
         return count;
     }
@@ -204,7 +202,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         constexpr bool IS_EMPTY = MATTER == EMPTY;
         INDEPENDENT
         for (int c = from; c < to; ++c) {
-            const F arriving = gather<POINTS>(back.light_from, steps.part, c);
+            const F arriving = gather<POINTS>(steps.light_from, steps.part, c);
             const F far = gather<POINTS>(steps.near_from, steps.part, c), near = steps.near[c];
             const F mass = IS_EMPTY ? F(0) : steps.mass(c);
             const F scattering_mass = IS_EMPTY ? F(0) : steps.scattering_mass(c);
@@ -229,23 +227,21 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
     }
 };
 
-// A lane's jobs. Slabs are gone through from the last one on: forward, and then back.
+// Slabs are gone through from the last one on: forward, and then back.
 template <int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS, class F>
 INLINE void return_rows(int lane, const Sweep<F>& of) {
-    for (int i = of.starts[lane]; i < of.starts[lane + 1]; ++i) {
-        const Job& job = ((const Job*)of.jobs)[i];
-        Rows<F, F, DEGREE, SHARES_FIELD, true> light(of, job);
-        const ReturningRows<F, DEGREE, SHARES_FIELD, VARIES_NUMBERS> back(light);
-        for (int from, to = job.slice_to; to > job.slice_from; to = from) {
-            from = light.slab_of(to - 1);
-            light.follow(from, to);
-            for (int s = to - 1; s >= from; --s)
-                for (int g = job.group_to - 1; g >= job.group_from; --g) {
-                    light.enter_group(g);
-                    for (int t = of.height - 1; t >= 0; --t)
-                        back.return_row(light.place(s, t), job.adds || g < job.group_to - 1);
-                }
-        }
+    const Job job(lane, of);
+    Rows<F, F, DEGREE, SHARES_FIELD, true> light(of, job);
+    const ReturningRows<F, DEGREE, SHARES_FIELD, VARIES_NUMBERS> back(light);
+    for (int from, to = job.slice_to; to > job.slice_from; to = from) {
+        from = light.slab_of(to - 1);
+        light.follow(from, to);
+        for (int s = to - 1; s >= from; --s)
+            for (int g = job.group_to - 1; g >= job.group_from; --g) {
+                light.enter_group(g);
+                for (int t = of.height - 1; t >= 0; --t)
+                    back.return_row(light.place(s, t), of.adds || g < job.group_to - 1);
+            }
     }
 }
 

@@ -2,7 +2,7 @@
 #include "ddrecon/diffusion/rounds/fused/moments.h"
 // Rows of cells along which radiance is followed (E11, E12).
 //
-// A job goes through the slices across z in the way that its light takes, s counting them, and in
+// A lane goes through the slices across z in the way that its light takes, s counting them, and in
 // each through the rows, t counting them in the way of a group of directions. A step begins at a
 // mean of up to four cells, which lie in this slice or the one before, in this row or the one
 // before: wherever a direction goes, they were done already. Of a row and a direction there are two
@@ -165,7 +165,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         UNROLLED
         for (int i = 0; i < POINTS; ++i) {
             const int *point = own.points[i], place = 2 * point[0] + point[1];
-            const int shift = point[2] * own.signs[2];
+            const int shift = point[2] * own.x_way;
             found.part[i] = parts.part[i];
             found.near_from[i] = begin.near[place] + (own_line - shift);
             found.light_from[i] = begin.is_inside[place] ? begin.light[place] + (own_line - shift)
@@ -222,7 +222,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                     find_scattering(
                         here, KEEPS ? 0 : here.range[2], KEEPS ? of.width : here.range[3]);
                     follow_row(here);
-                    if constexpr (!KEEPS) add_moments(here, job.adds || g > job.group_from);
+                    if constexpr (!KEEPS) add_moments(here, of.adds || g > job.group_from);
                 }
             }
     }
@@ -235,7 +235,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             const Line<N> light = line(here.s, here.t, LIGHT, group->before + j);
             light.put(-1, N(F(0)));
             light.put(width, N(F(0)));
-            if (own.signs[2] > 0)
+            if (own.x_way > 0)
                 near.put(-1, near[0]);
             else
                 near.put(width, near[width - 1]);
@@ -268,7 +268,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             if (!own.points[i][0] && !own.points[i][1]) steps.light_from[i] = nothing();
         follow_steps<true>(here, steps, light);
         const Line<N> carried = line_at<N>(scratch_row(0), of.pitch);
-        const int way = own.signs[2], width = of.width;
+        const int way = own.x_way, width = of.width;
         carry_on(light.at, carried.at, way, width);
         if constexpr (IS_CHANGED) {
             INDEPENDENT
@@ -310,12 +310,13 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         const Line<N> light = line(here.s, here.t, LIGHT, group->before);
         F* const begin = found_row(here);
         const F* taken[COUNT];
-        F *found[COUNT], first = value_of(inflow), *lines = light.at;
-        if constexpr (IS_CHANGED) first = inflow.by[0], lines = light.change;
+        F *found[COUNT], first = change_of(inflow), *lines = light.at;
+        if constexpr (IS_CHANGED) lines = light.change;
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i];
-            const bool is_known = k < 4 && !job.piece && !IS_CHANGED;
-            const F* part = is_known ? part_of(of.light_parts, k, all) : nullptr;
+            const bool is_known = k < 4 && !job.piece;
+            const F* const* light_parts = IS_CHANGED ? of.d_light_parts : of.light_parts;
+            const F* part = is_known ? part_of(light_parts, k, all) : nullptr;
             taken[i] = row_of(part, job.color * cells + here.at);
             found[i] = begin + k * all;
         }
@@ -328,13 +329,10 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     }
 };
 
-// A lane's jobs, each of its slices at once.
 template <class N, int DEGREE, bool SHARES_FIELD, class F>
 INLINE void follow_rows(int lane, const Sweep<F>& of) {
-    const Job* jobs = (const Job*)of.jobs;
-    for (int i = of.starts[lane]; i < of.starts[lane + 1]; ++i)
-        Rows<N, F, DEGREE, SHARES_FIELD, false>(of, jobs[i])
-            .follow(jobs[i].slice_from, jobs[i].slice_to);
+    const Job job(lane, of);
+    Rows<N, F, DEGREE, SHARES_FIELD, false>(of, job).follow(job.slice_from, job.slice_to);
 }
 
 } // namespace ddrecon

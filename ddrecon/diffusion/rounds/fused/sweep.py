@@ -7,68 +7,56 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.by_cells import Cells
-from ddrecon.diffusion.rounds.fused.by_rows import Rows
+from ddrecon.diffusion.rounds.fused.rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import (
     PARTS,
+    Parts,
     Swept,
-    less_light,
     parts_of,
     split,
     units_of_parts,
 )
-from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.autodiff import differentiate_once, is_forward, keep, run_plainly
 from ddrecon.numerics.harmonics import degrees_on
 from ddrecon.numerics.remember import remember
 
 
 def sweep_fused(
     medium: Medium,
-    light: Moments | None,
+    light: Moments,
     factors: Tensor,
     source: Moments,
     inflow: Tensor | None,
     directions: int,
-    by_cells: bool | None = None,
 ) -> Moments:
     """The moments of the radiance that `light`, by `factors`, and `source` scatter (E17).
 
-    The first two less those of `light`, where there is one, as `sweep_change` has it.
-    `directions`: how many the quadrature has; `by_cells`: whether a thread does a cell of a slice,
-    not rows of directions; None: on a GPU.
+    The first two less those of `light`. `directions`: how many the quadrature has.
     """
-    colors = len(medium.extinction.value) if light is None else len(light.mean)
-    beam_factors = None
+    colors, beam_factors = len(light.mean), None
+    if is_forward():  # where a beam and its factors may both change
+        source = source.spelled()
     if source.beam is not None:
         beam, each = source.beam
-        source, units = Moments(beam), _units_of(factors)
-        beam_factors = (units * each).expand(-1, colors)
+        # The parts of light are so many times its moments.
+        units = units_of_parts(len(factors) - 1)[:, None].to(factors)
+        source, beam_factors = Moments(beam), (units * each).expand(-1, colors)
     shares_field = medium.remaining.field is medium.extinction.field
     fields = medium.extinction.field, None if shares_field else medium.remaining.field
-    light_parts = (None,) * PARTS if light is None else parts_of(light, colors)
-    *found, _ = _Sweep.apply(
-        source.mean.is_cuda if by_cells is None else by_cells,
+    mean, z, y, x, higher, _ = _Sweep.apply(
         torch.is_grad_enabled(),
         medium.grid,
         directions,
-        _scales(
-            medium.extinction.scale,
-            medium.remaining.scale,
-            inflow,
-            colors,
-        ),
+        _scales(medium.extinction.scale, medium.remaining.scale, inflow, colors),
         *fields,
         _spread_factors(factors, colors),
         beam_factors,
-        *light_parts,
+        *parts_of(light, colors),
         *parts_of(source, colors),
     )
-    mean, *rest = found
-    z, y, x, higher = (*rest, None)[:4] if rest else (None, None, None, None)
-    return Moments(mean, (z, y, x) if rest else None, higher)
+    return Moments(mean, None if z is None else (z, y, x), higher)
 
 
 @remember
@@ -86,12 +74,6 @@ def _spread_factors(factors: Tensor, colors: int) -> Tensor:
     return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
 
 
-@remember
-def _units_of(factors: Tensor) -> Tensor:
-    """How many times the moments that have `factors` the parts of light are, [K, 1]."""
-    return units_of_parts(len(factors) - 1)[:, None].to(factors)
-
-
 class _Sweep(torch.autograd.Function):
     """The parts of light, and their derivatives by all tensors of `Swept`.
 
@@ -99,20 +81,16 @@ class _Sweep(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
-        swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
-        if by_cells:
-            return *split(less_light(swept.light, Cells(swept).follow())), None
-        is_saved = may_save and any(
-            isinstance(each, Tensor) and each.requires_grad for each in given
-        )
-        moments, saved = Rows(swept, threads).follow(is_saved)
+    def forward(may_save: bool, *given: Any) -> tuple[Any, ...]:
+        tensors = (each for each in given if isinstance(each, Tensor))
+        is_saved = may_save and any(each.requires_grad for each in tensors)
+        moments, saved = Rows(Swept.of(*given)).follow(is_saved)
         return *split(moments), saved
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-        ctx.by_cells, _, grid, directions, *tensors = inputs
-        ctx.of, ctx.threads, ctx.saved = (grid, directions), thread_count(output[0]), output[-1]
+        _, grid, directions, *tensors = inputs
+        ctx.of, ctx.saved = (grid, directions), output[-1]
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*([] if ctx.saved is None else [ctx.saved]))
         keep(ctx, *tensors)
@@ -121,17 +99,12 @@ class _Sweep(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
+        _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
         needs_beam_factors, *needs_parts = needs_more
-        parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
-        if ctx.by_cells:
-            found = Cells(swept).transpose(parts, needs_scales)
-        else:
-            found = Rows(swept, ctx.threads).transpose(ctx.saved, parts, needs_scales)
-        scales_bar, moments_bar, fields = found
+        parts = bars[:-1]
+        scales_bar, moments_bar, fields = Rows(swept).transpose(ctx.saved, parts, needs_scales)
         extinction_bar, *scattering_bar = fields
         return (
-            None,
             None,
             None,
             None,
@@ -146,15 +119,10 @@ class _Sweep(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor | None, ...]:
-        def change(*tensors: Any) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> Parts:
             half = len(tensors) // 2
             swept = Swept.of(*ctx.of, *tensors[:half])
             d_swept = swept.changes(*tensors[half:])
-            swept = swept.spelled()
-            if ctx.by_cells:
-                changed = Cells(swept, d_swept).follow()
-            else:
-                changed, _ = Rows(swept, ctx.threads, d_swept).follow()
-            return split(less_light(d_swept.light, changed))
+            return split(Rows(swept, d_swept).follow()[0])
 
-        return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None
+        return *run_plainly(change, *ctx.saved_tensors, *changes[3:]), None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -37,17 +37,12 @@ def units_of_parts(degree: int) -> Tensor:
     return units
 
 
-def split(moments: Tensor) -> tuple[Tensor, ...]:
+def split(moments: Tensor) -> Parts:
     """The parts of light in `moments` [K, C, z, y, x]."""
     if len(moments) == 1:
-        return (moments[0],)
-    first = (moments[_OF_HARMONIC.index(part)] for part in range(PARTS - 1))
-    return (*first, moments[PARTS - 1 :])[: 5 if len(moments) > 4 else 4]
-
-
-def in_parts(moments: Tensor) -> Parts:
-    """The same, with None for parts that are missing."""
-    return (*split(moments), *[None] * PARTS)[:PARTS]
+        return moments[0], None, None, None, None
+    y, z, x = moments[1:4]
+    return moments[0], z, y, x, moments[4:] if len(moments) > 4 else None
 
 
 def moment_of(parts: Parts, k: int) -> Tensor | None:
@@ -56,14 +51,6 @@ def moment_of(parts: Parts, k: int) -> Tensor | None:
         return parts[_OF_HARMONIC[k]]
     higher = parts[PARTS - 1]
     return None if higher is None else higher[k - 4]
-
-
-def less_light(light: Parts, moments: Tensor) -> Tensor:
-    """`moments` [K, C, z, y, x] less the mean and the flux of `light`, in place."""
-    for k in range(min(4, len(moments))):
-        if (part := moment_of(light, k)) is not None:
-            moments[k] -= part
-    return moments
 
 
 @dataclass(frozen=True)
@@ -87,20 +74,12 @@ class Swept:
     source: Parts
 
     @staticmethod
-    def of(
-        grid: Grid,
-        directions: int,
-        scales: Tensor,
-        extinction: Tensor,
-        scattering: Tensor | None,
-        factors: Tensor,
-        beam_factors: Tensor | None,
-        *parts: Tensor | None,
-    ) -> Swept:
+    def of(grid: Grid, directions: int, *tensors: Any) -> Swept:
         """From tensors as autograd must be given them: one by one."""
+        scales, extinction, scattering, factors, beams, *parts = tensors
+        light, source = tuple(parts[:PARTS]), tuple(parts[PARTS:])
         coefficients = scales, extinction, scattering
-        light, source = parts[:PARTS], parts[PARTS:]
-        return Swept(grid, directions, *coefficients, factors, beam_factors, light, source)
+        return Swept(grid, directions, *coefficients, factors, beams, light, source)
 
     @property
     def like(self) -> Tensor:
@@ -108,60 +87,19 @@ class Swept:
         (like, *_) = (part for part in (*self.source, *self.light) if part is not None)
         return like
 
-    def spelled(self) -> Swept:
-        """The same with all moments of the source."""
-        beam = self.source[0]
-        if self.beam_factors is None or beam is None:
-            return self
-        moments = self.beam_factors[..., None, None, None] * beam
-        return replace(self, beam_factors=None, source=in_parts(moments))
-
     def changes(self, *changes: Tensor | None) -> Swept:
-        """What is added to all tensors, as `Swept.of` takes them; None for nothing.
-
-        The source has all its moments, a beam or not.
-        """
+        """What is added to all tensors, as `Swept.of` takes them; None for nothing."""
         tensors = self.scales, self.extinction, self.scattering, self.factors
-        whole: list[Any] = [
+        whole = [
             tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
             for tensor, change in zip(tensors, changes, strict=False)
         ]
-        d_factors, *parts = changes[len(whole) :]
-        beam, d_beam = self.source[0], parts[PARTS]
-        if self.beam_factors is not None and beam is not None:
-            # a product, of which both may change
-            d_moments = self.factors.new_zeros(len(self.factors), *beam.shape)
-            for factors, part in ((d_factors, beam), (self.beam_factors, d_beam)):
-                if factors is not None and part is not None:
-                    d_moments += factors[..., None, None, None] * part
-            parts[PARTS:] = in_parts(d_moments)
-        return Swept.of(self.grid, self.directions, *whole, None, *parts)
+        return Swept.of(self.grid, self.directions, *whole, *changes[len(whole) :])
 
     @property
     def fields(self) -> list[Tensor]:
         """Those of extinction and of scattering; one where they share it."""
         return [field for field in (self.extinction, self.scattering) if field is not None]
-
-    def total(self) -> Tensor:
-        """The moments of what scatters, [K, C, z, y, x], in units of parts."""
-        found, whole = self.like.new_zeros(len(self.factors), *self.like.shape), self.spelled()
-        for k, total in enumerate(found):
-            light, source = moment_of(self.light, k), moment_of(whole.source, k)
-            if light is not None:
-                total += self.factors[k].view(-1, 1, 1, 1) * light
-            if source is not None:
-                total += source
-        return found
-
-    def total_change(self, changes: Swept) -> Tensor:
-        """The change of `total`: both the factors and what they multiply change."""
-        found = self.like.new_zeros(len(self.factors), *self.like.shape)
-        crossed = replace(self, light=changes.light, source=changes.source)
-        by_factors = replace(self, factors=changes.factors, source=(None,) * PARTS)
-        for part in (crossed, by_factors):
-            if any(each is not None for each in (*part.light, *part.source)):
-                found += part.total()
-        return found
 
     def light_bars(self, found: Tensor, bars: Parts, needs: Sequence[bool]) -> Parts:
         """Cotangents of those parts of light that need them.
@@ -170,11 +108,13 @@ class Swept:
         """
         if not any(needs):
             return (None,) * PARTS
-        first = less_light(bars, self.factors[:4, :, None, None, None] * found[:4])
+        first = self.factors[:4, :, None, None, None] * found[:4]
+        for k, each in enumerate(first):
+            if (bar := moment_of(bars, k)) is not None:
+                each -= bar
         higher = self.factors[4:, :, None, None, None] * found[4:] if needs[PARTS - 1] else None
-        parts = zip(in_parts(first)[: PARTS - 1], needs, strict=False)
-        kept = (part if need else None for part, need in parts)
-        return *kept, higher
+        parts = zip(split(first)[: PARTS - 1], needs, strict=False)
+        return *(part if need else None for part, need in parts), higher
 
     def factor_bar(self, bar: Tensor) -> Tensor:
         """The cotangent of `factors`, of `bar` of moments."""
@@ -187,8 +127,7 @@ class Swept:
     def source_bars(self, bar: Tensor, needs: Sequence[bool]) -> Parts:
         """Cotangents of those parts of the source that need them."""
         if self.beam_factors is None:
-            parts = zip(in_parts(bar), needs, strict=True)
-            return tuple(part if need else None for part, need in parts)
+            return tuple(p if need else None for p, need in zip(split(bar), needs, strict=True))
         found = torch.einsum("kc,kczyx->czyx", self.beam_factors, bar)
         return found, *[None] * (PARTS - 1)
 

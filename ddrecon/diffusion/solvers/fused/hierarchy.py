@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +23,6 @@ from ddrecon.diffusion.solvers.fused.stages import (
 )
 from ddrecon.diffusion.solvers.hierarchy import Coarsest
 from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.spare import borrow, give_back
 
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
@@ -108,7 +106,7 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
     stages, loss = stages_of(shape, colors, axes), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
     levels = len(stages.levels) - 1
-    data, work = borrow(stages.data, loss), borrow(stages.work, loss)
+    data, work = loss.new_empty(stages.data), loss.new_empty(stages.work)
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     made = {
         "data": data,
@@ -142,6 +140,4 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
         z, y, x = (lower_cells(c, axis) for axis, c in zip(AXES, faces, strict=True))
         inverse = Coarsest.of(Operator((z, y, x), lost)).inverse
         stages.view(data, last, "INVERSE", (few, few)).copy_(inverse)
-    give_back(work)
-    weakref.finalize(hierarchy, give_back, data)
     return hierarchy

@@ -25,7 +25,7 @@ from ddrecon.diffusion.solvers.fused.kernels import (
 )
 from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import borrow, give_back, trim_freed_memory
+from ddrecon.kernels.spare import trim_freed_memory
 
 MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
@@ -86,7 +86,6 @@ def _solve(
         is_open = residual > tolerance and launched < most
     counts.append(count)
     torch.mul(run.vector("Y"), hierarchy.scale, out=made)  # u = S y
-    give_back(run.vectors, run.coarser, run.scratch)
     return Solution(made, count, residual)
 
 
@@ -101,10 +100,10 @@ class Run:
         cells, self.edge = source[0].numel(), margin(x)
         self.shares, self.threads = shares_of(cells, self.colors, source)
         self.size = -(-self.colors * cells // 16) * 16 + self.edge
-        self.vectors = borrow(VECTORS["VECTORS"] * self.size + self.edge, source)
-        self.coarser = borrow(self.colors * stages.vectors, source).zero_()
+        self.vectors = source.new_empty(VECTORS["VECTORS"] * self.size + self.edge)
+        self.coarser = source.new_zeros(self.colors * stages.vectors)
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * self.edge)
-        self.scratch = borrow(self.colors * self.shares * slots, source)
+        self.scratch = source.new_empty(self.colors * self.shares * slots)
         self.sums = source.new_empty(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
         given = {

@@ -1,0 +1,212 @@
+"""Launches of a sweep's kernels: directions go through all rows together, on a processor.
+
+Each lane has memory of its own, and does a color and a way: up or down in z, which share one sum.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
+from ddrecon.diffusion.rounds.fused.swept import Swept
+from ddrecon.kernels.shares import count_shares
+from ddrecon.kernels.text import TextKernel, declarations
+
+_ROOM = "diffusion/rounds/fused"
+MARGIN = 16
+"""Cells before an array of rows, which begin where vectors do."""
+NUMBERS = 7
+"""Rows of a lane's own besides those of directions and of moments: two empty ones, and what the
+adjoint sums."""
+
+
+class Rows:
+    """The arrays of a sweep on a processor, and the launches of kernels on them.
+
+    Of a sweep and its `changes`, what is found is the change of what is swept. More threads than
+    all colors and ways need share directions, in pieces that have sums of their own.
+    """
+
+    def __init__(self, swept: Swept, changes: Swept | None = None):
+        threads = torch.get_num_threads()
+        self.swept, self.changes, self.like = swept, changes, swept.like
+        self.count, self.colors = swept.factors.shape
+        self.depth, self.height, self.width = self.like.shape[1:]
+        self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
+        self.slab = SLABS[swept.grid.cells > LARGE]
+        one = self.like.element_size() * piece_numbers(swept.grid.shape, self.colors, self.count)
+        self.pieces = count_shares(max(1, threads // (2 * self.colors)), one, 1)
+        self.together = max(1, min(threads // 2, self.colors))
+        self.threads, self.lanes = threads, 2 * self.together * self.pieces
+        self.tables = make_tables(
+            swept.grid, swept.directions, self.count, self.pieces, self.like.dtype
+        )
+        # slabs begin anew in the middle, where the ways meet
+        low, high = self.depth // 2, self.depth - self.depth // 2
+        self.slabs = -(-low // self.slab) + -(-high // self.slab)
+        fields = swept.fields
+        if changes is not None:
+            # Each with its change behind it: steps meet a medium where that changes, too.
+            fields = [torch.cat(pair) for pair in zip(fields, changes.fields, strict=True)]
+        self.fields, self.ranges, self.densest = surround(fields, self.pitch)
+        self.channels = [len(field) for field in swept.fields]
+
+    def follow(self, is_saved: bool = False) -> tuple[Tensor, Tensor | None]:
+        """Moments of radiance less the first two of light, and what `transpose` is given.
+
+        Moments are [K, C, z, y, x]. If it `is_saved`, that is I before slabs of slices,
+        [C, directions, slabs, y, x].
+        """
+        shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
+        saved = self.like.new_empty(shape) if is_saved else None
+        kinds = 2 if self.changes is None else 4
+        lines = self.like.new_zeros(self._line_count(kinds, self.height + 2))
+        kind = "F" if self.changes is None else "Dual<F>"
+        return self._run(f"follow_rows<{kind}, ", "", {}, {"saved": saved, "lines": lines}), saved
+
+    def transpose(
+        self, saved: Tensor, bars: Sequence[Tensor | None], varies_numbers: bool
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light.
+
+        `saved`: by `follow`.
+        """
+        shape = self.like.shape[1:]
+        # One sum for colors at a time, or one for each.
+        counts = [self.colors if each > 1 else self.together for each in self.channels]
+        fields = [self.like.new_zeros(self.pieces, each, *shape) for each in counts]
+        sums = self.like.new_zeros(self.colors, 2 * self.pieces, 3, dtype=torch.float64)
+        made = {
+            "saved": saved, "sums": sums, "e_bar": fields[0], "sc_bar": fields[-1],
+            "lines": self.like.new_empty(self._line_count(2, (self.slab + 1) * self.height)),
+            "returning": self.like.new_zeros(self._line_count(2 + len(fields), self.height + 2)),
+        }  # fmt: skip
+        flag = f", {str(varies_numbers).lower()}"
+        found = self._run("return_rows<", flag, {"bars": bars}, made)
+        of_fields = [
+            (bar[0] if len(bar) == 1 else bar.sum(0)).sum_to_size(each, *shape)
+            for bar, each in zip(fields, self.channels, strict=True)
+        ]
+        return sums.sum(1).T.to(found.dtype), found, of_fields
+
+    def _line_count(self, kinds: int, places: int) -> int:
+        return self.lanes * (kinds * self.tables["most"] * self.pitch * places + MARGIN)
+
+    def _run(
+        self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]
+    ) -> Tensor:
+        """Launches chunks, until the ways meet and from there on; the sums of moments."""
+        swept = self.swept
+        # Of each piece; zero where no direction of a piece goes.
+        shape = self.pieces, self.count, *self.like.shape
+        sums = self.like.new_empty(shape) if shape[0] == 1 else self.like.new_zeros(shape)
+        numbers = self.tables["chunks"].shape[2]
+        scratch_rows = NUMBERS + self.tables["most"] + self.count
+        scratch = self.like.new_zeros(self.lanes * scratch_rows * self.pitch)
+        given = given | self.tables | {
+            "light_parts": swept.light, "source_parts": swept.source, "factors": swept.factors,
+            "beam_factors": swept.beam_factors, "scales": swept.scales,
+            "extinction": self.fields[0], "extinction_channels": self.channels[0],
+            "scattering": self.fields[-1], "scattering_channels": self.channels[-1],
+            "ranges": self.ranges, "densest": self.densest,
+            "depth": self.depth, "height": self.height, "width": self.width,
+            "pitch": self.pitch, "margin": MARGIN, "colors": self.colors,
+            "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
+            "scratch_rows": scratch_rows, "pieces": self.pieces, "chunk_count": numbers,
+            "together": self.together,
+        }  # fmt: skip
+        if (changes := self.changes) is not None:
+            given |= {
+                "d_light_parts": changes.light, "d_source_parts": changes.source,
+                "d_factors": changes.factors, "d_scales": changes.scales,
+            }  # fmt: skip
+        degree, shares_field = round(self.count**0.5) - 1, str(swept.scattering is None).lower()
+        whole = f"{function}{degree}, {shares_field}{flags}>"
+        bound = _kernel(whole, torch.finfo(self.like.dtype).bits).bind(
+            given, made | {"found": sums, "scratch": scratch}
+        )
+        halves = (1, 0) if "bars" in given else (0, 1)
+        firsts = range(0, self.colors, self.together)
+        for first, chunk, half in product(firsts, range(numbers), halves):
+            count = 2 * self.pieces * min(self.together, self.colors - first)
+            places = {"color_from": first, "chunk": chunk, "half": half}
+            adds = int(chunk > 0 or half == halves[1])
+            bound.launch(count, min(self.threads, count), **places, adds=adds)
+        return sums.sum(0) if len(sums) > 1 else sums[0]
+
+
+def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """`fields` [K, z, y, x] with empty cells around them; `ranges` and `densest` of their rows.
+
+    They are flat: MARGIN zeros and [K, z + 2, y + 2, pitch]. `ranges` [z, y, 4]: from and to where
+    steps to the cells of a row meet a medium, and where those meet one that begin at these cells.
+    They begin where vectors do; empty ones are from 0 to 0. `densest` [z, y]: the largest value of
+    the first field that steps to these cells meet.
+    """
+    _, depth, height, width = fields[0].shape
+    larger, rows = list[Tensor](), fields[0].new_empty(3, depth, height)
+    for field in fields:
+        flat = field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch)
+        given = {
+            "field": field.detach(), "channels": len(field), "is_first": not larger,
+            "depth": depth, "height": height, "width": width, "pitch": pitch,
+        }  # fmt: skip
+        made = {"inner": flat[MARGIN + (height + 3) * pitch :], "rows": rows}
+        _surround_kernel(torch.finfo(field.dtype).bits).launch(depth * height, given, made)
+        larger.append(flat)
+    # Light at the ends of a step is a cell away at most, along each axis.
+    reached = []
+    for _ in range(2):
+        for dim in (1, 2):
+            longer = torch.cat([rows.narrow(dim, 0, 1), rows, rows.narrow(dim, -1, 1)], dim)
+            for start in (0, 2):
+                rows = rows.maximum(longer.narrow(dim, start, rows.shape[dim]))
+        reached.append(rows)
+    low, high, top = torch.stack(reached, -1)
+    cells = torch.arange(1.0, 3.0)
+    first = (width - low - cells).clamp(min=0).div(MARGIN, rounding_mode="floor")
+    last = ((high + cells) / MARGIN).ceil()
+    ranges = torch.stack([first, last], -1).mul(MARGIN).clamp(max=width) * (high > 0)[..., None]
+    return larger, ranges.flatten(2).int(), top[..., 0].contiguous()
+
+
+@functools.cache
+def _surround_kernel(bits: int) -> TextKernel:
+    names = "field, channels, depth, height, width, pitch, is_first, inner, rows"
+    given = "F *field, *inner, *rows; int channels, depth, height, width, pitch; bool is_first"
+    text, header = f"surround_row(item, {names});", f"{_ROOM}/surround.h"
+    return TextKernel("surround_row", bits, text, given, "inner rows", header)
+
+
+@functools.cache
+def _kernel(function: str, bits: int) -> TextKernel:
+    """The kernel of a `function(item, given)` in a header of this room.
+
+    It is given what `Sweep` of `given.h` declares, and writes where pointers are not const.
+    """
+    text = Path(__file__).with_name("given.h").read_text(encoding="utf-8")
+    (body,) = re.findall(r"struct Sweep {(.*?)\n};", text, re.DOTALL)
+    body = " ".join(body.replace("* ", " *").split())
+    made = ";".join(each for each in body.split(";") if "*" in each and "const" not in each)
+    given = body.replace("const ", "")
+    values = [
+        f"{{{', '.join(f'{one}[{k}]' for k in range(count))}}}" if count else one
+        for _, _, one, count in declarations(given)
+    ]
+    name = function.split("<")[0]
+    return TextKernel(
+        name,
+        bits,
+        f"{function}(item, Sweep<F>{{{', '.join(values)}}});",
+        given,
+        " ".join(one for _, _, one, _ in declarations(made)),
+        f"{_ROOM}/{'rows' if name == 'follow_rows' else 'returning'}.h",
+    )
