@@ -110,7 +110,9 @@ def factors_by_formula(g: float, rounds: int) -> list[float]:
     return [1 / (1 - bound * math.cos((k + 0.5) * math.pi / rounds)) for k in range(rounds)]
 
 
-def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: int) -> Moments:
+def round_by_loops(
+    problem: DiffusionProblem, light: Moments, g: float, degree: int, is_last: bool
+) -> Moments:
     """One round of E12 from `light`, gray, by `sweep_by_loops` and dense solves."""
     medium, (operator, right) = problem.medium, problem.system
     directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
@@ -124,8 +126,9 @@ def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: 
     total = right + medium.remaining_scattering * gain - theta * imbalance
     if light.flux is None or swept.flux is None or swept.higher is None:
         return Moments(torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)
+    part = 1.0 if is_last else (1 - p[1]) / (2 - p[1])
     turned = tuple(
-        theta * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
+        theta * part * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
     )
     # the same problem with this flux as its only source: what E4 adds to the right side
     alone = replace(

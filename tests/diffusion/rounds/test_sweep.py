@@ -81,8 +81,8 @@ def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
     for rounds in (1, 2):
         expected = start
         factors = factors_by_formula(g, rounds) if g else [1.0] * rounds
-        for factor in factors:
-            new = round_by_loops(problem, expected, g, 3)
+        for number, factor in enumerate(factors, 1):
+            new = round_by_loops(problem, expected, g, 3, number == rounds)
             old = expected.harmonics(degree)
             blended = old + factor * (new.harmonics(degree) - old)
             expected = Moments.of_harmonics(blended)
