@@ -14,7 +14,6 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.third_order import ThirdOrder
 
 
@@ -123,13 +122,11 @@ def is_field(peak: Tensor) -> bool:
 class Channels:
     """Fields to interpolate, each [channels, z, y, x], linearly or to `third_order`.
 
-    Where the first `matter` channels are zero nothing is to be seen, and slices leave that out; 0:
-    something may be anywhere, but where `support` [z, y, x] is 0.
+    Where `support` [z, y, x], if given, is 0 nothing is to be seen, and fused kernels leave it out.
     """
 
     fields: Sequence[Tensor]
     third_order: ThirdOrder | None = None
-    matter: int = 0
     support: Tensor | None = None
 
     @functools.cached_property
@@ -139,15 +136,9 @@ class Channels:
 
 
 def pack_channels(emission: Emission) -> Channels:
-    """The fields of `emission` as `Channels`: masses to third order, the others linearly.
-
-    Nothing is left out as empty where the medium is varied: derivatives by the density of empty
-    cells are wanted, and must be those of what is rendered. But for those outside of a support.
-    """
+    """The fields of `emission` as `Channels`: masses to third order, the others linearly."""
     cells = Sampled.in_cells(emission)
     first = cells.extinction.shape[0] + cells.diffuse.shape[0]
     last = first + sum(mass.shape[0] for mass in cells.masses)
     third_order = ThirdOrder(first, last, emission.extinction.mass_bound) if cells.masses else None
-    is_fixed = not (is_varied(cells.extinction) or is_varied(cells.scattering))
-    matter = cells.extinction.shape[0] if is_fixed else 0
-    return Channels(cells.fields(), third_order, matter, emission.support)
+    return Channels(cells.fields(), third_order, emission.support)

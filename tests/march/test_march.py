@@ -23,11 +23,9 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
 from ddrecon.march import integral as march_module
-from ddrecon.march import slices
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
-from ddrecon.numerics.nodes import Nodes
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -136,7 +134,7 @@ def test_a_box_behind_the_camera_is_not_seen():
 
 @each_camera
 def test_chunks_do_not_matter(view: dict, monkeypatch):
-    """Nor do the bands of slices that they meet: neither to what is seen nor to its derivative."""
+    """Neither to what is seen nor to its derivative."""
     density = random_values(9, 11, 10).requires_grad_()
     bundle = cast_rays(make_camera(size=(7, 6), **view))
 
@@ -146,43 +144,9 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(slices, "BAND", 1)
+    monkeypatch.setattr(march_module, "CELLS_PER_NODE", 100)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
-
-
-@each_camera
-def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypatch):
-    """Nothing is left out where the density is being varied."""
-    density = torch.zeros(20, 22, 21, dtype=torch.float64)
-    density[6:9, 12:15, 8:12] = 1 + random_values(3, 3, 4)
-    bundle, integrated, nodes = (
-        cast_rays(make_camera(size=(9, 8), **view)),
-        march_module._integrate,
-        [],
-    )
-
-    def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
-        nodes.append(values[:, 0].numel())
-        return integrated(emission, values, places)
-
-    monkeypatch.setattr(march_module, "_integrate", counting)
-    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
-    emissions = (
-        emission_of(box_grid((20, 22, 21)), density),
-        emission_of(box_grid((20, 22, 21)), density.clone().requires_grad_()),
-    )
-    seen, counts = [], []
-    for emission in emissions:
-        nodes.clear()
-        seen.append(march_rays(emission, bundle, every_ray(1)))
-        counts.append(sum(nodes))
-    for one, other in zip(*seen, strict=True):
-        torch.testing.assert_close(one, other.detach(), rtol=1e-12, atol=1e-15)
-    if view is CAMERAS["inside"]:
-        assert counts[0] == counts[1]  # rays at equal steps leave nothing out
-    else:
-        assert counts[0] < 0.6 * counts[1]
 
 
 @each_camera

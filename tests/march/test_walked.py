@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
-from ddrecon.march.emission import Channels
+from ddrecon.march.samplers import planes_across, support_of_planes
 from ddrecon.march.sight import look_through
-from ddrecon.march.slices import Slices
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -126,12 +125,10 @@ def test_segments_walked_are_those_whose_cells_it_touches(steps: int):
     scene = scene_with(two_blobs(), {}, half_width=0.6)
     sight = look_through(scene.views[0].camera, scene.volume.grid, scene.render)
     rays, crossing, axis = sight.rays, sight.crossing, sight.way.axis
-    channels = Channels([scene.volume.density[None]], support=scene.volume.support)
-    slices = Slices(channels, scene.volume.grid, axis, sight.way.is_reversed, steps)
-    packed = pack_rays(
-        scene.volume.grid, axis, rays.origin, rays.direction, *vars(crossing).values()
-    )
-    support, planes = slices.support, slices.planes
+    grid, kind = scene.volume.grid, (axis, sight.way.is_reversed, steps)
+    planes = planes_across(grid, *kind, torch.float64, torch.device("cpu"))
+    support = support_of_planes(scene.volume.support, *kind)
+    packed = pack_rays(grid, axis, rays.origin, rays.direction, *vars(crossing).values())
     bits = find_walked(support, planes, packed.bundle)
     walked = [
         [bool(bits[p, n // 32] >> (n % 32) & 1) for n in range(len(planes))]

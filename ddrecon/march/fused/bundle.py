@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -10,11 +9,9 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam, leaving_cosine
-from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.fused.cellwise import find_along_rays, table_of_cells
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.lattice import Lattice
 from ddrecon.medium.phase import PhaseKind
 from ddrecon.medium.phase_cells import others_of
 from ddrecon.medium.phase_peak import SeenPhase
@@ -56,31 +53,6 @@ def pack_rays(
     """Those rays that `hit` the box, by slices across `axis` unless that is None."""
     origin, direction = origin[hit], direction[hit]
     return Packed(_bundle(grid, axis, origin, direction, near, far), origin, direction)
-
-
-def pack_lattice(grid: Grid, axis: int, lattice: Lattice) -> Packed:
-    """All rays of `lattice`, by slices across `axis`."""
-    place = lattice.axis, lattice.middle, lattice.eye, lattice.direction
-    return _pack_lattice(grid, axis, *place, lattice.rows, lattice.columns)
-
-
-@remember
-def _pack_lattice(
-    grid: Grid,
-    axis: int,
-    across_axis: int,
-    middle: float,
-    eye: Tensor | None,
-    direction: Tensor,
-    rows: Tensor,
-    columns: Tensor,
-) -> Packed:
-    lattice = Lattice(across_axis, middle, eye, direction, rows, columns)
-    rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
-    near, far = intersect_box(grid, rays)
-    far = torch.maximum(near, far)
-    bundle = _bundle(grid, axis, rays.origin, rays.direction, near, far)
-    return Packed(bundle, rays.origin.clone(), rays.direction.clone())
 
 
 def _bundle(

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import MOST, too_many
 from ddrecon.march.fused.stretches import find_walked
-from ddrecon.march.samplers import Equidistant
-from ddrecon.march.slices import Slices
+from ddrecon.march.samplers import Equidistant, Slices, support_of_planes
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
@@ -73,7 +72,9 @@ def cells_of(sampler: Slices | Equidistant) -> tuple[Cells, list[Tensor]]:
         like = fields[0]
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
-    support, planes = sampler.support, sampler.planes
+    support, planes = sampler.channels.support, sampler.planes
+    if support is not None:
+        support = support_of_planes(support, sampler.axis, sampler.is_reversed, sampler.steps)
     if sampler.steps == 1:
         return Cells(planes, sampler.axis, _short(sampler.order), support), fields
     # Slices between those of cells are interpolated beforehand.

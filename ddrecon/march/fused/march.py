@@ -12,9 +12,7 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.fused.bundle import (
-    Packed,
     numbers_of,
-    pack_lattice,
     pack_rays,
     see_beams,
     table_of,
@@ -23,82 +21,43 @@ from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.integral import opacity_of
-from ddrecon.march.lattice import Lattice
-from ddrecon.march.samplers import Equidistant
-from ddrecon.march.slices import Slices
+from ddrecon.march.samplers import Equidistant, Slices
 from ddrecon.medium.phase_cells import count_tables
 
 
 def march_rays(
-    emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
-) -> tuple[Tensor, Tensor]:
-    """Those of `rays` that are in `crossing`: indices [P], radiance and opacity [2 C, P]."""
-    return crossing.hit, _integrate(emission, sampler, _pack(emission, sampler, rays, crossing))[0]
-
-
-def integrate_rays(
     emission: Emission,
     sampler: Slices | Equidistant,
     rays: Rays,
     crossing: Crossing,
-    fronts: Tensor | None = None,
-) -> Tensor:
-    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P].
-
-    Behind the mass `fronts` [K, P], which counts as mass along them.
-    """
-    packed = _pack(emission, sampler, rays, crossing)
-    composed, masses = _integrate(emission, sampler, packed, fronts)
-    return torch.cat([composed[: emission.colors], masses])
-
-
-def march_lattice(emission: Emission, bands: Slices, lattice: Lattice) -> Tensor:
-    """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
-    packed = pack_lattice(emission.grid, bands.axis, lattice)
-    return _integrate(emission, bands, packed)[0].unflatten(1, lattice.shape)
-
-
-def _pack(
-    emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
-) -> Packed:
+    front: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
     axis = sampler.axis if isinstance(sampler, Slices) else None
     ends = crossing.hit, crossing.near, crossing.far
-    return pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
-
-
-def _integrate(
-    emission: Emission,
-    sampler: Slices | Equidistant,
-    packed: Packed,
-    fronts: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
+    packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
     along, third_order = see_beams(emission, layout, packed), sampler.channels.third_order
-    numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
     out, masses, _ = Integrate.apply(
         layout,
         cells,
         packed.bundle,
         along.angles,
         along.polynomials,
-        numbers,
+        numbers_of(emission, 0.0 if third_order is None else third_order.bound),
         table_of(emission),
-        packed.bundle.new_empty(layout.extinction, 0) if fronts is None else fronts,
+        packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
         *fields,
     )
-    return _compose(emission, out, masses, along.factors), masses
+    return _compose(emission, out, along.factors), masses
 
 
-def _compose(
-    emission: Emission, out: Tensor, masses: Tensor, factors: tuple[Tensor | None, ...]
-) -> Tensor:
-    """Scattered radiance and opacity [2 C, R] from the integrals `out` [C (1 + beams), R].
+def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]) -> Tensor:
+    """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
     light that of what remains; beams' irradiances, and p where it is one of the `factors`
-    [1 or C, R] (E2); and E1's 1 - tau of what is behind, with `masses` [K, R].
+    [1 or C, R] (E2).
     """
     diffuse, *arriving = out.split(emission.colors)
     scattered = diffuse * (emission.remaining or emission.scattering).scale.view(-1, 1)
@@ -106,7 +65,7 @@ def _compose(
         weighted = light if factor is None else light * factor
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + weighted * strength.view(-1, 1)
-    return torch.cat([scattered, opacity_of(emission, masses)])
+    return scattered
 
 
 def layout_of(emission: Emission) -> Layout:
