@@ -14,9 +14,9 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission, Sampled, pack_channels
-from ddrecon.march.lattice import interpolate_between, is_rough
-from ddrecon.march.samplers import Equidistant, Slices, make_sampler
+from ddrecon.march.emission import Emission
+from ddrecon.march.lattice import find_rough, interpolate_between
+from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
@@ -49,11 +49,11 @@ def march(
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing, 1 - nothing
-    sampler = make_sampler(pack_channels(emission), emission.grid, sight.way, settings.steps)
+    sampler = Sampler(emission, sight.way, settings.steps)
 
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
         """Radiance and opacity [2 C, P] of those of `rays` that are in `crossing`."""
-        radiance, mass = _march_by_engine(emission, sampler, rays, crossing)
+        radiance, mass = _march_by_engine(sampler, rays, crossing)
         # E1: what comes from the volume, and 1 - tau of what is behind it.
         return torch.cat([radiance, opacity_of(emission, mass)])
 
@@ -62,7 +62,8 @@ def march(
     else:
         lattice = sight.lattice
         between = march_these(lattice.rays, lattice.crossing).unflatten(1, lattice.shape)
-        values, numbers = _interpolate(between, sight, lattice.places, settings, behind)
+        values = _interpolate(between, sight, lattice.places)
+        numbers = _find_rough(between, lattice.places, settings.tolerance, behind)
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
             values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
@@ -70,55 +71,51 @@ def march(
     return scattered, 1 - opacity
 
 
-def _march_by_engine(
-    emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
-) -> tuple[Tensor, Tensor]:
+def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
     """As `march_rays`, by the engine in use, and through all slabs of a grid that has some."""
     march_own = march_rays
     if current_engine() == "warp":
-        from ddrecon.march.fused.march import march_rays as march_own
-    if isinstance(emission.grid, Slab):
+        from ddrecon.march.fused.integrate import march_rays as march_own
+    if isinstance(sampler.emission.grid, Slab):
         from ddrecon.march.slabs import march_slabs
 
-        return march_slabs(march_own, emission, sampler, rays, crossing)
-    return march_own(emission, sampler, rays, crossing)
+        return march_slabs(march_own, sampler, rays, crossing)
+    return march_own(sampler, rays, crossing)
 
 
-def _interpolate(
-    values: Tensor, sight: Sight, places: Tensor, settings: RenderSettings, behind: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """`values` [2 C, r, c] of a lattice at the `places` of pixels, [2 C, R] along all rays.
-
-    And the numbers of those that meet the box which are not to be interpolated.
-    """
-    brightest = values.new_zeros(1) if behind is None else behind.detach().max().view(1)
+def _interpolate(values: Tensor, sight: Sight, places: Tensor) -> Tensor:
+    """`values` [2 C, r, c] of a lattice at the `places` of pixels, [2 C, R] along all rays."""
     if current_engine() == "warp" and not is_varied(places):
         from ddrecon.march.fused.between import interpolate_pixels
 
-        count = len(sight.rays.direction)
-        return interpolate_pixels(
-            values, places, sight.crossing.hit, count, brightest, settings.tolerance
-        )
-    # Those where the lattice says that this may change the image by more than `tolerance` of its
-    # root mean square.
+        return interpolate_pixels(values, places, sight.crossing.hit, len(sight.rays.direction))
+    return _spread(interpolate_between(values, places), sight)
+
+
+def _find_rough(values: Tensor, places: Tensor, tolerance: float, behind: Tensor | None) -> Tensor:
+    """Which pixels, of those at `places` [P, 2] of a lattice, are not to be interpolated: [*].
+
+    The `values` [2 C, r, c] of the lattice say that this may change the image by more than
+    `tolerance` of its root mean square.
+    """
     scattered, opacity = values.detach().chunk(2)
-    brightness = (scattered + brightest * (1 - opacity)).square().mean().sqrt()
-    bound = (settings.tolerance * brightness.double()).to(values.dtype)
-    own = is_rough(torch.cat([scattered, brightest * opacity]), bound, places)
-    return _spread(interpolate_between(values, places), sight), own.nonzero()[:, 0]
+    brightest = 0.0 if behind is None else behind.detach().max()
+    seen = scattered + brightest * (1 - opacity)
+    bound = tolerance * seen.square().mean(dtype=torch.float64).sqrt()
+    return find_rough(torch.cat([scattered, brightest * opacity]), bound.to(values.dtype), places)
 
 
 def _spread(along: Tensor, sight: Sight) -> Tensor:
     """Radiance and opacity [2 C, R] of all rays: those `along` the ones that hit, else 0."""
-    if sight.is_whole:
+    count = len(sight.rays.direction)
+    if along.shape[1] == count:
         return along
-    pixels = along.new_zeros(len(along), len(sight.rays.direction))
+    pixels = along.new_zeros(len(along), count)
     return pixels.index_copy(1, sight.crossing.hit, along)
 
 
 def march_rays(
-    emission: Emission,
-    sampler: Slices | Equidistant,
+    sampler: Sampler,
     rays: Rays,
     crossing: Crossing,
     front: Tensor | None = None,
@@ -127,7 +124,7 @@ def march_rays(
 
     `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
     """
-    hitting, values = rays.select(crossing.hit), sampler.values
+    emission, hitting, values = sampler.emission, rays.select(crossing.hit), sampler.values
 
     def run(chunk: Tensor) -> Tensor:
         chosen = hitting.select(chunk)
@@ -157,27 +154,33 @@ def integrate_segments(
 
     `front` [K, R] is the mass between the camera and the first node, 0 if left out.
     """
-    at_nodes = Sampled.in_cells(emission).unpack(values)
+    sizes = [len(field) for field in emission.fields.values()]
+    at_nodes = dict(zip(emission.fields, values.split(sizes, 1), strict=True))
+    extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
+    scattering = extinction if scattering is None else scattering
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
-    mass = nodes.integral(at_nodes.extinction)
+    mass = nodes.integral(extinction)
     own = end = mass.cumsum(0)
     if front is not None:
         end = end + front
     begin = end - mass
     # E3: the integral of tau kappa_s (L0 + g L1 . w).
-    by = at_nodes.scattering if at_nodes.remaining is None else at_nodes.remaining
-    scattered = decayed_sum(nodes.integral(by * at_nodes.diffuse), begin, end, scale)
+    diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
+    scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
     scattered = scattered * (emission.remaining or emission.scattering).scale.view(-1, 1)
     passed = torch.cat([begin[:1], end])
     seen: SeenPhase | SeenNodes = emission.seen
-    if at_nodes.number is not None:
-        seen = SeenNodes(seen.phase, at_nodes.number, seen.degree)
-    for beam, to_light in zip(emission.beams, at_nodes.masses, strict=True):
+    if "number" in at_nodes:
+        seen = SeenNodes(seen.phase, at_nodes["number"], seen.degree)
+    for index, beam in enumerate(emission.beams):
         # E13: the depth of the forward peak, from where the light enters to the camera.
-        depth = None if at_nodes.peak is None else at_nodes.peak * (passed + to_light)
+        to_light, depth = at_nodes[f"mass {index}"], None
+        if emission.peak is not None:
+            peak = at_nodes["peak"] if "peak" in at_nodes else emission.peak.view(-1, 1)
+            depth = peak * (passed + to_light)
         # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
-        weight, phase = beam.scatter(at_nodes.scattering, nodes, seen, depth)
+        weight, phase = beam.scatter(scattering, nodes, seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + arriving * phase * strength.view(-1, 1)

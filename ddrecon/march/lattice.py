@@ -110,19 +110,18 @@ def interpolate(values: Tensor, places: Tensor) -> Tensor:
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def is_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
-    """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: bool [P].
+def find_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
+    """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: numbers [*].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
-    they are large at edges sharper than the lattice as well.
+    they are large at edges sharper than the lattice as well. They come in an order in which
+    neighbors are neighbors in the volume: along stripes as high as a voxel.
     """
+    down, along = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
+    uneven = (down.abs() + along.abs()).sum(0)
     # Of each place, the largest of the four rays around.
-    cells = max_pool2d(find_uneven(values.detach())[None], 2, 1)[0]
+    largest = max_pool2d(uneven[None], 2, 1)[0]
     rows, columns = places.detach().floor().long().unbind(-1)
-    return DOUBT * cells[rows, columns] > tolerance
-
-
-def find_uneven(values: Tensor) -> Tensor:
-    """Magnitudes of fourth differences of `values` [K, r, c] along both axes: their sums [r, c]."""
-    rows, columns = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
-    return (rows.abs() + columns.abs()).sum(0)
+    rough = (DOUBT * largest[rows, columns] > tolerance).nonzero()[:, 0]
+    stripe = rows[rough] // RAYS_PER_VOXEL
+    return rough[(stripe * values.shape[2] + places.detach()[rough, 1]).argsort(stable=True)]

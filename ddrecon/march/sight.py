@@ -29,11 +29,6 @@ class Sight:
     way: Way | None
     lattice: Lattice | None = None
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether every ray meets the box; `crossing` then has them in their order."""
-        return len(self.crossing.hit) == len(self.rays.direction)
-
 
 def look_along(grid: Grid, rays: Rays, settings: RenderSettings) -> Sight:
     """The sight of `rays` of one camera."""

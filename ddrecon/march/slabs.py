@@ -15,24 +15,22 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.march import integral
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission, pack_channels
-from ddrecon.march.samplers import Equidistant, Slices, planes_across
+from ddrecon.march.emission import Emission
+from ddrecon.march.samplers import Sampler, Way, planes_across
 from ddrecon.slabs.exchange import sum_before, sum_slabs
 from ddrecon.slabs.slab import Slab
-
-Sampler = Slices | Equidistant
 
 
 def march_slabs(
     march_own: Callable[..., tuple[Tensor, Tensor]],
-    emission: Emission,
     sampler: Sampler,
     rays: Rays,
     crossing: Crossing,
 ) -> tuple[Tensor, Tensor]:
     """As `integral.march_rays`, through all slabs; by `march_own`, or that itself, in this one."""
-    assert isinstance(emission.grid, Slab)
-    slab, hitting, count = emission.grid, rays.select(crossing.hit), len(crossing.hit)
+    emission, slab = sampler.emission, sampler.emission.grid
+    assert isinstance(slab, Slab)
+    hitting, count = rays.select(crossing.hit), len(crossing.hit)
     near, far = clip_to_slab(slab, hitting, crossing.near, crossing.far, sampler)
     inside = (far > near).nonzero()[:, 0]
     if not len(inside):
@@ -45,16 +43,15 @@ def march_slabs(
         return along.new_zeros(len(along), count).index_copy(1, inside, along)
 
     if emission.peak is None:
-        scattered, mass = map(of_all, march_own(emission, sampler, hitting, own))
+        scattered, mass = map(of_all, march_own(sampler, hitting, own))
         front = sum_before(mass, is_upwards)
         scattered = scattered * torch.exp(-emission.extinction.scale.view(-1, 1) * front)
     else:
         # With a forward peak (E13) radiance depends on all mass before it, found first.
-        absorbing = _without_light(emission)
-        alone = replace(sampler, channels=pack_channels(absorbing))
-        mass = of_all(integral.march_rays(absorbing, alone, hitting, own)[1])
+        absorbing = replace(sampler, emission=_without_light(emission))
+        mass = of_all(integral.march_rays(absorbing, hitting, own)[1])
         front = sum_before(mass, is_upwards)
-        scattered = of_all(march_own(emission, sampler, hitting, own, front[:, inside])[0])
+        scattered = of_all(march_own(sampler, hitting, own, front[:, inside])[0])
     radiance, total = sum_slabs(torch.cat([scattered, mass])).split([len(scattered), len(mass)])
     return radiance, total
 
@@ -78,26 +75,24 @@ def clip_to_slab(
     direction, origin = rays.direction[:, slab.axis], rays.origin[:, slab.axis]
     tiny = torch.finfo(direction.dtype).tiny
     direction = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
-    is_upwards = direction > 0
-    beyond = torch.full_like(direction, torch.inf)
-    crossings = []
-    for end, outside in zip(slab.ends, (-beyond, beyond), strict=True):
-        if end is None:
-            crossings.append(torch.where(is_upwards, outside, -outside))
-        else:
-            crossings.append(_next_node(slab, rays, (end - origin) / direction, sampler))
-    low, high = crossings
-    enter, leave = torch.where(is_upwards, low, high), torch.where(is_upwards, high, low)
+    faces = slab.whole.lower[slab.axis], slab.whole.upper[slab.axis]
+    one, other = (
+        (face - origin) / direction
+        if end is None
+        else _next_node(slab, rays, (end - origin) / direction, sampler)
+        for end, face in zip(slab.ends, faces, strict=True)
+    )
+    enter, leave = torch.minimum(one, other), torch.maximum(one, other)
     near, far = (torch.minimum(torch.maximum(end, near), far) for end in (enter, leave))
     return near, far
 
 
 def _next_node(slab: Slab, rays: Rays, distance: Tensor, sampler: Sampler) -> Tensor:
     """The distance [R] of the node on each of `rays` that is nearest to `distance` [u]."""
-    if isinstance(sampler, Equidistant):
+    axis, like = sampler.way.axis, rays.direction
+    if axis is None:
         return distance
-    axis, like = sampler.axis, rays.direction
-    planes = planes_across(slab.whole, axis, False, sampler.steps, like.dtype, like.device)
+    planes = planes_across(slab.whole, Way(axis), sampler.steps, like.dtype, like.device)
     origin, direction = rays.origin[:, axis], rays.direction[:, axis]
     place = (origin + distance * direction).detach()
     nearest = planes[torch.searchsorted(0.5 * (planes[1:] + planes[:-1]), place)]

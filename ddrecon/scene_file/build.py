@@ -11,7 +11,7 @@ import torch
 from ddrecon.errors import UsageError
 from ddrecon.layer import DTYPES
 from ddrecon.light.lights import Light
-from ddrecon.march.steps import choose_steps
+from ddrecon.march.samplers import choose_steps
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
 from ddrecon.scene_file.build_starts import (

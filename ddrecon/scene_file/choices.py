@@ -9,7 +9,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, get_args
 
 from ddrecon.grid import Triple
-from ddrecon.march.steps import greatest_depth
+from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.scene_file.read import type_hints

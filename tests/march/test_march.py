@@ -149,7 +149,7 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
 
-@each_camera
+@pytest.mark.parametrize("view", [CAMERAS["oblique"], CAMERAS["inside"]], ids=str)
 def test_radiance_and_transmittance_have_both_derivatives(view: dict):
     grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
@@ -182,10 +182,7 @@ def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
     )
 
 
-@pytest.mark.parametrize("g", [0.0, -0.6])
-@pytest.mark.parametrize(
-    "is_behind", [True, False], ids=["lit from behind the camera", "lit towards the camera"]
-)
+@pytest.mark.parametrize(("g", "is_behind"), [(0.0, False), (-0.6, True)])
 def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool):
     """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L);
     approached at second order.
@@ -229,32 +226,18 @@ def test_the_transmittance_of_a_blob_converges_at_second_order():
     """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
     distance b from its middle.
     """
-    camera, counts, errors = (
-        make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1),
-        [12, 24, 48],
-        [],
-    )
+    camera = make_camera(eye=(0.3, 0.4, 2.5), size=(6, 6), half_width=0.1)
+    counts, errors = [10, 20, 40], []
     bundle = cast_rays(camera)
     closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
-    depth = (
-        SIGMA_A
-        * DENSITY
-        * WIDTH
-        * math.sqrt(2 * math.pi)
-        * torch.exp(-(closest**2) / (2 * WIDTH**2))
-    )
-    expected = torch.exp(-depth).view(camera.size)
+    mass = DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    expected = torch.exp(-SIGMA_A * mass).view(camera.size)
     for n in counts:
         grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
         density = DENSITY * torch.exp(
             -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
         )
-        absorbing = {
-            "sigma_a": (SIGMA_A,),
-            "sigma_s": (0.0,),
-            "directional": None,
-            "ambient": (1.0,),
-        }
-        scene = make_scene(density, grid=grid, camera=camera, **absorbing)
+        absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "ambient": (1.0,)}
+        scene = make_scene(density, grid=grid, camera=camera, directional=None, **absorbing)
         errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
     assert errors[-1] < 2e-3 and convergence_order([1 / n for n in counts], errors) >= 1.8, errors

@@ -120,15 +120,15 @@ def test_segments_walked_are_those_whose_cells_it_touches(steps: int):
     pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
     from ddrecon.kernels.packets import LANES
     from ddrecon.march.fused.bundle import pack_rays
-    from ddrecon.march.fused.stretches import find_walked
+    from ddrecon.march.fused.cells import find_walked
 
     scene = scene_with(two_blobs(), {}, half_width=0.6)
     sight = look_through(scene.views[0].camera, scene.volume.grid, scene.render)
-    rays, crossing, axis = sight.rays, sight.crossing, sight.way.axis
-    grid, kind = scene.volume.grid, (axis, sight.way.is_reversed, steps)
-    planes = planes_across(grid, *kind, torch.float64, torch.device("cpu"))
-    support = support_of_planes(scene.volume.support, *kind)
-    packed = pack_rays(grid, axis, rays.origin, rays.direction, *vars(crossing).values())
+    rays, crossing, way = sight.rays, sight.crossing, sight.way
+    grid = scene.volume.grid
+    planes = planes_across(grid, way, steps, torch.float64, torch.device("cpu"))
+    support = support_of_planes(scene.volume.support, way, steps)
+    packed = pack_rays(grid, way.axis, rays.origin, rays.direction, *vars(crossing).values())
     bits = find_walked(support, planes, packed.bundle)
     walked = [
         [bool(bits[p, n // 32] >> (n % 32) & 1) for n in range(len(planes))]

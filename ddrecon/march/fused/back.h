@@ -1,6 +1,5 @@
 #pragma once
 #include "ddrecon/march/fused/rays.h"
-#include "ddrecon/march/fused/spread.h"
 // The adjoint of the walk along packets of rays. Of the walk out nothing is kept but the mass
 // behind each ray: on the walk back values are sampled anew, and masses are those behind less those
 // of the segments in between.
