@@ -13,6 +13,7 @@ from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import Way, choose_way
+from ddrecon.numerics.autodiff import is_steady
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
@@ -52,7 +53,7 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
     shared = tuple(
         tensor.detach().numpy().tobytes()
         for tensor in camera.tensors
-        if not tensor.untyped_storage().resizable()
+        if is_steady(tensor) and not tensor.untyped_storage().resizable()
     )
     return _look(grid, settings, shared, *values)
 

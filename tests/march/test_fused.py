@@ -258,7 +258,7 @@ def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, f
     assert_near(found, known, 1e-11)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if "depth" in name])
 def test_hard_cases_are_passed(name: str):
     """Where cells are opaque, little mass is left of much on the walk back."""
     use_engine("warp")
