@@ -69,11 +69,12 @@ def twist(camera: Camera, change: Tensor, pivot: Triple) -> Camera:
 def rotation(vector: Tensor) -> Tensor:
     """The matrix [3, 3] of the right-handed rotation by |vector| [rad] about `vector` (x, y, z).
 
-    It is the exponential of the cross product by `vector`.
+    Rodrigues' formula, I + (sin a / a) K + (sin (a / 2) / (a / 2))^2 / 2 K^2 with a = |vector| and
+    K the cross product by `vector`.
     """
     axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    crossed: Tensor = torch.linalg.matrix_exp(torch.linalg.cross(axes, vector.expand(3, 3)))
-    return crossed
+    turns, cross = vector.norm() / math.pi, torch.linalg.cross(axes, vector.expand(3, 3))
+    return axes + torch.sinc(turns) * cross + 0.5 * torch.sinc(turns / 2) ** 2 * cross @ cross
 
 
 @dataclass(frozen=True)

@@ -245,10 +245,8 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
     Behind the volume is what is `given` [C, h, w], else the lights.
     """
-    sight, samples = (
-        look_through(camera, scene.volume.grid, scene.render),
-        scene.render.samples_per_pixel,
-    )
+    sight = look_through(camera, scene.volume.grid, scene.render)
+    samples = scene.render.samples_per_pixel
     behind = None
     if given is not None:
         behind = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)

@@ -115,10 +115,7 @@ def _spread(along: Tensor, sight: Sight) -> Tensor:
 
 
 def march_rays(
-    sampler: Sampler,
-    rays: Rays,
-    crossing: Crossing,
-    front: Tensor | None = None,
+    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2, E3).
 
@@ -128,9 +125,8 @@ def march_rays(
 
     def run(chunk: Tensor) -> Tensor:
         chosen = hitting.select(chunk)
-        sampled, distance = sampler.sample(
-            values, chosen, crossing.near[chunk], crossing.far[chunk]
-        )
+        near, far = crossing.near[chunk], crossing.far[chunk]
+        sampled, distance = sampler.sample(values, chosen, near, far)
         nodes = Nodes(chosen.origin, chosen.direction, distance)
         before = None if front is None else front[:, chunk]
         return torch.cat(integrate_segments(emission, sampled, nodes, before))

@@ -98,13 +98,13 @@ def _lattice_rays(
 def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
     """`values` [K, r, c] of lattice rays at `places` [P, 2] (rows, columns): `[K, P]`.
 
-    They are interpolated to third order, and held at zero.
+    They are interpolated to third order, and not below zero.
     """
     return interpolate(values, places).clamp(min=0)
 
 
 def interpolate(values: Tensor, places: Tensor) -> Tensor:
-    """The same, not held."""
+    """The same, whatever it is."""
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]

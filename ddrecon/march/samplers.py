@@ -104,8 +104,8 @@ class Sampler:
         points = torch.stack(places, -1)
         if axis is None:
             return sample_volume(values, points, third_order).transpose(0, 1), distance
-        held = torch.minimum(torch.maximum(distance, near), far)
-        return sample_slices(values, points, third_order), held
+        within = torch.minimum(torch.maximum(distance, near), far)
+        return sample_slices(values, points, third_order), within
 
 
 @remember

@@ -233,7 +233,7 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
 
 @pytest.mark.parametrize(
     ("lights", "view"),
-    zip(LIGHTS.values(), ["inside", "oblique", "inside", "oblique", "oblique"], strict=True),
+    list(zip(LIGHTS.values(), ["inside", "oblique", "inside", "oblique", "oblique"])),
     ids=LIGHTS.keys(),
 )
 @pytest.mark.usefixtures("same_fields")

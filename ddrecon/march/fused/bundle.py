@@ -25,12 +25,7 @@ from ddrecon.light.beam import Beam, leaving_cosine
 from ddrecon.march.emission import Emission
 from ddrecon.march.fused.kernels import Layout
 from ddrecon.medium.phase import PhaseKind
-from ddrecon.medium.phase_cells import (
-    at_ends,
-    end_table,
-    others_of,
-    peak_tables,
-)
+from ddrecon.medium.phase_cells import at_ends, end_table, others_of, peak_tables
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember

@@ -41,10 +41,7 @@ NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
 
 
 def march_rays(
-    sampler: Sampler,
-    rays: Rays,
-    crossing: Crossing,
-    front: Tensor | None = None,
+    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
     emission, ends = sampler.emission, (crossing.hit, crossing.near, crossing.far)

@@ -74,7 +74,7 @@ template <class F> struct Pixels {
                     const F* row = out_bar + (first + k) * (long long)pixels;
                     V bar = P::all(F(0));
                     for (int l = 0; l < LANES && n + l < end; ++l) P::put(bar, l, row[hit[n + l]]);
-                    // What was held at zero does not move.
+                    // What was clamped to zero does not move.
                     const V found = value_at(packet, channel(first + k));
                     bars[k] = P::pick(found < P::all(F(0)), P::all(F(0)), bar);
                 }
@@ -86,7 +86,7 @@ template <class F> struct Pixels {
                 for (int r = 0; r < packet.runs.count; ++r) {
                     const Shares<F> shares(packet.runs.run[r], packet.y, packet.x, lines(), true);
                     for (int k = 0; k < count; ++k)
-                        shares.add_bent(field + k * size, bars[k], -bars[k]);
+                        shares.add_cubic(field + k * size, bars[k], -bars[k]);
                 }
 #endif
             }

@@ -59,7 +59,7 @@ struct Layout {
     static constexpr INLINE int curve(int b, int c) {
         return b * RAY_TERMS + (HAS_TABLES ? c * (HAS_NUMBERS ? 2 : COEFFICIENTS) : 0);
     }
-    static constexpr INLINE bool is_bent(int c) { return c >= FIRST_MASS && c < AFTER_MASSES; }
+    static constexpr INLINE bool is_cubic(int c) { return c >= FIRST_MASS && c < AFTER_MASSES; }
     // Whether beam b is a point light.
     static constexpr INLINE bool is_point(int b) {
         const bool points[] = {POINTS..., false};
@@ -136,13 +136,14 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
 
     // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
-    // at and `t` held in the box; values; emission, depth, exp(-depth), and p; the beams' angles.
+    // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p; the beams'
+    // angles.
     struct Node : Spot<F, IS_SLICED, V> {
         Runs<F> runs;
         bool is_empty, is_lit;
         Distance s, t;
         N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
-        V held[L::MASSES + 1], decay[L::OUT];
+        V limit[L::MASSES + 1], decay[L::OUT];
         E p[L::OUT];
         Cubic<F, V> angle[L::BEAMS + 1];
     };
@@ -176,7 +177,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             for (int k = 0; k < L::BEAMS * L::RAY_TERMS; ++k)
                 coefficients[k] =
                     load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
-        // Nodes before the box and behind it are held at its faces: between them nothing is added.
+        // Nodes before the box and behind it are clamped to its faces: between them nothing is
+        // added.
         const V near = value_of(ray[6]), far = value_of(ray[7]);
         while (first_node < last_node && P::every(value_of(distance(ray, first_node + 1)) <= near))
             ++first_node;
@@ -238,13 +240,13 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return from < to;
     }
 
-    // Of any kind of numbers that a ray has: the distance of node n; the same held in the box; and
-    // where it is then across slices, along y, and along x.
+    // Of any kind of numbers that a ray has: the distance of node n; the same clamped to the box;
+    // and where it is then across slices, along y, and along x.
     template <class X> X distance(const X* ray, int n) const {
         if (IS_SLICED) return (given.planes[n] - ray[0]) / ray[3];
         return ray[6] + given.planes[n] * (ray[7] - ray[6]);
     }
-    template <class X> static X hold(const X* ray, const X& s) {
+    template <class X> static X clamp(const X* ray, const X& s) {
         return P::least(P::most(s, ray[6]), ray[7]);
     }
     template <class X> static X place(const X* ray, const X& s, int axis) {
@@ -256,7 +258,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     // Where node n lies, and the matter there.
     void locate(int n, Node& node) const {
         node.s = distance(ray, n);
-        node.t = hold(ray, node.s);
+        node.t = clamp(ray, node.s);
         auto at = [&](int axis, int size) {
             return Place<F, V>::at(value_of(place(ray, node.s, axis)), size);
         };
@@ -289,9 +291,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                     const Window<F> w(node.runs.run[r], node.y, node.x, lines);
                     for (int c = from; c < to; ++c) {
                         V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = w.value(fields[c] + offset, L::is_bent(c), bend);
+                        const V v = w.value(fields[c] + offset, L::is_cubic(c), bend);
                         known = P::pick(w.is_in, v, known);
-                        if (!L::is_bent(c)) continue;
+                        if (!L::is_cubic(c)) continue;
                         V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
                         known_bend = P::pick(w.is_in, bend, known_bend);
                     }
@@ -302,8 +304,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         for (int c = from; c < to; ++c) {
             V bend = P::all(F(0));
             P::template part<PART>(node.v[c]) =
-                node.value(fields[c] + offset, lines, L::is_bent(c), bend);
-            if (L::is_bent(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
+                node.value(fields[c] + offset, lines, L::is_cubic(c), bend);
+            if (L::is_cubic(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
         }
     }
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
@@ -326,9 +328,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         for (int c = from; c < to; ++c) {
             const F* field = given.fields[c] + slice(n);
             Slope bend(none), other(none);
-            Slope v = sides[0].value(field, lines, L::is_bent(c), bend);
+            Slope v = sides[0].value(field, lines, L::is_cubic(c), bend);
             if (has_kink) {
-                v = F(0.5) * (v + sides[1].value(field, lines, L::is_bent(c), other));
+                v = F(0.5) * (v + sides[1].value(field, lines, L::is_cubic(c), other));
                 bend = F(0.5) * (bend + other);
             }
             take(c, v, bend);
@@ -345,7 +347,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         };
         take_slopes(n, node.s, from, to, [&](int c, const Slope& v, const Slope& bend) {
             node.v[c].by[0] += along(v);
-            if (L::is_bent(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
+            if (L::is_cubic(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
         });
     }
 
@@ -425,10 +427,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         sample(node, n, L::EXTINCTION, L::AFTER_MASSES);
         if (L::FIRST_PEAK < L::CHANNELS) sample(node, n, L::FIRST_PEAK, L::CHANNELS);
         for (int k = 0; k < L::MASSES; ++k) {
-            const N bent = number(2 * L::C) * node.bend[k],
-                    held = F(1) / P::root(F(1) + bent * bent);
-            node.v[L::FIRST_MASS + k] -= node.bend[k] * held;
-            node.held[k] = value_of(held);
+            const N off = number(2 * L::C) * node.bend[k], limit = F(1) / P::root(F(1) + off * off);
+            node.v[L::FIRST_MASS + k] -= node.bend[k] * limit;
+            node.limit[k] = value_of(limit);
         }
         for (int c = 0; c < L::C; ++c) {
             const N scattering = node.v[L::diffusing(c)];

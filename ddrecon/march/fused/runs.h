@@ -91,11 +91,11 @@ template <class F> struct Window {
             rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
     }
     // As `Spot::value`.
-    INLINE V value(const F* f, bool is_bent, V& bend) const {
+    INLINE V value(const F* f, bool is_cubic, V& bend) const {
         V row[4];
         UNROLLED
         for (int r = 0; r < 4; ++r) {
-            if (!is_bent && (r == 0 || r == 3)) continue;
+            if (!is_cubic && (r == 0 || r == 3)) continue;
             if (stride == 1)
                 row[r] = P::read(f + rows[r] + first);
             else
@@ -103,7 +103,7 @@ template <class F> struct Window {
                     row[r][l] = f[rows[r] + (long long)(first + l) * stride];
         }
         auto cell = [&](int r, int c) HERE { return Permute<F>::pick(row[r], x.cells[c]); };
-        return is_bent ? curved(y, x, cell, bend) : linear(y, x, cell);
+        return is_cubic ? curved(y, x, cell, bend) : linear(y, x, cell);
     }
 };
 
@@ -157,11 +157,11 @@ template <class F> struct Shares {
     // first to fourth it is. Else each lane's weights of columns, and those of a (1 - a) / 2 second
     // differences.
     I lanes_of[MOST_ALIKE][4];
-    V linear[LANES], bent[LANES];
+    V linear[LANES], cubic[LANES];
 
     Shares(
         const Run& run, const Place<F, V>& y, const Place<F, V>& x, const Lines& lines,
-        bool is_bent)
+        bool is_cubic)
         : run(run),
           lines(lines),
           first(run.first),
@@ -185,9 +185,9 @@ template <class F> struct Shares {
             for (int c = 0; c < 4; ++c) at[c] = column(((const int*)&x.cells[c])[l]);
             const F w1 = xa[l], w0 = F(1) - w1;
             linear[l] = w0 * at[1] + w1 * at[2];
-            if (is_bent)
-                bent[l] = excess[l] * ((w1 - F(2) * w0) * at[1] + (w0 - F(2) * w1) * at[2] +
-                                       w0 * at[0] + w1 * at[3]);
+            if (is_cubic)
+                cubic[l] = excess[l] * ((w1 - F(2) * w0) * at[1] + (w0 - F(2) * w1) * at[2] +
+                                        w0 * at[0] + w1 * at[3]);
         }
     }
     void pick_lanes(const Place<F, V>& x) {
@@ -222,17 +222,17 @@ template <class F> struct Shares {
         alike = most;
     }
     // To a row of cells what linear values there have as bars, and corrections along the row.
-    template <bool IS_BENT> void add_row(F* row, V bar, V bend_bar = V{}) const {
+    template <bool IS_CUBIC> void add_row(F* row, V bar, V bend_bar = V{}) const {
         V sum = P::all(F(0));
         if (!alike)
             for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
                 const int l = __builtin_ctz(rest);
                 sum += ((const F*)&bar)[l] * linear[l];
-                if (IS_BENT) sum += ((const F*)&bend_bar)[l] * bent[l];
+                if (IS_CUBIC) sum += ((const F*)&bend_bar)[l] * cubic[l];
             }
         if constexpr (HAS_PERMUTATION<F>) {
             V by_j = bar * xa, by_i = bar - by_j, by_m = V{}, by_p = V{};
-            if (IS_BENT) {
+            if (IS_CUBIC) {
                 const V bend = x_excess * bend_bar;
                 by_p = bend * xa;
                 by_m = bend - by_p;
@@ -242,7 +242,7 @@ template <class F> struct Shares {
             for (int k = 0; k < alike; ++k) {
                 sum +=
                     Lanes::pick_any(by_i, lanes_of[k][1]) + Lanes::pick_any(by_j, lanes_of[k][2]);
-                if (IS_BENT)
+                if (IS_CUBIC)
                     sum += Lanes::pick_any(by_m, lanes_of[k][0]) +
                            Lanes::pick_any(by_p, lanes_of[k][3]);
             }
@@ -260,7 +260,7 @@ template <class F> struct Shares {
         add_row<false>(field + rows[1], bar - in_j);
         add_row<false>(field + rows[2], in_j);
     }
-    void add_bent(F* field, V bar, V bend_bar) const {
+    void add_cubic(F* field, V bar, V bend_bar) const {
         const V bend_j = bend_bar * ya, bend_i = bend_bar - bend_j;
         const V in_m = y_excess * bend_i, in_p = y_excess * bend_j, in_j = bar * ya;
         add_row<false>(field + rows[0], in_m);
