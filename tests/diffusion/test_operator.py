@@ -18,7 +18,7 @@ from ddrecon.diffusion.operator import (
     difference,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.multigrid import conjugate_gradient
+from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.grid import Grid
 
 SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
