@@ -15,7 +15,7 @@ from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
-from ddrecon.march.lattice import find_rough, interpolate_between
+from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
 from ddrecon.medium.phase_cells import SeenNodes
@@ -63,7 +63,7 @@ def march(
         lattice = sight.lattice
         between = march_these(lattice.rays, lattice.crossing).unflatten(1, lattice.shape)
         values = _interpolate(between, sight, lattice.places)
-        numbers = _find_rough(between, lattice.places, settings.tolerance, behind)
+        numbers = _find_rough(between, lattice, settings.tolerance, behind)
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
             values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
@@ -92,8 +92,10 @@ def _interpolate(values: Tensor, sight: Sight, places: Tensor) -> Tensor:
     return _spread(interpolate_between(values, places), sight)
 
 
-def _find_rough(values: Tensor, places: Tensor, tolerance: float, behind: Tensor | None) -> Tensor:
-    """Which pixels, of those at `places` [P, 2] of a lattice, are not to be interpolated: [*].
+def _find_rough(
+    values: Tensor, lattice: Lattice, tolerance: float, behind: Tensor | None
+) -> Tensor:
+    """Which pixels among the rays of a lattice are not to be interpolated: numbers [*].
 
     The `values` [2 C, r, c] of the lattice say that this may change the image by more than
     `tolerance` of its root mean square.
@@ -102,7 +104,7 @@ def _find_rough(values: Tensor, places: Tensor, tolerance: float, behind: Tensor
     brightest = 0.0 if behind is None else behind.detach().max()
     seen = scattered + brightest * (1 - opacity)
     bound = tolerance * seen.square().mean(dtype=torch.float64).sqrt()
-    return find_rough(torch.cat([scattered, brightest * opacity]), bound.to(values.dtype), places)
+    return find_rough(torch.cat([scattered, brightest * opacity]), bound.to(values.dtype), lattice)
 
 
 def _spread(along: Tensor, sight: Sight) -> Tensor:

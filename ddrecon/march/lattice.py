@@ -6,6 +6,7 @@ cross most cells, and so it is in every slice.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,6 +46,12 @@ class Lattice:
     crossing: Crossing
     shape: tuple[int, int]
     places: Tensor
+
+    @functools.cached_property
+    def cells(self) -> Tensor:
+        """Between which four rays places lie [P], counted row by row."""
+        rows, columns = self.places.detach().floor().long().unbind(-1)
+        return rows * (self.shape[1] - 1) + columns
 
 
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
@@ -110,8 +117,8 @@ def interpolate(values: Tensor, places: Tensor) -> Tensor:
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def find_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
-    """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: numbers [*].
+def find_rough(values: Tensor, tolerance: Tensor, lattice: Lattice) -> Tensor:
+    """Which pixels interpolation may have off by more than `tolerance`: numbers [*].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
     they are large at edges sharper than the lattice as well. They come in an order in which
@@ -120,8 +127,8 @@ def find_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
     down, along = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
     uneven = (down.abs() + along.abs()).sum(0)
     # Of each place, the largest of the four rays around.
-    largest = max_pool2d(uneven[None], 2, 1)[0]
-    rows, columns = places.detach().floor().long().unbind(-1)
-    rough = (DOUBT * largest[rows, columns] > tolerance).nonzero()[:, 0]
-    stripe = rows[rough] // RAYS_PER_VOXEL
-    return rough[(stripe * values.shape[2] + places.detach()[rough, 1]).argsort(stable=True)]
+    is_rough = (DOUBT * max_pool2d(uneven[None], 2, 1) > tolerance).flatten()
+    rough = is_rough[lattice.cells].nonzero()[:, 0]
+    rows, columns = lattice.places.detach()[rough].unbind(-1)
+    stripe = (rows / RAYS_PER_VOXEL).floor()
+    return rough[(stripe * lattice.shape[1] + columns).argsort(stable=True)]

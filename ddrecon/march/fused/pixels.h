@@ -48,6 +48,10 @@ template <class F> struct Pixels {
         return value - bend;
     }
 
+    // Whether pixels n on, as many as lanes, are neighbors in an image.
+    INLINE bool is_whole(int n, int end) const {
+        return n + LANES <= end && hit[n + LANES - 1] - hit[n] == LANES - 1;
+    }
     // To `out` [channels, pixels].
     void interpolate(int item, F* out) const {
         const int end = this->end(item);
@@ -56,7 +60,11 @@ template <class F> struct Pixels {
             for (int k = 0; k < channels; ++k) {
                 const V value = P::most(value_at(packet, channel(k)), P::all(F(0)));
                 F* row = out + k * (long long)pixels;
-                for (int l = 0; l < LANES && n + l < end; ++l) row[hit[n + l]] = P::lane(value, l);
+                if (is_whole(n, end))
+                    P::write(row + hit[n], value);
+                else
+                    for (int l = 0; l < LANES && n + l < end; ++l)
+                        row[hit[n + l]] = P::lane(value, l);
             }
         }
     }
@@ -73,7 +81,11 @@ template <class F> struct Pixels {
                 for (int k = 0; k < count; ++k) {
                     const F* row = out_bar + (first + k) * (long long)pixels;
                     V bar = P::all(F(0));
-                    for (int l = 0; l < LANES && n + l < end; ++l) P::put(bar, l, row[hit[n + l]]);
+                    if (is_whole(n, end))
+                        bar = P::read(row + hit[n]);
+                    else
+                        for (int l = 0; l < LANES && n + l < end; ++l)
+                            P::put(bar, l, row[hit[n + l]]);
                     // What was clamped to zero does not move.
                     const V found = value_at(packet, channel(first + k));
                     bars[k] = P::pick(found < P::all(F(0)), P::all(F(0)), bar);
