@@ -61,34 +61,20 @@ def twist(camera: Camera, change: Tensor, pivot: Triple) -> Camera:
     """
     axes, origin = camera.pose[:, :3], camera.pose[:, 3]
     center = origin.new_tensor(pivot)
-    rotation = axes @ _rotation(change[:3]) @ axes.T
-    moved = center + rotation @ (origin - center) + axes @ change[3:]
-    return replace(camera, pose=torch.cat([rotation @ axes, moved[:, None]], 1))
+    turn = axes @ rotation(change[:3]) @ axes.T
+    moved = center + turn @ (origin - center) + axes @ change[3:]
+    return replace(camera, pose=torch.cat([turn @ axes, moved[:, None]], 1))
 
 
-def _rotation(vector: Tensor) -> Tensor:
-    """The matrix [3, 3] of the rotation by |vector| [rad] about `vector`.
+def rotation(vector: Tensor) -> Tensor:
+    """The matrix [3, 3] of the right-handed rotation by |vector| [rad] about `vector` (x, y, z).
 
-    Rodrigues' formula, I + (sin a / a) K + ((1 - cos a) / a^2) K^2 with a = |vector| and K the
-    cross product by `vector`. Its factors are smooth at a = 0, but not as written: there they are
-    taken from their series.
+    Rodrigues' formula, I + (sin a / a) K + (sin (a / 2) / (a / 2))^2 / 2 K^2 with a = |vector| and
+    K the cross product by `vector`.
     """
-    square = vector @ vector
-    is_small = square < 1e-3
-    angle = torch.where(is_small, 1, square).sqrt()
-    first = torch.where(
-        is_small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), angle.sin() / angle
-    )
-    second = torch.where(
-        is_small,
-        0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)),
-        (1 - angle.cos()) / angle**2,
-    )
-    x, y, z = vector.unbind()
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-    identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
-    return identity + first * cross + second * cross @ cross
+    axes = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    turns, cross = vector.norm() / math.pi, torch.linalg.cross(axes, vector.expand(3, 3))
+    return axes + torch.sinc(turns) * cross + 0.5 * torch.sinc(turns / 2) ** 2 * cross @ cross
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from ddrecon.light.sky import Sky, decompose_lights
 from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
-from ddrecon.march.sight import Sight, look_through
+from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.medium.cut import cut_volume
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
@@ -210,15 +210,16 @@ def view_image(
     `behind` [C, h, w] is the radiance behind the volume, in place of that of lights.
     """
     if derivatives == "all":
-        sight = look_through(camera, scene.volume.grid, scene.render)
-        image = _image(_emission(light_field, sight.rays), scene, sight, behind, camera.size)
-        return image.unflatten(-1, camera.size)
+        return _image(light_field, scene, camera, behind)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    single = replace(light_field, diffuse=nothing, turned=()), scene, camera, "all", behind
-    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene), camera
+    parts = [
+        (replace(light_field, diffuse=nothing, turned=()), scene, camera, behind),
+        (replace(light_field, beams=(), skies=()), _without_background(scene), camera, None),
+    ]
+    varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
-        rest = (view_image(*diffusion) if derivatives == "single" else view_image(*single)).detach()
-    return (view_image(*single) if derivatives == "single" else view_image(*diffusion)) + rest
+        rest = _image(*fixed).detach()
+    return _image(*varied) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -239,25 +240,24 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _image(
-    emission: Emission, scene: Scene, sight: Sight, given: Tensor | None, size: tuple[int, int]
-) -> Tensor:
-    """Radiance [3, pixels]: E1, averaged over the rays of each pixel.
+def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor | None) -> Tensor:
+    """Radiance [3, h, w]: E1, averaged over the rays of each pixel.
 
-    Behind the volume is what is `given` [C, h, w] for an image of this `size`, else the lights.
+    Behind the volume is what is `given` [C, h, w], else the lights.
     """
+    sight = look_through(camera, scene.volume.grid, scene.render)
+    samples = scene.render.samples_per_pixel
     behind = None
     if given is not None:
-        pixels = given.expand(-1, *size).flatten(1)
-        behind = pixels.repeat(1, scene.render.samples_per_pixel)
+        behind = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)
     elif scene.render.background:
         behind = _background(scene.lights, sight.rays)
-    radiance, clear = march(emission, sight, scene.render, behind)
+    radiance, clear = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     if behind is not None:
         radiance = radiance + clear * behind
-    if scene.render.samples_per_pixel > 1:
-        radiance = radiance.unflatten(-1, (scene.render.samples_per_pixel, -1)).mean(-2)
-    return radiance.expand(3, -1)
+    if samples > 1:
+        radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)
+    return radiance.expand(3, -1).unflatten(-1, camera.size)
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:

@@ -10,21 +10,28 @@ from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
-from ddrecon.march.steps import greatest_depth
+from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
-from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
-from ddrecon.settings import DiffusionSettings
 
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
+    medium, phase = scale_medium(scene.volume, scene.diffusion.angles), scene.volume.phase
+    is_diffuse = multiply_scatters(medium, scene.diffusion)
+    colors = medium.extinction.scale.shape[0]
     samples = _count(scene.render.steps, "sample")
-    depth = f"{greatest_depth(scene.volume):.2g}"
-    return [*_light_in(scene), f"view rays: {samples} a cell of at most {depth} optical depths"]
+    means = _listed(phase.moments(2)[:, 1], phase.cells is not None)
+    return [
+        f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
+        f"phase function {phase.NAME}, mean cosine {means}",
+        *_light_terms(scene.lights, is_diffuse),
+        *_diffuse_terms(medium, scene, is_diffuse),
+        f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
+    ]
 
 
 def engine_of_scene(scene: Scene, has_slabs: bool) -> dict[str, str]:
@@ -56,41 +63,39 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
     return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
 
 
-def _light_in(scene: Scene) -> list[str]:
-    """The terms of the light in the volume of `scene`."""
-    settings = scene.diffusion
-    medium = scale_medium(scene.volume, settings.angles)
-    colors = medium.extinction.scale.shape[0]
-    is_diffuse = multiply_scatters(medium, settings)
-    terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
-    terms.append(_phase_term(scene.volume.phase))
-    terms += _light_terms(scene.lights, is_diffuse)
+def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
+    """The terms of light that is scattered more than once."""
     if not is_diffuse:
-        return [*terms, "no multiple scattering: no diffusion solve"]
-    if bool((medium.forward_fraction > 0).any()):
-        terms.append(_peak_term(medium))
-    terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
+        return ["no multiple scattering: no diffusion solve"]
+    settings, terms = scene.diffusion, []
+    fraction = medium.forward_fraction
+    if bool((fraction > 0).any()):
+        part = _listed(fraction, medium.is_cellwise)
+        terms.append(f"delta-Eddington scaling of the forward peak, {part} of scattering")
+    if settings.scheme == "printed":
+        method = "smooth closure, printed scheme by Jacobi iteration"
+    elif settings.model == "flux_limited":
+        method = f"{settings.limiter} limiter, damped Picard iteration with {settings.solver}"
+    else:
+        method = f"{settings.closure} closure, {settings.solver}"
+    terms.append(f"multiple scattering by {settings.model} diffusion, {method}")
     if settings.rounds:
-        terms += _round_terms(medium, scene)
+        rounds = _count(settings.rounds, "transport round")
+        directions = DIRECTIONS[settings.angles]
+        rounds += f" of sweeps along {directions} directions, each with a diffusion solve"
+        if medium.degree > 1:
+            left = remaining_moments(medium)[2].abs().max().item()
+            rounds += f"; each leaves up to {left:.2g} of what diffusion lacks"
+        terms.append(rounds)
+        if _has_pairs(medium, scene):
+            part = _listed(backward_fraction(medium), medium.is_cellwise)
+            terms.append(f"beams in pairs: a backward peak turns {part} of scattering back")
     else:
         terms.append("no transport rounds: diffusion alone")
-    return [*terms, _angle_term(medium)]
-
-
-def _round_terms(medium: Medium, scene: Scene) -> list[str]:
-    """Transport rounds, and the pairs of beams that they go with."""
-    settings = scene.diffusion
-    rounds = _count(settings.rounds, "transport round")
-    directions = DIRECTIONS[settings.angles]
-    terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
-    if medium.degree > 1:
-        left = remaining_moments(medium)[2].abs().max().item()
-        terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
-    if _has_pairs(medium, scene):
-        part = backward_fraction(medium).max().item()
-        most = "up to " if medium.is_cellwise else ""
-        terms.append(f"beams in pairs: a backward peak turns {most}{part:.3g} of scattering back")
-    return terms
+    moments = count_harmonics(medium.degree)
+    kept = ["no fluxes Q1 and L1 (g = 0)", "fluxes Q1 and L1 (g is not 0)"]
+    kept += [f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"]
+    return [*terms, kept[min(medium.degree, 2)]]
 
 
 def _has_pairs(medium: Medium, scene: Scene) -> bool:
@@ -107,64 +112,30 @@ def _has_beams(lights: Sequence[Light]) -> bool:
     )
 
 
-def _angle_term(medium: Medium) -> str:
-    """What of light's direction is kept."""
-    if medium.degree == 0:
-        return "no fluxes Q1 and L1 (g = 0)"
-    if medium.degree == 1:
-        return "fluxes Q1 and L1 (g is not 0)"
-    moments = count_harmonics(medium.degree)
-    return f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"
-
-
-def _phase_term(phase: PhaseFunction) -> str:
-    """Which phase function, and its mean cosine."""
-    means = phase.moments(2)[:, 1]
-    if phase.cells is not None:
-        least, most = means.min().item(), means.max().item()
-        return f"phase function {phase.NAME}, mean cosine per cell, {least:.3g} to {most:.3g}"
-    return f"phase function {phase.NAME}, mean cosine {_listed(means)}"
-
-
-def _peak_term(medium: Medium) -> str:
-    """What part of scattering counts as not scattered."""
-    fraction = medium.forward_fraction
-    parts = f"up to {fraction.max().item():.3g}" if medium.is_cellwise else _listed(fraction)
-    return f"delta-Eddington scaling of the forward peak, {parts} of scattering"
-
-
-def _listed(numbers: Tensor) -> str:
-    return ", ".join(f"{number:.3g}" for number in numbers.flatten().tolist())
-
-
-def _method(settings: DiffusionSettings) -> str:
-    if settings.scheme == "printed":
-        return "smooth closure, printed scheme by Jacobi iteration"
-    if settings.model == "flux_limited":
-        return f"{settings.limiter} limiter, damped Picard iteration with {settings.solver}"
-    return f"{settings.closure} closure, {settings.solver}"
-
-
 def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
     terms = []
     for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
-        count = sum(isinstance(light, kind) for light in lights)
-        if count:
+        if count := sum(isinstance(light, kind) for light in lights):
             terms.append(f"transmittance towards {_count(count, name)}")
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"
     if any(isinstance(light, AmbientLight) for light in lights):
         terms.append(f"ambient light, {ambient}")
-    maps = [light for light in lights if isinstance(light, EnvironmentLight)]
-    return terms + [_environment_term(light, ambient) for light in maps]
+    for light in lights:
+        if isinstance(light, EnvironmentLight):
+            (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
+            beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
+            sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
+            terms.append(f"environment map {width} x {height}: {beams}{sky}")
+    return terms
 
 
-def _environment_term(light: EnvironmentLight, ambient: str) -> str:
-    (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
-    beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
-    sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
-    return f"environment map {width} x {height}: {beams}{sky}"
+def _listed(numbers: Tensor, is_by_cell: bool) -> str:
+    """`numbers` of colors; or, where they differ from cell to cell, from which to which."""
+    if is_by_cell:
+        return f"{numbers.min().item():.3g} to {numbers.max().item():.3g} by cell"
+    return ", ".join(dict.fromkeys(f"{number:.3g}" for number in numbers.flatten().tolist()))
 
 
 def _count(number: int, noun: str) -> str:

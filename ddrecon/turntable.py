@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera
+from ddrecon.cameras import Camera, rotation
 from ddrecon.grid import Triple
 from ddrecon.light.lights import DirectionalLight, Light
 from ddrecon.scene import Scene, View
@@ -26,9 +26,9 @@ def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Came
     The line runs through `center` (x, y, z).
     """
     middle = camera.pose.new_tensor(center)
-    rotation = _rotation(axis, angle).to(camera.pose)
-    origin = middle + rotation @ (camera.pose[:, 3] - middle)
-    return replace(camera, pose=torch.cat([rotation @ camera.pose[:, :3], origin[:, None]], 1))
+    turn = _turn(axis, angle).to(camera.pose)
+    origin = middle + turn @ (camera.pose[:, 3] - middle)
+    return replace(camera, pose=torch.cat([turn @ camera.pose[:, :3], origin[:, None]], 1))
 
 
 def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
@@ -37,11 +37,11 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
     They are called `ring_000`, which is that of `view`, `ring_001` and so on.
     """
     axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
-    angles = [2 * math.pi * index / count for index in range(count)]
-    return [
-        View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center))
-        for index, angle in enumerate(angles)
-    ]
+    turned = (
+        turn_camera(view.camera, axis, 2 * math.pi * index / count, center)
+        for index in range(count)
+    )
+    return [View(f"ring_{index:03d}", camera) for index, camera in enumerate(turned)]
 
 
 def turn_lights(scene: Scene, count: int) -> list[list[Light]]:
@@ -50,24 +50,16 @@ def turn_lights(scene: Scene, count: int) -> list[list[Light]]:
     They turn about the axis that `place_turntable` has. The first are those of the scene.
     """
     axis = upright_axis([item.camera for item in scene.views])
-    turned = list[list[Light]]()
-    for index in range(count):
-        rotation = _rotation(axis, 2 * math.pi * index / count)
-        turned.append(
-            [
-                replace(light, direction=rotation.to(light.direction) @ light.direction)
-                if isinstance(light, DirectionalLight)
-                else light
-                for light in scene.lights
-            ]
-        )
-    return turned
+
+    def turned(light: Light, turn: Tensor) -> Light:
+        if not isinstance(light, DirectionalLight):
+            return light
+        return replace(light, direction=turn.to(light.direction) @ light.direction)
+
+    turns = [_turn(axis, 2 * math.pi * index / count) for index in range(count)]
+    return [[turned(light, turn) for light in scene.lights] for turn in turns]
 
 
-def _rotation(axis: int, angle: float) -> Tensor:
-    """The matrix [3, 3] that turns by `angle` about `axis`, right-handed, in double precision."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix = torch.eye(3, dtype=torch.float64)
-    matrix[first, first] = matrix[second, second] = math.cos(angle)
-    matrix[second, first], matrix[first, second] = math.sin(angle), -math.sin(angle)
-    return matrix
+def _turn(axis: int, angle: float) -> Tensor:
+    """The matrix [3, 3] that turns by `angle` about `axis`, in double precision."""
+    return rotation(angle * torch.eye(3, dtype=torch.float64)[axis])

@@ -103,10 +103,10 @@ RADIUS = 0.35
 
 
 def ball(thickness: float, g: float) -> Scene:
-    grid = Grid((18, 20, 22), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    grid = Grid((12, 13, 14), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
     density = (radius < RADIUS).double() * thickness / (2 * RADIUS)
-    camera = make_camera(size=(16, 16), half_width=0.25)
+    camera = make_camera(size=(10, 10), half_width=0.25)
     return make_scene(
         density,
         grid=grid,
@@ -126,8 +126,7 @@ def misses(camera: Camera, radius: float) -> Tensor:
     return ((bundle.origin**2).sum(1) - along**2 > radius**2).view(camera.size)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
-@pytest.mark.parametrize("thickness", [0.0, 1.0, 10.0])
+@pytest.mark.parametrize(("thickness", "g"), [(0.0, 0.5), (1.0, 0.5), (10.0, -0.5), (10.0, 0.0)])
 def test_a_white_furnace_is_white(thickness: float, g: float):
     """Albedo 1 under radiance 1 from everywhere: radiance 1 everywhere, and not even rounding where
     nothing is in the way.
@@ -212,22 +211,6 @@ def test_images_are_linear_in_light():
         replace(scene, lights=[ambient])
     )
     torch.testing.assert_close(render(replace(scene, lights=mixed)), parts, rtol=1e-10, atol=0)
-
-
-def test_gray_is_three_equal_colors():
-    density = half_empty(*SHAPE)
-    gray = make_scene(
-        density, sigma_a=(0.5,), sigma_s=(6.0,), g=0.4, directional=(3.0,), ambient=(0.5,)
-    )
-    colored = make_scene(
-        density,
-        sigma_a=(0.5,) * 3,
-        sigma_s=(6.0,) * 3,
-        g=0.4,
-        directional=(3.0,) * 3,
-        ambient=(0.5,) * 3,
-    )
-    torch.testing.assert_close(render(gray), render(colored), rtol=1e-10, atol=0)
 
 
 @pytest.mark.parametrize("colored", ["light", "medium"])
@@ -357,9 +340,6 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
     },
     "no model": {"model": "none", "g": 0.4, **BOTH},
 }
-each_configuration = pytest.mark.parametrize(
-    "configuration", CONFIGURATIONS.values(), ids=CONFIGURATIONS.keys()
-)
 
 
 @pytest.fixture
@@ -424,49 +404,28 @@ def central_difference(
     return (at(step) - at(-step)) / (2 * step)
 
 
-@each_configuration
-def test_tangent_and_adjoint_of_an_image_agree(configuration: dict[str, Any], build):
-    assert modes_error(build(configuration), "density") < 1e-10
+BY_OTHERS = [
+    (name, configuration)
+    for name in ("sigma_a", "sigma_s", "g")
+    for configuration in ("forward, both, perspective", "fields, both, perspective")
+]
 
 
-@pytest.mark.parametrize("name", ["sigma_a", "sigma_s", "g"])
 @pytest.mark.parametrize(
-    "configuration",
-    [
-        "forward, both, perspective",
-        "backward, directional, orthographic",
-        "fields, both, perspective",
-    ],
+    ("name", "configuration"), [*(("density", one) for one in CONFIGURATIONS), *BY_OTHERS]
 )
-def test_tangent_and_adjoint_agree_for_every_parameter(name: str, configuration: str, build):
-    assert modes_error(build(CONFIGURATIONS[configuration]), name) < 1e-10
-
-
-@each_configuration
-def test_gradients_of_an_image_agree_with_differences(configuration: dict[str, Any], build):
+def test_derivatives_of_an_image_agree_in_both_modes_and_with_differences(
+    name: str, configuration: str, build
+):
     """In cells of every kind: the densest, one in between, and an empty one."""
-    scene = build(configuration)
-    loss, density = image_loss(scene, "density"), scene.volume.density
-    slopes = gradient(loss, density).flatten()
-    order = density.flatten().argsort(stable=True).tolist()
-    for index in (order[0], order[2 * len(order) // 3], order[-1]):
-        assert slopes[index].item() == pytest.approx(
-            central_difference(loss, density, index), rel=1e-6, abs=1e-8 * float(slopes.abs().max())
-        )
-
-
-@pytest.mark.parametrize("name", ["sigma_a", "sigma_s", "g"])
-@pytest.mark.parametrize(
-    "configuration", ["forward, both, perspective", "fields, both, perspective"]
-)
-def test_gradients_by_other_parameters_agree_with_differences(name: str, configuration: str, build):
     scene = build(CONFIGURATIONS[configuration])
     loss, value = image_loss(scene, name), getattr(scene.volume, name)
     slopes = gradient(loss, value).flatten()
-    for index in {0, value.numel() - 1}:
-        expected = central_difference(loss, value, index)
+    assert modes_error(scene, name) < 1e-10
+    order = value.flatten().argsort(stable=True).tolist()
+    for index in {order[0], order[2 * len(order) // 3], order[-1]}:
         assert slopes[index].item() == pytest.approx(
-            expected, rel=1e-6, abs=1e-8 * float(slopes.abs().max())
+            central_difference(loss, value, index), rel=1e-6, abs=1e-8 * float(slopes.abs().max())
         )
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
@@ -14,7 +12,6 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.third_order import ThirdOrder
 
 
@@ -50,104 +47,31 @@ class Emission:
             1,
         )
 
+    @functools.cached_property
+    def fields(self) -> dict[str, Tensor]:
+        """What rays sample, `[channels, z, y, x]`, as it stands in channels of one interpolation.
 
-@dataclass(frozen=True)
-class Sampled:
-    """The fields of an `Emission` that rays sample.
-
-    In cells each is `[channels, z, y, x]`, at nodes of rays `[N, channels, R]`. There is one mass
-    for each beam. `scattering` is the tensor `extinction` itself where both coefficients have the
-    same field. A `peak` that is the same everywhere is `[C, 1, 1, 1]`, and at nodes `[C, 1]`.
-    Where the phase function differs from cell to cell, `number` is that of its numbers which does,
-    and `remaining` is what scatters diffuse light; else both are None.
-    """
-
-    extinction: Tensor
-    diffuse: Tensor
-    masses: tuple[Tensor, ...]
-    scattering: Tensor
-    peak: Tensor | None
-    number: Tensor | None = None
-    remaining: Tensor | None = None
-
-    @staticmethod
-    def in_cells(emission: Emission) -> Sampled:
-        """The fields of `emission` in all cells."""
-        return Sampled(
-            emission.extinction.field,
-            emission.diffuse,
-            tuple(beam.mass for beam in emission.beams),
-            emission.scattering.field,
-            emission.peak,
-            emission.seen.phase.cells,
-            None if emission.remaining is None else emission.remaining.field,
-        )
-
-    def unpack(self, values: Tensor) -> Sampled:
-        """The same fields at nodes, from `values` [N, channels, R] of the channels of `fields`."""
-        fields = iter(values.split([field.shape[0] for field in self.fields()], 1))
-        extinction, diffuse = next(fields), next(fields)
-        masses = tuple(next(fields) for _ in self.masses)
-        scattering = next(fields) if self._has_own_scattering else extinction
-        peak = self.peak
-        if peak is not None:
-            peak = next(fields) if is_field(peak) else peak.view(-1, 1)
-        number = None if self.number is None else next(fields)
-        remaining = None if self.remaining is None else next(fields)
-        return Sampled(extinction, diffuse, masses, scattering, peak, number, remaining)
-
-    def fields(self) -> list[Tensor]:
-        """Those that differ, in the order in which they are channels of one interpolation."""
-        fields = [self.extinction, self.diffuse, *self.masses]
-        if self._has_own_scattering:
-            fields.append(self.scattering)
-        if self.peak is not None and is_field(self.peak):
-            fields.append(self.peak)
-        if self.number is not None:
-            fields.append(self.number)
+        Masses are numbered by beam. `scattering` is left out where it is the extinction's field,
+        `peak` where it is the same everywhere. Where the phase function differs from cell to cell,
+        `number` is that of its numbers which does, and `remaining` is what scatters diffuse light.
+        """
+        fields = {"extinction": self.extinction.field, "diffuse": self.diffuse}
+        fields |= {f"mass {index}": beam.mass for index, beam in enumerate(self.beams)}
+        if self.scattering.field is not self.extinction.field:
+            fields["scattering"] = self.scattering.field
+        if self.peak is not None and self.peak.shape[1:].numel() > 1:
+            fields["peak"] = self.peak
+        if self.seen.phase.cells is not None:
+            fields["number"] = self.seen.phase.cells
         if self.remaining is not None:
-            fields.append(self.remaining)
+            fields["remaining"] = self.remaining.field
         return fields
 
     @property
-    def _has_own_scattering(self) -> bool:
-        return self.scattering is not self.extinction
-
-
-def is_field(peak: Tensor) -> bool:
-    """Whether a medium's `peak` differs from cell to cell."""
-    return peak.shape[1:].numel() > 1
-
-
-@dataclass(frozen=True)
-class Channels:
-    """Fields to interpolate, each [channels, z, y, x], linearly or to `third_order`.
-
-    Where the first `matter` channels are zero nothing is to be seen, and slices leave that out; 0:
-    something may be anywhere, but where `support` [z, y, x] is 0.
-    """
-
-    fields: Sequence[Tensor]
-    third_order: ThirdOrder | None = None
-    matter: int = 0
-    support: Tensor | None = None
-
-    @functools.cached_property
-    def values(self) -> Tensor:
-        """All fields as channels of one tensor, which one interpolation serves."""
-        return torch.cat(list(self.fields))
-
-
-def pack_channels(emission: Emission) -> Channels:
-    """The fields of `emission` as `Channels`: masses to third order, the others linearly.
-
-    Nothing is left out as empty where the medium is varied: derivatives by the density of empty
-    cells are wanted, and must be those of what is rendered. But for those outside of a support.
-    """
-    cells = Sampled.in_cells(emission)
-    first = cells.extinction.shape[0] + cells.diffuse.shape[0]
-    last = first + sum(mass.shape[0] for mass in cells.masses)
-    third_order = ThirdOrder(first, last, emission.extinction.mass_bound) if cells.masses else None
-    is_fixed = not (is_varied(cells.extinction) or is_varied(cells.scattering))
-    matter = cells.extinction.shape[0] if is_fixed else 0
-    return Channels(cells.fields(), third_order, matter, emission.support)
+    def third_order(self) -> ThirdOrder | None:
+        """Of these channels the masses, interpolated to third order; the others are linearly."""
+        if not self.beams:
+            return None
+        first = len(self.extinction.field) + len(self.diffuse)
+        last = first + sum(len(beam.mass) for beam in self.beams)
+        return ThirdOrder(first, last, self.extinction.mass_bound)

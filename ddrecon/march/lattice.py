@@ -1,16 +1,15 @@
 """View rays no closer together than a volume can tell: pixels are interpolated between them.
 
 Their lattice is regular in the plane through the box's center, across the axis along which rays
-cross most cells. So it is in every slice, and interpolation there is a small matrix for rows and
-one for columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in
-place of gathers, and of scatters in the backward pass.
+cross most cells, and so it is in every slice.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from torch.nn.functional import max_pool2d, normalize
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
+from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.slicing import across
 from ddrecon.numerics.third_order import ThirdOrder, second_difference
@@ -36,53 +36,22 @@ jump.
 
 @dataclass(frozen=True)
 class Lattice:
-    """Rays through a lattice of places in the plane across `axis` at `middle` [u].
+    """`rays` of so many (rows, columns), row by row, and where they run in the box.
 
-    `rows` and `columns` are the places along the two axes across that one [u]. The rays come from
-    the point `eye` [3], or where that is None are parallel to `direction` [3].
+    All are in their `crossing`, those that miss the box with no length there. `places` [P, 2] are
+    those of pixels' rays in its rows and columns.
     """
 
-    axis: int
-    middle: float
-    eye: Tensor | None
-    direction: Tensor
-    rows: Tensor
-    columns: Tensor
+    rays: Rays
+    crossing: Crossing
+    shape: tuple[int, int]
+    places: Tensor
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """How many rows and columns."""
-        return len(self.rows), len(self.columns)
-
-    def rays(self, rows: Tensor, extent: float) -> Rays:
-        """Rays of some `rows` [u], row by row; parallel ones begin `extent` before the plane."""
-        places = torch.meshgrid(rows, self.columns, indexing="ij")
-        point = [torch.full_like(places[0], self.middle)] * 3
-        for axis, place in zip(across(self.axis), places, strict=True):
-            point[axis] = place
-        points = torch.stack(point, -1).flatten(0, 1)
-        if self.eye is None:
-            return Rays(points - extent * self.direction, self.direction.expand_as(points), None)
-        return Rays(self.eye.expand_as(points), normalize(points - self.eye, dim=-1), self.eye)
-
-    def places(self, bundle: Rays) -> Tensor:
-        """Where rays cross the lattice's plane, `[R, 2]`, in rows and columns."""
-        distance = (self.middle - bundle.origin[:, self.axis]) / bundle.direction[:, self.axis]
-        counted = []
-        for axis, line in zip(across(self.axis), (self.rows, self.columns), strict=True):
-            place = bundle.origin[:, axis] + distance * bundle.direction[:, axis]
-            counted.append((place - line[0]) / (line[1] - line[0]))
-        return torch.stack(counted, -1)
-
-    def crossings(self, planes: Tensor, which: int, line: Tensor) -> Tensor:
-        """Where rays through `line` [R] cross `planes` [N] across `axis`: `[N, R]` [u].
-
-        `line` holds some rows (`which` = 0) or columns (1) of the lattice.
-        """
-        apart, axis = planes[:, None] - self.middle, across(self.axis)[which]
-        if self.eye is None:
-            return line + apart * (self.direction[axis] / self.direction[self.axis])
-        return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
+    @functools.cached_property
+    def cells(self) -> Tensor:
+        """Between which four rays places lie [P], counted row by row."""
+        rows, columns = self.places.detach().floor().long().unbind(-1)
+        return rows * (self.shape[1] - 1) + columns
 
 
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
@@ -90,57 +59,76 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
 
     None where these are no more work themselves, or the camera is not beyond the slices.
     """
-    eye, direction = hitting.eye, hitting.direction[0]
+    eye = hitting.eye
     low, high, margin = grid.lower[axis], grid.upper[axis], grid.spacing[axis]
     if eye is not None and low - margin < float(eye[axis].detach()) < high + margin:
         return None
-
-    def lines(first: Sequence[int], last: Sequence[int]) -> Iterator[Tensor]:
-        """Rows and columns `first` to `last`; number 0 lies half a step within the box."""
-        for other, a, b in zip(across(axis), first, last, strict=True):
-            step = grid.spacing[other] / RAYS_PER_VOXEL
-            index = torch.arange(a, b + 1, dtype=direction.dtype, device=direction.device)
-            yield grid.lower[other] + 0.5 * step + step * index
-
-    # Any two lines of each kind tell where all rays are among lines without end.
-    unit = Lattice(axis, 0.5 * (low + high), eye, direction, *lines((0, 0), (1, 1)))
-    places = unit.places(hitting).detach()
-    first = [math.floor(place) - MARGIN for place in places.amin(0).tolist()]
-    last = [math.ceil(place) + MARGIN for place in places.amax(0).tolist()]
-    rows, columns = lines(first, last)
-    if FEWER * len(rows) * len(columns) > len(places):
+    # Row and column 0 lie half a step within the box.
+    distance = (0.5 * (low + high) - hitting.origin[:, axis]) / hitting.direction[:, axis]
+    places = []
+    for other in across(axis):
+        step = grid.spacing[other] / RAYS_PER_VOXEL
+        place = hitting.origin[:, other] + distance * hitting.direction[:, other]
+        places.append((place - grid.lower[other]) / step - 0.5)
+    first = [math.floor(place.detach().amin()) - MARGIN for place in places]
+    last = [math.ceil(place.detach().amax()) + MARGIN for place in places]
+    rows, columns = (b - a + 1 for a, b in zip(first, last, strict=True))
+    if FEWER * rows * columns > len(hitting.direction):
         return None
-    return replace(unit, rows=rows, columns=columns)
+    rays = _lattice_rays(grid, axis, hitting, first, (rows, columns))
+    near, far = intersect_box(grid, rays)
+    crossing = Crossing(torch.arange(len(near), device=near.device), near, torch.maximum(near, far))
+    own = torch.stack([place - a for place, a in zip(places, first, strict=True)], -1)
+    return Lattice(rays, crossing, (rows, columns), own)
+
+
+def _lattice_rays(
+    grid: Grid, axis: int, like: Rays, first: Sequence[int], shape: tuple[int, int]
+) -> Rays:
+    """Rays of a lattice of this `shape`, through one point or parallel as those `like` them."""
+    point = [like.direction.new_tensor(0.5 * (grid.lower[axis] + grid.upper[axis]))] * 3
+    lines = []
+    for other, a, count in zip(across(axis), first, shape, strict=True):
+        step = grid.spacing[other] / RAYS_PER_VOXEL
+        index = torch.arange(a, a + count, dtype=like.direction.dtype).to(like.direction.device)
+        lines.append(grid.lower[other] + 0.5 * step + step * index)
+    for other, place in zip(across(axis), torch.meshgrid(*lines, indexing="ij"), strict=True):
+        point[other] = place.flatten()
+    points = torch.stack(torch.broadcast_tensors(*point), -1)
+    if like.eye is None:
+        # They begin outside of the box.
+        way = like.direction[0]
+        return Rays(points - 2 * math.hypot(*grid.extent) * way, way.expand_as(points), None)
+    return Rays(like.eye.expand_as(points), normalize(points - like.eye, dim=-1), like.eye)
 
 
 def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
     """`values` [K, r, c] of lattice rays at `places` [P, 2] (rows, columns): `[K, P]`.
 
-    They are interpolated to third order, and held at zero.
+    They are interpolated to third order, and not below zero.
     """
     return interpolate(values, places).clamp(min=0)
 
 
 def interpolate(values: Tensor, places: Tensor) -> Tensor:
-    """The same, not held."""
+    """The same, whatever it is."""
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def is_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
-    """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: bool [P].
+def find_rough(values: Tensor, tolerance: Tensor, lattice: Lattice) -> Tensor:
+    """Which pixels interpolation may have off by more than `tolerance`: numbers [*].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
-    they are large at edges sharper than the lattice as well.
+    they are large at edges sharper than the lattice as well. They come in an order in which
+    neighbors are neighbors in the volume: along stripes as high as a voxel.
     """
+    down, along = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
+    uneven = (down.abs() + along.abs()).sum(0)
     # Of each place, the largest of the four rays around.
-    cells = max_pool2d(find_uneven(values.detach())[None], 2, 1)[0]
-    rows, columns = places.detach().floor().long().unbind(-1)
-    return DOUBT * cells[rows, columns] > tolerance
-
-
-def find_uneven(values: Tensor) -> Tensor:
-    """Magnitudes of fourth differences of `values` [K, r, c] along both axes: their sums [r, c]."""
-    rows, columns = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
-    return (rows.abs() + columns.abs()).sum(0)
+    is_rough = (DOUBT * max_pool2d(uneven[None], 2, 1) > tolerance).flatten()
+    rough = is_rough[lattice.cells].nonzero()[:, 0]
+    rows, columns = lattice.places.detach()[rough].unbind(-1)
+    stripe = (rows / RAYS_PER_VOXEL).floor()
+    return rough[(stripe * lattice.shape[1] + columns).argsort(stable=True)]

@@ -1,7 +1,10 @@
-"""Which way of sampling a bundle of view rays allows: by slices, or at equal steps."""
+"""How view rays sample a volume: in slices across an axis, which they cross plane by plane, or at
+equal steps; and how finely, where a scene file leaves that out.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -12,19 +15,19 @@ from torch.nn.functional import normalize
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Channels
-from ddrecon.march.slices import Slices
-from ddrecon.numerics.interpolation import sample_volume
+from ddrecon.march.emission import Emission
+from ddrecon.medium.coefficients import Volume, along_colors
+from ddrecon.numerics.interpolation import sample_slices, sample_volume
+from ddrecon.numerics.remember import remember
+from ddrecon.numerics.slicing import across
+from ddrecon.numerics.third_order import subdivide
 
 STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that
 are marched by slices.
 """
-CELLS_PER_NODE = 16
-"""At most so many cells of a large volume to a node marched at equal steps at a time.
-
-For every chunk of rays the backward pass fills an array of all cells.
-"""
+THICK = 0.75
+"""Cells of more optical depths than this get two samples along a ray (docs/accuracy.md)."""
 
 
 @dataclass(frozen=True)
@@ -50,34 +53,101 @@ def choose_way(grid: Grid, rays: Rays, crossing: Crossing) -> Way:
     return Way(None, longest=float((crossing.far - crossing.near).detach().max()))
 
 
-def make_sampler(channels: Channels, grid: Grid, way: Way, steps: int) -> Slices | Equidistant:
-    """Slices of `channels`, or equal steps through them, `steps` to a cell."""
-    if way.axis is None:
-        nodes = steps * math.ceil(way.longest / min(grid.spacing)) + 1
-        return Equidistant(channels, grid, nodes)
-    return Slices(channels, grid, way.axis, way.is_reversed, steps)
-
-
 @dataclass(frozen=True, eq=False)
-class Equidistant:
-    """`channels` at so many `nodes` with equal steps along rays, wherever these run in `grid`."""
+class Sampler:
+    """Fields of an `emission` at nodes of rays, `steps` a cell, in the `way` that these run."""
 
-    channels: Channels
-    grid: Grid
-    nodes: int
+    emission: Emission
+    way: Way
+    steps: int
 
-    def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
-        """All of `rays`, `count` at a time, in large volumes more: indices, and what they meet."""
-        size = max(count, self.channels.fields[0][0].numel() // (CELLS_PER_NODE * self.nodes))
-        indices = torch.arange(len(rays.direction), device=rays.direction.device)
-        return [(chunk, self) for chunk in indices.split(size)]
+    @property
+    def nodes(self) -> int:
+        """How many a ray has."""
+        return len(self.planes)
 
-    def sample(self, rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """Values [N, channels, R] and distances [N, R] at the nodes of `rays`."""
-        part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
-        distance = near + part * (far - near)
-        points = rays.origin + distance[..., None] * rays.direction
-        low, extent = points.new_tensor(self.grid.lower), points.new_tensor(self.grid.extent)
-        places = (2 * (points - low) / extent - 1).flip(-1)
-        values = sample_volume(self.channels.values, places, self.channels.third_order)
-        return values.transpose(0, 1), distance
+    @functools.cached_property
+    def planes(self) -> Tensor:
+        """Where nodes are [N]: planes across the axis of slices [u], or parts of a ray's way."""
+        grid, like = self.emission.grid, self.emission.diffuse
+        if self.way.axis is not None:
+            return planes_across(grid, self.way, self.steps, like.dtype, like.device)
+        nodes = self.steps * math.ceil(self.way.longest / min(grid.spacing)) + 1
+        return torch.linspace(0, 1, nodes, dtype=like.dtype, device=like.device)
+
+    @functools.cached_property
+    def values(self) -> Tensor:
+        """All channels in all planes [N, channels, rows, columns], or cells [channels, z, y, x]."""
+        cells = torch.cat(list(self.emission.fields.values()))
+        if self.way.axis is None:
+            return cells
+        row, column = across(self.way.axis)
+        slices = cells.permute(1 + self.way.axis, 0, 1 + row, 1 + column)
+        order = order_of_slices(cells.shape[1 + self.way.axis], self.way, cells.device)
+        return subdivide(slices.index_select(0, order), self.steps, self.emission.third_order)
+
+    def sample(
+        self, values: Tensor, rays: Rays, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`values` as [N, channels, R], and distances [N, R], at the nodes of `rays`."""
+        axis, planes, grid = self.way.axis, self.planes[:, None], self.emission.grid
+        third_order = self.emission.third_order
+        axes: tuple[int, ...] = (0, 1, 2) if axis is None else across(axis)
+        if axis is None:
+            distance = near + planes * (far - near)
+        else:
+            distance = (planes - rays.origin[:, axis]) / rays.direction[:, axis]
+        places = []
+        for one in reversed(axes):
+            place = rays.origin[:, one] + distance * rays.direction[:, one]
+            places.append(2 * (place - grid.lower[one]) / grid.extent[one] - 1)
+        points = torch.stack(places, -1)
+        if axis is None:
+            return sample_volume(values, points, third_order).transpose(0, 1), distance
+        within = torch.minimum(torch.maximum(distance, near), far)
+        return sample_slices(values, points, third_order), within
+
+
+@remember
+def order_of_slices(count: int, way: Way, device: torch.device) -> Tensor:
+    """Which of `count` slices of cells lies in each plane, before cells are subdivided."""
+    index = torch.arange(-1, count + 1, dtype=torch.int32, device=device).clamp(0, count - 1)
+    return index.flip(0) if way.is_reversed else index
+
+
+@remember
+def planes_across(
+    grid: Grid, way: Way, steps: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """The planes of slices of `grid` [u]: through all centers of cells, and both faces."""
+    assert way.axis is not None
+    # In cells: 0, 0.5, 1.5, ...
+    count = grid.shape[way.axis]
+    place = torch.arange(count + 2, dtype=dtype, device=device) - 0.5
+    planes = grid.lower[way.axis] + place.clamp(0, count) * grid.spacing[way.axis]
+    return subdivide(planes.flip(0) if way.is_reversed else planes, steps)
+
+
+@remember
+def support_of_planes(support: Tensor, way: Way, steps: int) -> Tensor:
+    """Where `support` [z, y, x] is not 0 in the planes of slices: bool [N, rows, columns]."""
+    assert way.axis is not None
+    order = order_of_slices(support.shape[way.axis], way, support.device)
+    slices = (support != 0).permute(way.axis, *across(way.axis)).index_select(0, order)
+    return subdivide(slices[:, None].float(), steps)[:, 0] > 0
+
+
+def choose_steps(volume: Volume) -> int:
+    """Samples a cell that `volume` deserves: 2 where one is optically thick, else 1."""
+    return 2 if greatest_depth(volume) > THICK else 1
+
+
+def greatest_depth(volume: Volume) -> float:
+    """The greatest optical depth of a cell of `volume`, of any color, across its mean side."""
+    absorbing, scattering = (
+        sigma.detach() if sigma.ndim == 4 else along_colors(sigma).detach()
+        for sigma in (volume.sigma_a, volume.sigma_s)
+    )
+    most = (absorbing + scattering).amax(0)
+    spacing = volume.grid.spacing
+    return float((volume.density.detach() * most).amax()) * sum(spacing) / len(spacing)

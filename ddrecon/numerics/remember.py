@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 from weakref import ref
 
@@ -18,7 +19,7 @@ from ddrecon.numerics.autodiff import is_steady, version_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
-MOST_BYTES = 1 << 28
+MOST_BYTES = 1 << 29
 """So much is kept of all functions together; other results are found again each time."""
 _bytes_kept: dict[int, int] = {}
 """Of each result that is kept, by its identity."""
@@ -76,7 +77,9 @@ def _bytes(value: object) -> int:
     """What the tensors in `value` take."""
     if isinstance(value, tuple):
         return sum(map(_bytes, value))
-    return value.nbytes if isinstance(value, Tensor) else 0
+    if is_dataclass(value):
+        return _bytes(tuple(vars(value).values()))
+    return value.untyped_storage().nbytes() if isinstance(value, Tensor) else 0
 
 
 @remember

@@ -46,13 +46,6 @@ class Weights:
         bend = second_difference(linear, 2)
         return Weights(linear, third_order_weight(coordinate, size)[..., None] * bend)
 
-    def between(self, first: int, last: int) -> Weights:
-        """Those of slices `first` to before `last`."""
-        return Weights(
-            self.linear[first:last],
-            None if self.third_order is None else self.third_order[first:last],
-        )
-
 
 def sample_lattice(
     slices: Tensor, rows: Weights, columns: Weights, third_order: ThirdOrder | None = None

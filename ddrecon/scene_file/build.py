@@ -22,7 +22,7 @@ from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.layer import DTYPES
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.march.steps import choose_steps, greatest_depth
+from ddrecon.march.samplers import choose_steps, greatest_depth
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import PhaseFunction

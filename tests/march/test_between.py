@@ -11,14 +11,10 @@ from graphics_cards import assert_compiles
 from media import random_values
 from torch import Tensor
 
-from ddrecon.march.lattice import interpolate_between, is_rough
+from ddrecon.march.lattice import interpolate_between
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.march.fused.between import (
-    interpolate_pixels,
-    interpolation_kernel,
-    spread_kernel,
-)
+from ddrecon.march.fused.between import interpolate_pixels, pixel_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +43,7 @@ def known(values: Tensor, places: Tensor, hit: Tensor, count: int) -> Tensor:
 
 
 def fused(values: Tensor, places: Tensor, hit: Tensor, count: int) -> Tensor:
-    return interpolate_pixels(values, places, hit, count, values.new_zeros(1), 0.1)[0]
+    return interpolate_pixels(values, places, hit, count)
 
 
 @each_type
@@ -83,19 +79,6 @@ def test_tangents_agree_and_are_the_adjoint(shape):
     )
 
 
-@each_shape
-@pytest.mark.parametrize("light", [0.0, 2.0])
-@pytest.mark.parametrize("tolerance", [0.05, 0.3, 1.0])
-def test_the_same_pixels_are_rough(shape, light, tolerance):
-    values, places, hit, count = case(shape, torch.float64)
-    behind = values.new_tensor([light])
-    scattered, opacity = values.chunk(2)
-    brightness = (scattered + light * (1 - opacity)).square().mean().sqrt()
-    expected = is_rough(torch.cat([scattered, light * opacity]), tolerance * brightness, places)
-    found = interpolate_pixels(values, places, hit, count, behind, tolerance)[1]
-    assert torch.equal(found.sort().values, expected.nonzero()[:, 0])
-
-
 def test_nothing_passes_derivatives_to_every_ray_of_the_lattice():
     values, *pixels = case(SHAPES[0], torch.float64)
     leaf = torch.zeros_like(values).requires_grad_()
@@ -122,4 +105,4 @@ def test_two_threads_find_the_same_and_always_the_same_bits(monkeypatch):
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    assert_compiles([interpolation_kernel(32), spread_kernel(32)], tmp_path)
+    assert_compiles([pixel_kernel(name, 32) for name in ("interpolate", "spread")], tmp_path)

@@ -29,15 +29,14 @@ from ddrecon.validate.hard_cases import CASES
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.march.fused.cells import Cells
+from ddrecon.march.fused.cells import Cells, mark_kernel
 from ddrecon.march.fused.kernels import (
     Case,
+    Layout,
     adjoint_kernel,
     integral_kernel,
     tangent_kernel,
 )
-from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.stretches import mark_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -122,11 +121,14 @@ def gradients(scene: Scene, names: list[str], engine: str) -> tuple[Tensor, list
     return rendered[0].detach(), list(torch.autograd.grad(loss, list(leaves.values())))
 
 
-def tangent(scene: Scene, name: str, engine: str) -> Tensor:
-    value = value_of(scene, name).detach()
+def tangent(scene: Scene, names: list[str], engine: str) -> Tensor:
     with forward.dual_level():
-        dual = forward.make_dual(value, random_values(*value.shape, seed=5).to(value))
-        return forward.unpack_dual(images(scene, {name: dual}, engine)[0]).tangent
+        duals = {}
+        for name in names:
+            value = value_of(scene, name).detach()
+            change = random_values(*value.shape, seed=5).to(value)
+            duals[name] = forward.make_dual(value, change)
+        return forward.unpack_dual(images(scene, duals, engine)[0]).tangent
 
 
 def assert_near(found: Tensor, known: Tensor, error: float) -> None:
@@ -138,21 +140,17 @@ EMISSIONS = [
     ("backward", OUTSIDE, [*LIGHT, "albedo"]),
     ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
-    ("g by cell", INSIDE, ["density", "g", *POSE]),
     ("weight by cell", INSIDE, ["density", "phase.weight", *POINT, *POSE]),
     # With all rays where they are, packets of them are marched back.
     ("gray", OUTSIDE, ["density", "g", "sigma_a", "sigma_s"]),
-    ("backward", OUTSIDE, LIGHT),
     ("peaked", OUTSIDE, [*LIGHT, "sigma_s"]),
     ("points", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
     ("fields", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
     ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT, *POSE]),
-    ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight"]),
     # Where the phase function differs from cell to cell.
     ("g by cell", OUTSIDE, ["density", "g", *POSE]),
     ("g by cell", OUTSIDE, [*LIGHT, "sigma_s"]),
     ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT]),
-    ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight"]),
     ("blend by cell", OUTSIDE, ["density", "phase.phases.0.g", "phase.weight"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
@@ -179,9 +177,9 @@ def test_images_and_gradients_are_those_of_torch(kind: str, view: dict, names: l
 
 @each_case
 def test_tangents_are_those_of_torch(kind: str, view: dict, names: list[str]):
+    """By all numbers together; by each alone they are transposes of the adjoint, below."""
     scene = scene_of(kind, view)
-    for name in names:
-        assert_near(tangent(scene, name, "warp"), tangent(scene, name, "torch"), 1e-11)
+    assert_near(tangent(scene, names, "warp"), tangent(scene, names, "torch"), 1e-11)
 
 
 def test_forward_mode_of_torch_func():
@@ -256,11 +254,11 @@ def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, f
     found, known = (gradients(scene, ["density", *POSE], engine)[1] for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 1e-11)
-    found, known = (tangent(scene, *POSE, engine) for engine in ("warp", "torch"))
+    found, known = (tangent(scene, POSE, engine) for engine in ("warp", "torch"))
     assert_near(found, known, 1e-11)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if "depth" in name])
 def test_hard_cases_are_passed(name: str):
     """Where cells are opaque, little mass is left of much on the walk back."""
     use_engine("warp")
@@ -272,7 +270,7 @@ def test_tangent_and_adjoint_are_transposes_of_each_other():
     scene = scene_of("fields", OUTSIDE)
     for name in ("density", "g", "lights.1.position", "views.view.camera"):
         value = value_of(scene, name).detach()
-        change = tangent(scene, name, "warp")
+        change = tangent(scene, [name], "warp")
         along = float((change * weights_of(change)).sum())
         (gradient,) = gradients(scene, [name], "warp")[1]
         back = float((gradient * random_values(*value.shape, seed=5)).sum())
@@ -295,9 +293,9 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
-    several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
-    steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
+    one = Layout(1, 1, 1, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
+    several = Layout(3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
+    steep = Layout(1, 1, 1, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
     moved, inside = Case(True, True, True), Case(False, True, True)
     packets = [mark_kernel(32), integral_kernel(several, True)]
     packets += [integral_kernel(steep, False), tangent_kernel(one, inside)]

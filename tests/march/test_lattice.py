@@ -9,17 +9,14 @@ import torch
 from media import box_grid, make_camera, make_scene, march_rays, random_values
 from torch import Tensor
 
-from ddrecon.cameras import cast_rays
+from ddrecon.cameras import Rays, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.march import integral as march_module
 from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
-from ddrecon.march.emission import Channels
-from ddrecon.march.lattice import Lattice, choose_lattice
-from ddrecon.march.samplers import choose_way, make_sampler
-from ddrecon.march.slices import Slices
-from ddrecon.numerics.slicing import across
+from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
+from ddrecon.march.samplers import choose_way
 from ddrecon.renderer import _emission, render, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -56,12 +53,12 @@ def scene_of():
     return scene
 
 
-def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
+def lattice_of(scene: Scene) -> tuple[Lattice, Rays, int]:
+    """The lattice for a scene's camera, the rays of that which hit the box, and the axis."""
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    way = choose_way(grid, bundle, crossing)
-    slices = make_sampler(Channels([scene.volume.density[None]]), grid, way, 1)
-    return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
+    axis, hitting = choose_way(grid, bundle, crossing).axis, bundle.select(crossing.hit)
+    return choose_lattice(grid, axis, hitting), hitting, axis
 
 
 def images(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -70,30 +67,20 @@ def images(scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 @each_camera
-def test_places_and_crossings_are_those_of_the_rays(view: dict, scene_of):
-    lattice, slices = lattice_of(scene_of(view))
-    chosen = lattice.rows[2:5]
-    bundle = lattice.rays(chosen, 3.0)
-    rows, columns = torch.meshgrid(
-        torch.arange(2, 5).double(), torch.arange(len(lattice.columns)).double(), indexing="ij"
-    )
-    torch.testing.assert_close(
-        lattice.places(bundle), torch.stack([rows, columns], -1).flatten(0, 1), rtol=0, atol=1e-11
-    )
-    down, along = (
-        lattice.crossings(slices.planes, 0, chosen),
-        lattice.crossings(slices.planes, 1, lattice.columns),
-    )
-    distance = (slices.planes[:, None] - bundle.origin[:, lattice.axis]) / bundle.direction[
-        :, lattice.axis
-    ]
-    points = (bundle.origin + distance[..., None] * bundle.direction).unflatten(1, rows.shape)
-    torch.testing.assert_close(
-        points[..., across(lattice.axis)[0]], down[:, :, None].expand(-1, -1, rows.shape[1])
-    )
-    torch.testing.assert_close(
-        points[..., across(lattice.axis)[1]], along[:, None, :].expand(-1, rows.shape[0], -1)
-    )
+def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
+    """In the plane through the middle of the box, which both cross, and anywhere along them."""
+    scene = scene_of(view)
+    lattice, hitting, axis = lattice_of(scene)
+    grid = scene.volume.grid
+    for part in (0.2, 0.5, 0.7):
+        plane = grid.lower[axis] + part * grid.extent[axis]
+        corners, own = (
+            rays.origin
+            + ((plane - rays.origin[:, axis]) / rays.direction[:, axis])[:, None] * rays.direction
+            for rays in (lattice.rays, hitting)
+        )
+        between = interpolate(corners.T.unflatten(1, lattice.shape), lattice.places)
+        torch.testing.assert_close(between.T, own, rtol=0, atol=1e-12)
 
 
 @each_camera
@@ -102,13 +89,15 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     gives.
     """
     scene = scene_of(view)
-    lattice, _ = lattice_of(scene)
-    bundle = lattice.rays(lattice.rows, 3.0)
-    emission = _emission(solve_light(scene, SolveMemory()), bundle)
-    monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: lattice)
+    lattice = lattice_of(scene)[0]
+    emission = _emission(solve_light(scene, SolveMemory()), lattice.rays)
+    hit = cross_box(scene.volume.grid, lattice.rays).hit
+    places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
+    own_places = replace(lattice, places=places)
+    monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
     interpolated, own = (
-        march_rays(emission, bundle, INTERPOLATED, torch.ones(())),
-        march_rays(emission, bundle, OWN),
+        march_rays(emission, lattice.rays, INTERPOLATED, torch.ones(())),
+        march_rays(emission, lattice.rays, OWN),
     )
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
@@ -163,15 +152,17 @@ def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
 
 
 @pytest.mark.parametrize(
-    "view", [CAMERAS["oblique"], CAMERAS["orthographic"]], ids=["perspective", "orthographic"]
+    ("view", "name"),
+    [
+        ("oblique", "density"),
+        ("oblique", "views.view.camera.rotation_x"),
+        ("orthographic", "views.view.camera.y"),
+    ],
 )
-@pytest.mark.parametrize(
-    "name", ["density", "g", "views.view.camera.rotation_x", "views.view.camera.y"]
-)
-def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, scene_of):
+def test_derivatives_are_those_of_the_interpolated_image(view: str, name: str, scene_of):
     """In forward mode as by central differences, and in reverse as in forward mode."""
-    scene = replace(scene_of(view), render=INTERPOLATED)
-    variable = name if name in ("density", "g") else name.rpartition(".")[0]
+    scene = replace(scene_of(CAMERAS[view]), render=INTERPOLATED)
+    variable = name if name == "density" else name.rpartition(".")[0]
     value = value_of(scene, variable)
     change = torch.ones_like(value)
     if variable != name:

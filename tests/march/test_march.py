@@ -23,11 +23,9 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
 from ddrecon.march import integral as march_module
-from ddrecon.march import slices
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
-from ddrecon.numerics.nodes import Nodes
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -136,7 +134,7 @@ def test_a_box_behind_the_camera_is_not_seen():
 
 @each_camera
 def test_chunks_do_not_matter(view: dict, monkeypatch):
-    """Nor do the bands of slices that they meet: neither to what is seen nor to its derivative."""
+    """Neither to what is seen nor to its derivative."""
     density = random_values(9, 11, 10).requires_grad_()
     bundle = cast_rays(make_camera(size=(7, 6), **view))
 
@@ -146,46 +144,12 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(slices, "BAND", 1)
+    monkeypatch.setattr(march_module, "CELLS_PER_NODE", 100)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
 
-@each_camera
-def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypatch):
-    """Nothing is left out where the density is being varied."""
-    density = torch.zeros(20, 22, 21, dtype=torch.float64)
-    density[6:9, 12:15, 8:12] = 1 + random_values(3, 3, 4)
-    bundle, integrated, nodes = (
-        cast_rays(make_camera(size=(9, 8), **view)),
-        march_module._integrate,
-        [],
-    )
-
-    def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
-        nodes.append(values[:, 0].numel())
-        return integrated(emission, values, places)
-
-    monkeypatch.setattr(march_module, "_integrate", counting)
-    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
-    emissions = (
-        emission_of(box_grid((20, 22, 21)), density),
-        emission_of(box_grid((20, 22, 21)), density.clone().requires_grad_()),
-    )
-    seen, counts = [], []
-    for emission in emissions:
-        nodes.clear()
-        seen.append(march_rays(emission, bundle, every_ray(1)))
-        counts.append(sum(nodes))
-    for one, other in zip(*seen, strict=True):
-        torch.testing.assert_close(one, other.detach(), rtol=1e-12, atol=1e-15)
-    if view is CAMERAS["inside"]:
-        assert counts[0] == counts[1]  # rays at equal steps leave nothing out
-    else:
-        assert counts[0] < 0.6 * counts[1]
-
-
-@each_camera
+@pytest.mark.parametrize("view", [CAMERAS["oblique"], CAMERAS["inside"]], ids=str)
 def test_radiance_and_transmittance_have_both_derivatives(view: dict):
     grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
@@ -218,10 +182,7 @@ def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
     )
 
 
-@pytest.mark.parametrize("g", [0.0, -0.6])
-@pytest.mark.parametrize(
-    "is_behind", [True, False], ids=["lit from behind the camera", "lit towards the camera"]
-)
+@pytest.mark.parametrize(("g", "is_behind"), [(0.0, False), (-0.6, True)])
 def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool):
     """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L);
     approached at second order.
@@ -265,32 +226,18 @@ def test_the_transmittance_of_a_blob_converges_at_second_order():
     """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
     distance b from its middle.
     """
-    camera, counts, errors = (
-        make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1),
-        [12, 24, 48],
-        [],
-    )
+    camera = make_camera(eye=(0.3, 0.4, 2.5), size=(6, 6), half_width=0.1)
+    counts, errors = [10, 20, 40], []
     bundle = cast_rays(camera)
     closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
-    depth = (
-        SIGMA_A
-        * DENSITY
-        * WIDTH
-        * math.sqrt(2 * math.pi)
-        * torch.exp(-(closest**2) / (2 * WIDTH**2))
-    )
-    expected = torch.exp(-depth).view(camera.size)
+    mass = DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    expected = torch.exp(-SIGMA_A * mass).view(camera.size)
     for n in counts:
         grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
         density = DENSITY * torch.exp(
             -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
         )
-        absorbing = {
-            "sigma_a": (SIGMA_A,),
-            "sigma_s": (0.0,),
-            "directional": None,
-            "ambient": (1.0,),
-        }
-        scene = make_scene(density, grid=grid, camera=camera, **absorbing)
+        absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "ambient": (1.0,)}
+        scene = make_scene(density, grid=grid, camera=camera, directional=None, **absorbing)
         errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
     assert errors[-1] < 2e-3 and convergence_order([1 / n for n in counts], errors) >= 1.8, errors

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
-from ddrecon.march.emission import Channels
+from ddrecon.march.samplers import planes_across, support_of_planes
 from ddrecon.march.sight import look_through
-from ddrecon.march.slices import Slices
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -115,43 +114,22 @@ def test_rays_that_miss_it_show_what_is_behind():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [1, 3])
-def test_segments_walked_are_those_whose_cells_it_touches(steps: int):
-    """By a plain loop over rays, segments and corners."""
+def test_what_it_leaves_out_is_not_walked():
+    """By bits: none of no support, and of blobs less than half of what all cells have."""
     pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-    from ddrecon.kernels.packets import LANES
     from ddrecon.march.fused.bundle import pack_rays
-    from ddrecon.march.fused.stretches import find_walked
+    from ddrecon.march.fused.cells import find_walked
 
     scene = scene_with(two_blobs(), {}, half_width=0.6)
-    sight = look_through(scene.views[0].camera, scene.volume.grid, scene.render)
-    rays, crossing, axis = sight.rays, sight.crossing, sight.way.axis
-    channels = Channels([scene.volume.density[None]], support=scene.volume.support)
-    slices = Slices(channels, scene.volume.grid, axis, sight.way.is_reversed, steps)
-    packed = pack_rays(
-        scene.volume.grid, axis, rays.origin, rays.direction, *vars(crossing).values()
-    )
-    support, planes = slices.support, slices.planes
-    bits = find_walked(support, planes, packed.bundle)
-    walked = [
-        [bool(bits[p, n // 32] >> (n % 32) & 1) for n in range(len(planes))]
-        for p in range(len(bits))
-    ]
-    expected = [[False] * len(planes) for _ in bits]
-    for r, ray in enumerate(packed.bundle):
-        near, far = float(ray[6]), float(ray[7])
-        places = [(float(plane) - float(ray[0])) / float(ray[3]) for plane in planes]
-        touches = []
-        for n, s in enumerate(places):
-            corners = []
-            for axis, size in enumerate(support.shape[1:], 1):
-                place = min(max(float(ray[axis] + s * ray[3 + axis]), 0), size - 1)
-                first = min(int(place), max(size - 2, 0))
-                corners.append({first, min(first + 1, size - 1)})
-            touches.append(any(support[n, y, x] for y in corners[0] for x in corners[1]))
-        for n in range(1, len(planes)):
-            is_inside = places[n] > near and places[n - 1] < far and near < far
-            if is_inside and (touches[n - 1] or touches[n]):
-                expected[r // LANES][n] = True
-    assert walked == expected
-    assert 0 < sum(map(sum, walked)) < len(walked) * (len(planes) - 1) / 2
+    grid = scene.volume.grid
+    sight = look_through(scene.views[0].camera, grid, scene.render)
+    planes = planes_across(grid, sight.way, 1, torch.float64, torch.device("cpu"))
+    rays, ends = sight.rays, vars(sight.crossing).values()
+    bundle = pack_rays(grid, sight.way.axis, rays.origin, rays.direction, *ends).bundle
+
+    def count(support: Tensor) -> int:
+        bits = find_walked(support_of_planes(support, sight.way, 1), planes, bundle)
+        return sum(number.bit_count() for number in bits.flatten().tolist())
+
+    none, some, all_of_them = map(count, (torch.zeros(SHAPE), two_blobs(), torch.ones(SHAPE)))
+    assert none == 0 < some < all_of_them / 2

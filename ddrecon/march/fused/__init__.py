@@ -1,13 +1,11 @@
 """The view-ray integral as fused kernels (NVIDIA Warp): nothing is kept between out and back.
 
-`layout` says what a node holds, and `cells` where nodes are: in slices, or at equal steps.
+`cells` says where nodes are, in slices or at equal steps, and which segments are walked; `bundle`
+what kernels are given of rays, beams and phase functions; `kernels` what a node holds.
 Rays go in packets, a ray a lane of a processor's vectors: `cells.h` has values at nodes and how
-they change with the rays, `runs.h` those of lanes close to each other, `spread.h` their adjoint,
-`optics.h` the formulas, `rays.h` what a node emits, `walk.h` the integral and its tangent, and
-`back.h` the adjoint; `kernels` are made of these.
-`stretches` finds which segments of a packet are walked at all; `between` interpolates pixels
-between rays of a lattice.
-Phase functions that differ from cell to cell are tables and a number of the cell: `cellwise` says
-which.
-`integrate` makes of all that one function of tensors, and `march` calls it for an `Emission`.
+they change with the rays, `runs.h` those of lanes close to each other, and their adjoint,
+`optics.h` the formulas, `rays.h` what a node emits, the integral and its tangent, and `back.h` the
+adjoint.
+`integrate` makes of all that one function of an `Emission`; `between` interpolates pixels between
+rays of a lattice.
 """

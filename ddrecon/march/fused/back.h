@@ -1,6 +1,5 @@
 #pragma once
 #include "ddrecon/march/fused/rays.h"
-#include "ddrecon/march/fused/spread.h"
 // The adjoint of the walk along packets of rays. Of the walk out nothing is kept but the mass
 // behind each ray: on the walk back values are sampled anew, and masses are those behind less those
 // of the segments in between.
@@ -205,9 +204,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     void spread(int n, const Node& node, const V* v_bar, V t_bar) {
         V bend_bar[L::MASSES + 1];
         for (int k = 0; k < L::MASSES; ++k) {
-            const V bent = this->number(2 * L::C) * node.bend[k], inverse = node.held[k];
+            const V off = this->number(2 * L::C) * node.bend[k], inverse = node.limit[k];
             bend_bar[k] = -v_bar[L::FIRST_MASS + k] * inverse * inverse * inverse;
-            number_bar[2 * L::C] -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
+            number_bar[2 * L::C] -= bend_bar[k] * off * node.bend[k] * node.bend[k];
         }
         if constexpr (IS_SLICED)
             spread_to_cells(node, node.runs, this->slice(n), v_bar, bend_bar);
@@ -223,15 +222,15 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             if (bars.fields[c])
                 spread_place(
                     bars.fields[c] + offset, spot.y, spot.x, lines, v_bar[c],
-                    L::is_bent(c) ? bend_bar[c - L::FIRST_MASS] : F(0));
+                    L::is_cubic(c) ? bend_bar[c - L::FIRST_MASS] : F(0));
 #else
-        bool is_wanted[L::CHANNELS], has_bent = false;
+        bool is_asked[L::CHANNELS], has_cubic = false;
         M is_zero = none == none;
         for (int c = 0; c < L::CHANNELS; ++c) {
             const M is = v_bar[c] == none;
-            is_wanted[c] = bars.fields[c] && !P::every(is);
-            if (is_wanted[c]) is_zero = is_zero & is;
-            has_bent = has_bent || (is_wanted[c] && L::is_bent(c));
+            is_asked[c] = bars.fields[c] && !P::every(is);
+            if (is_asked[c]) is_zero = is_zero & is;
+            has_cubic = has_cubic || (is_asked[c] && L::is_cubic(c));
         }
         // Lanes outside of the box count for nothing.
         const unsigned counting = ~P::bits_of(__builtin_convertvector(is_zero, typename P::I));
@@ -240,13 +239,13 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             run.lanes &= counting;
             if (!run.lanes) continue;
             run.lane = __builtin_ctz(run.lanes);
-            const Shares<F> shares(run, spot.y, spot.x, lines, has_bent);
+            const Shares<F> shares(run, spot.y, spot.x, lines, has_cubic);
 #pragma clang loop unroll(disable)
             for (int c = 0; c < L::CHANNELS; ++c) {
-                if (!is_wanted[c]) continue;
+                if (!is_asked[c]) continue;
                 F* const field = bars.fields[c] + offset;
-                if (L::is_bent(c))
-                    shares.add_bent(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
+                if (L::is_cubic(c))
+                    shares.add_cubic(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
                 else
                     shares.add(field, v_bar[c]);
             }
@@ -257,15 +256,15 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         const Layers<F, V> layers(node.z);
         for (int i = 0; i < 4; ++i) {
             if (layers.is_outer(i) && !L::MASSES) continue;
-            V value_bar[L::CHANNELS], bent_bar[L::MASSES + 1];
+            V value_bar[L::CHANNELS], linear_bar[L::MASSES + 1];
             for (int c = 0; c < L::CHANNELS; ++c) value_bar[c] = layers.linear[i] * v_bar[c];
             for (int k = 0; k < L::MASSES; ++k) {
                 value_bar[L::FIRST_MASS + k] += layers.across[i] * bend_bar[k];
-                bent_bar[k] = layers.linear[i] * bend_bar[k];
+                linear_bar[k] = layers.linear[i] * bend_bar[k];
             }
             Spot<F, false, V> spot = node;
             spot.y = node.y.behind(node.z.cells[i] * lines.rows);
-            spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, bent_bar);
+            spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, linear_bar);
         }
     }
 
@@ -275,7 +274,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         this->take_slopes(n, node.s, 0, L::CHANNELS, [&](int c, const auto& v, const auto& bend) {
             for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k) {
                 at_bar[k] += v_bar[c] * v.by[k];
-                if (L::is_bent(c)) at_bar[k] += bend_bar[c - L::FIRST_MASS] * bend.by[k];
+                if (L::is_cubic(c)) at_bar[k] += bend_bar[c - L::FIRST_MASS] * bend.by[k];
             }
         });
         Dual<V, 8> ray[8];
@@ -284,7 +283,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             ray[k].by[k] = P::all(F(1));
         }
         const int axes[] = {1, 2, 0};
-        const auto s = this->distance(ray, n), t = this->hold(ray, s);
+        const auto s = this->distance(ray, n), t = this->clamp(ray, s);
         for (int k = 0; k < 8; ++k) ray_bar[k] += t_bar * t.by[k];
         for (int i = 0; i < (IS_SLICED ? 2 : 3); ++i) {
             const auto place = this->place(ray, s, axes[i]);

@@ -1,4 +1,16 @@
-"""What kernels are given of rays and of beams, found once where neither is varied."""
+"""What kernels are given of rays and of beams, found once where neither is varied.
+
+Where the phase function differs from cell to cell (E36) a node holds the number that differs. How p
+depends on it is the layout's `form`:
+
+- `LINEAR`: a weight, without a forward peak. p is `at_ends[0] + weight at_ends[1]`.
+- `EVEN`: a weight, with one. E13 by tables at even steps of the weight, the rungs.
+- `STEEP`: g. Where it is positive, and there is a forward peak, by tables at even steps of
+  artanh g; else p by its formula.
+
+Kernels know nothing else of a phase function than the number and these tables, of which each color
+may have its own.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +22,12 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam, leaving_cosine
-from ddrecon.march.box import intersect_box
-from ddrecon.march.emission import Emission, is_field
-from ddrecon.march.fused.cellwise import find_along_rays, table_of_cells
-from ddrecon.march.fused.layout import Layout
-from ddrecon.march.lattice import Lattice
+from ddrecon.march.emission import Emission
+from ddrecon.march.fused.kernels import Layout
 from ddrecon.medium.phase import PhaseKind
-from ddrecon.medium.phase_cells import others_of
+from ddrecon.medium.phase_cells import at_ends, end_table, others_of, peak_tables
 from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
@@ -53,43 +63,12 @@ def pack_rays(
     near: Tensor,
     far: Tensor,
 ) -> Packed:
-    """Those rays that `hit` the box, by slices across `axis` unless that is None."""
-    origin, direction = origin[hit], direction[hit]
-    return Packed(_bundle(grid, axis, origin, direction, near, far), origin, direction)
+    """Those rays that `hit` the box, by slices across `axis` unless that is None.
 
-
-def pack_lattice(grid: Grid, axis: int, lattice: Lattice) -> Packed:
-    """All rays of `lattice`, by slices across `axis`."""
-    place = lattice.axis, lattice.middle, lattice.eye, lattice.direction
-    return _pack_lattice(grid, axis, *place, lattice.rows, lattice.columns)
-
-
-@remember
-def _pack_lattice(
-    grid: Grid,
-    axis: int,
-    across_axis: int,
-    middle: float,
-    eye: Tensor | None,
-    direction: Tensor,
-    rows: Tensor,
-    columns: Tensor,
-) -> Packed:
-    lattice = Lattice(across_axis, middle, eye, direction, rows, columns)
-    rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
-    near, far = intersect_box(grid, rays)
-    far = torch.maximum(near, far)
-    bundle = _bundle(grid, axis, rays.origin, rays.direction, near, far)
-    return Packed(bundle, rays.origin.clone(), rays.direction.clone())
-
-
-def _bundle(
-    grid: Grid, axis: int | None, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor
-) -> Tensor:
-    """Origins and directions in cells, counted from cells' centers; `near` and `far` [u].
-
-    For slices the coordinate across them comes first, in u, then those of rows and columns.
+    Origins and directions in cells, counted from cells' centers; `near` and `far` [u]. For slices
+    the coordinate across them comes first, in u, then those of rows and columns.
     """
+    origin, direction = origin[hit], direction[hit]
     spacing = origin.new_tensor(grid.spacing)
     places = (origin - origin.new_tensor(grid.lower)) / spacing - 0.5
     speeds = direction / spacing
@@ -97,14 +76,15 @@ def _bundle(
         order = list(across(axis))
         places = torch.cat([origin[:, [axis]], places[:, order]], 1)
         speeds = torch.cat([direction[:, [axis]], speeds[:, order]], 1)
-    return torch.cat([places, speeds, near[:, None], far[:, None]], 1)
+    bundle = torch.cat([places, speeds, near[:, None], far[:, None]], 1)
+    return Packed(bundle, origin, direction)
 
 
 def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
     """The beams of `emission` along rays."""
     phase, has_peak = emission.seen.phase, emission.peak is not None
-    numbers = phase.numbers if layout.form is None else others_of(phase)
-    rows = layout.ray_terms if has_peak or layout.form else 0
+    numbers = phase.numbers if phase.cells is None else others_of(phase)
+    rows = layout.ray_terms if has_peak or phase.cells is not None else 0
     seen = []
     for beam in emission.beams:
         if isinstance(beam, Beam):
@@ -131,18 +111,25 @@ def _see_beam(
     kind: PhaseKind,
     degree: int,
     has_peak: bool,
-    form: str | None,
+    form: str,
     *numbers: Tensor,
 ) -> Along:
     """A beam along `towards` seen by rays of `direction` [R, 3].
 
-    It is scattered by the phase function `kind` of these `numbers`; or, where that has a `form`
-    because it differs from cell to cell, of these others.
+    It is scattered by the phase function `kind` of these `numbers`; or, where that differs from
+    cell to cell, of these others.
     """
     cosine = leaving_cosine(direction, towards)
     angles = torch.stack([cosine, torch.ones_like(cosine)])
-    if form is not None:
-        return Along(angles, find_along_rays(cosine, form, kind, numbers), (None,))
+    if form == "LINEAR":
+        ends = at_ends(kind(*numbers, cosine.new_zeros(())), cosine)
+        return Along(angles, torch.stack(ends, 1).flatten(0, 1), (None,))
+    if form != "SAME":
+        # Between which angles of tables it is: the first, and the part of the way to the second.
+        place = angle_of(cosine) * (STEPS / math.pi)
+        first = place.detach().long().clamp(0, STEPS - 1)
+        where = torch.stack([cosine, first.to(cosine), (place - first).to(cosine)])
+        return Along(angles, where, (None,))
     seen = SeenPhase(kind(*numbers), degree)
     if not has_peak:
         return Along(angles, cosine.new_empty(0, len(cosine)), (seen.value(cosine),))
@@ -150,28 +137,37 @@ def _see_beam(
     return Along(angles, seen.polynomials(cosine).movedim(1, 0).flatten(0, 1), (None,))
 
 
-def table_of(emission: Emission) -> Tensor:
-    """Coefficients of p over the angle, [phases * (steps + 1) * 2, terms], for point lights.
+def table_of(emission: Emission, layout: Layout) -> Tensor:
+    """The tables that kernels read, [rows, terms].
 
-    Without rows where there are none; `table_of_cells` where p differs from cell to cell.
+    Coefficients of p over the angle for point lights, [phases * (steps + 1) * 2, terms], or where p
+    is linear in a number of the cell both of `at_ends`. Where it is not, and there is a forward
+    peak, by color, rung and angle. The rest have no rows.
     """
-    if emission.seen.phase.cells is not None:
-        return table_of_cells(emission)
-    table = emission.seen.table(emission.peak is not None).to(emission.diffuse)
-    has_points = any(not isinstance(beam, Beam) for beam in emission.beams)
-    return table.flatten(0, 2) if has_points else table.new_empty(0, table.shape[-1])
-
-
-def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
-    """The scale and the peak of each color, and the `bound` of third-order corrections."""
-    peak = emission.peak
-    if peak is not None and is_field(peak):
-        peak = None
-    return _numbers(emission.colors, emission.extinction.scale, peak, bound)
+    phase, like = emission.seen.phase, emission.diffuse
+    if layout.form == "LINEAR":
+        return end_table(phase).to(like).flatten(0, 2)
+    if layout.form != "SAME":
+        tables = peak_tables(phase, emission.seen.degree) if layout.peak >= 0 else None
+        return like.new_empty(0, 1) if tables is None else _flatten(tables, like.dtype)
+    table = emission.seen.table(layout.peak >= 0).to(like)
+    return table.flatten(0, 2) if any(layout.beams) else table.new_empty(0, table.shape[-1])
 
 
 @remember
-def _numbers(colors: int, scale: Tensor, peak: Tensor | None, bound: Tensor | float) -> Tensor:
-    scale = scale.view(-1).expand(colors)
-    peak = 0 * scale if peak is None else peak.view(-1).expand(colors)
-    return torch.cat([scale, peak, torch.as_tensor(bound).to(scale).view(1)])
+def _flatten(tables: Tensor, dtype: torch.dtype) -> Tensor:
+    """With a row more, as kernels read terms of several rows at once."""
+    rows = tables.to(dtype).flatten(0, 4)
+    return torch.cat([rows, rows.new_zeros(1, rows.shape[1])])
+
+
+def numbers_of(emission: Emission) -> Tensor:
+    """The scale and the peak of each color, and the bound of third-order corrections."""
+    scale = emission.extinction.scale.view(-1).expand(emission.colors)
+    peak = emission.peak
+    if peak is None or "peak" in emission.fields:
+        peak = torch.zeros_like(scale)
+    bound = emission.extinction.mass_bound if emission.beams else 0.0
+    return torch.cat(
+        [scale, peak.view(-1).expand_as(scale), torch.as_tensor(bound).to(scale).view(1)]
+    )

@@ -24,16 +24,16 @@ template <class F, class N> struct Place {
     static INLINE Place at(V y, int size) {
         const V none = P::all(F(0)), end = P::all(F(size - 1));
         // Also where y is not a number.
-        const V held = P::least(P::pick(y > none, y, none), end);
+        const V inside = P::least(P::pick(y > none, y, none), end);
         const I zero = P::whole(none), top = zero + (size - 1);
-        const I last = zero + (size > 1 ? size - 2 : 0), cell = P::whole(held);
+        const I last = zero + (size > 1 ? size - 2 : 0), cell = P::whole(inside);
         Place q;
         const I i = P::pick(cell > last, last, cell), j = P::pick(i + 1 > top, top, i + 1);
         q.cells[0] = P::pick(i > zero, i - 1, zero);
         q.cells[1] = i;
         q.cells[2] = j;
         q.cells[3] = P::pick(j + 1 > top, top, j + 1);
-        q.a = held - P::real(i);
+        q.a = inside - P::real(i);
         q.excess = P::pick((y > none) & (y < end), F(0.5) * q.a * (F(1) - q.a), none);
         return q;
     }
@@ -83,28 +83,28 @@ template <class F, class N> struct Layers {
 // Where a node lies among cells: in a slice, or anywhere.
 template <class F, bool IS_SLICED, class N> struct Spot {
     Place<F, N> z, y, x;
-    // The linear value of field f there; if it `is_bent`, in `bend` what that is off by.
-    INLINE N value(const F* f, const Lines& lines, bool is_bent, N& bend) const {
-        if (IS_SLICED) return in_slice(f, y, lines, is_bent, bend);
+    // The linear value of field f there; if it `is_cubic`, in `bend` what that is off by.
+    INLINE N value(const F* f, const Lines& lines, bool is_cubic, N& bend) const {
+        if (IS_SLICED) return in_slice(f, y, lines, is_cubic, bend);
         const Layers<F, N> layers(z);
         N total(Packets<F>::all(F(0)));
         bend = total;
         for (int i = 0; i < 4; ++i) {
-            if (layers.is_outer(i) && !is_bent) continue;
+            if (layers.is_outer(i) && !is_cubic) continue;
             N own(Packets<F>::all(F(0)));
             const Place<F, N> row = y.behind(z.cells[i] * lines.rows);
-            const N v = in_slice(f, row, lines, is_bent && !layers.is_outer(i), own);
+            const N v = in_slice(f, row, lines, is_cubic && !layers.is_outer(i), own);
             total += layers.linear[i] * v;
-            if (is_bent) bend += layers.linear[i] * own + layers.across[i] * v;
+            if (is_cubic) bend += layers.linear[i] * own + layers.across[i] * v;
         }
         return total;
     }
     INLINE N
-    in_slice(const F* f, const Place<F, N>& y, const Lines& lines, bool is_bent, N& bend) const {
+    in_slice(const F* f, const Place<F, N>& y, const Lines& lines, bool is_cubic, N& bend) const {
         auto cell = [&](int r, int c) HERE {
             return Packets<F>::gather(f, y.cells[r] * lines.row + x.cells[c] * lines.column);
         };
-        return is_bent ? curved(y, x, cell, bend) : linear(y, x, cell);
+        return is_cubic ? curved(y, x, cell, bend) : linear(y, x, cell);
     }
 };
 
@@ -118,8 +118,8 @@ template <class F> struct Kink {
         F(16) * (sizeof(F) == 8 ? F(2.220446049250313e-16) : F(1.1920929e-7));
     static constexpr F SIDE = F(4) * WIDTH;
     static INLINE typename P::M is_at(V y, int size) {
-        const V held = P::least(P::most(y, P::all(F(-2))), P::all(F(size + 1)));
-        return P::size(y - P::real(P::whole(held + F(0.5)))) < P::all(WIDTH * F(size));
+        const V inside = P::least(P::most(y, P::all(F(-2))), P::all(F(size + 1)));
+        return P::size(y - P::real(P::whole(inside + F(0.5)))) < P::all(WIDTH * F(size));
     }
     // Its derivative by y is along `direction`.
     template <class N> static INLINE Place<F, N> place(V y, int size, F side, int direction) {
@@ -137,5 +137,39 @@ template <class F> struct Kink {
         return q;
     }
 };
+
+// Which segments of packet `item` of `rays` [R, 8] are `walked` [packets, words]: those between
+// nodes in slices at `planes` of which one has cells that are `touched` [N, rows, columns].
+template <class F> INLINE void mark(
+    int item, const F* planes, const F* rays, const bool* touched, int* walked, int ray_count,
+    int node_count, int rows, int columns, int words) {
+    typedef Packets<F> P;
+    typedef typename P::V V;
+    const int last = ray_count - 1, begin = item * LANES;
+    V ray[8];
+    for (int k = 0; k < 8; ++k) ray[k] = P::load(rays + k, begin, 8, last);
+    const V near = ray[6], far = ray[7], none = P::all(F(0)), one = P::all(F(1));
+    V before = none, touched_before = none;
+    unsigned word = 0;
+    for (int n = 0; n < node_count; ++n) {
+        // Which lanes' cells at node n the support touches.
+        const V s = (planes[n] - ray[0]) / ray[3];
+        const auto y = Place<F, V>::at(ray[1] + s * ray[4], rows);
+        const auto x = Place<F, V>::at(ray[2] + s * ray[5], columns);
+        const auto cell = y.cells[1] * columns + x.cells[1];
+        const bool* slice = touched + (long long)n * rows * columns;
+        V touches = none;
+        for (int l = 0; l < LANES; ++l) P::put(touches, l, F(slice[P::lane_of(cell, l)]));
+        // And which lanes' segments before it lie in the box.
+        const V inside = P::pick((s > near) & (before < far) & (near < far), one, none);
+        if (n > 0 && !P::every(inside * (touches + touched_before) == none)) word |= 1u << (n % 32);
+        if (n % 32 == 31 || n == node_count - 1) {
+            walked[(long long)item * words + n / 32] = (int)word;
+            word = 0;
+        }
+        before = s;
+        touched_before = touches;
+    }
+}
 
 } // namespace ddrecon

@@ -1,7 +1,14 @@
-"""The cells that nodes of rays lie in, as kernels are given them: in place."""
+"""The cells that nodes of rays lie in, as kernels are given them: in place.
+
+And which segments of rays are walked: those that a volume's support touches (E35). Between two
+nodes whose cells all lie outside there is no matter and never will be: the segment adds nothing,
+and to no derivative that is asked for. A packet of rays has a bit for each segment, found once for
+rays and a support that stay.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,11 +17,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import MOST, too_many
-from ddrecon.march.fused.stretches import find_walked
-from ddrecon.march.samplers import Equidistant
-from ddrecon.march.slices import Slices
+from ddrecon.kernels.packets import LANES
+from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.march.samplers import Sampler, order_of_slices, support_of_planes
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
+
+BITS = 32
+"""Segments in a word; segment n lies between nodes n - 1 and n."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,21 +71,52 @@ class Cells:
         return self._found[0] if self._found else None
 
 
-@remember
-def _short(order: Tensor) -> Tensor:
-    return order.int()
-
-
-def cells_of(sampler: Slices | Equidistant) -> tuple[Cells, list[Tensor]]:
+def cells_of(sampler: Sampler) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
-    fields = list(sampler.channels.fields)
-    if not isinstance(sampler, Slices):
-        like = fields[0]
-        planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
+    emission, planes, way = sampler.emission, sampler.planes, sampler.way
+    fields, support = list(emission.fields.values()), emission.support
+    if way.axis is None:
         return Cells(planes), fields
-    support, planes = sampler.support, sampler.planes
+    if support is not None:
+        support = support_of_planes(support, way, sampler.steps)
     if sampler.steps == 1:
-        return Cells(planes, sampler.axis, _short(sampler.order), support), fields
+        order = order_of_slices(emission.grid.shape[way.axis], way, planes.device)
+        return Cells(planes, way.axis, order, support), fields
     # Slices between those of cells are interpolated beforehand.
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
     return Cells(planes, 0, order, support), [sampler.values.transpose(0, 1)]
+
+
+@functools.cache
+def mark_kernel(bits: int) -> TextKernel:
+    """The kernel that finds which segments of a packet of rays touch cells of a support."""
+    names = "ray_count, node_count, rows, columns, words"
+    text = f"mark(item, planes, rays, touched, walked, {names});"
+    given = f"F *planes, *rays; bool *touched; int *walked, {names}"
+    return TextKernel("mark", bits, text, given, "walked", "march/fused/cells.h")
+
+
+@remember
+def find_walked(support: Tensor, planes: Tensor, rays: Tensor) -> Tensor:
+    """Bits of the segments that packets of `rays` are to walk, int32 [packets, words].
+
+    `support` [N, rows, columns] is that of the slices in which nodes lie, as `planes` [N] do.
+    """
+    touched, nodes = _touched(support), len(planes)
+    packets, _ = cut(len(rays), LANES, rays)
+    words = -(-nodes // BITS)
+    walked = rays.new_empty(packets, words, dtype=torch.int32)
+    given = {"planes": planes, "rays": rays, "touched": touched, "ray_count": len(rays)}
+    given |= {"node_count": nodes, "rows": support.shape[1], "columns": support.shape[2]}
+    mark_kernel(torch.finfo(rays.dtype).bits).launch(
+        packets, given | {"words": words}, {"walked": walked}
+    )
+    return walked
+
+
+@remember
+def _touched(support: Tensor) -> Tensor:
+    """Whether a cell, or the next row's or column's, is of the `support`: as places count them."""
+    below = torch.cat([support[:, 1:], support[:, -1:]], 1)
+    rows = support | below
+    return rows | torch.cat([rows[:, :, 1:], rows[:, :, -1:]], 2)

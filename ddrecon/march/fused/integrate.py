@@ -1,21 +1,35 @@
-"""The integral along rays as one differentiable function of tensors, by fused kernels."""
+"""The view-ray integral of an `Emission` by fused kernels: what `march.integral` does in chunks.
+
+It is one differentiable function of tensors.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.packets import LANES
 from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import cut
-from ddrecon.march.fused.cells import Cells
-from ddrecon.march.fused.kernels import Case, adjoint_kernel, integral_kernel, tangent_kernel
-from ddrecon.march.fused.layout import Layout
+from ddrecon.march.box import Crossing
+from ddrecon.march.emission import Emission
+from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
+from ddrecon.march.fused.cells import Cells, cells_of
+from ddrecon.march.fused.kernels import (
+    Case,
+    Layout,
+    adjoint_kernel,
+    integral_kernel,
+    tangent_kernel,
+)
+from ddrecon.march.samplers import Sampler
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 NEIGHBORS, TURNS = 128, 8
@@ -24,6 +38,44 @@ often each thread has its turn, at most.
 """
 NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
 """What a walk is given besides fields and what stays, in the order of its arguments."""
+
+
+def march_rays(
+    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
+    emission, ends = sampler.emission, (crossing.hit, crossing.near, crossing.far)
+    packed = pack_rays(emission.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
+    layout, (cells, fields) = Layout.of(emission), cells_of(sampler)
+    along = see_beams(emission, layout, packed)
+    out, masses, _ = Integrate.apply(
+        layout,
+        cells,
+        packed.bundle,
+        along.angles,
+        along.polynomials,
+        numbers_of(emission),
+        table_of(emission, layout),
+        packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
+        *fields,
+    )
+    return _compose(emission, out, along.factors), masses
+
+
+def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]) -> Tensor:
+    """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
+
+    What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
+    light that of what remains; beams' irradiances, and p where it is one of the `factors`
+    [1 or C, R] (E2).
+    """
+    diffuse, *arriving = out.split(emission.colors)
+    scattered = diffuse * (emission.remaining or emission.scattering).scale.view(-1, 1)
+    for beam, light, factor in zip(emission.beams, arriving, factors, strict=True):
+        weighted = light if factor is None else light * factor
+        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        scattered = scattered + weighted * strength.view(-1, 1)
+    return scattered
 
 
 class Integrate(torch.autograd.Function):
@@ -52,15 +104,47 @@ class Integrate(torch.autograd.Function):
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *bars_of_made: Tensor | None) -> tuple[Any, ...]:
+        """Cotangents of the tensors that need them; of numbers and fronts always."""
         masses, *tensors = ctx.saved_tensors
-        out_bar, masses_bar = (
-            room.zero_() if bar is None else bar
-            for bar, room in zip(bars, _empty(ctx.layout, tensors[0]), strict=False)
-        )
-        ends = {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar}
-        needs = ctx.needs_input_grad[2:]
-        return None, None, *_transpose(ctx.layout, ctx.cells, tensors, needs, ends)
+        needs, ends = ctx.needs_input_grad[2:], {"masses": masses}
+        rooms = _empty(ctx.layout, tensors[0])
+        for name, bar, room in zip(("out_bar", "masses_bar"), bars_of_made, rooms, strict=False):
+            ends[name] = room.zero_() if bar is None else bar
+        rays, _, _, numbers, table, fronts, *fields = tensors
+        # Each thread adds to cells of its own: the same bits, whichever of them is faster.
+        sums = [table if needs[NAMES.index("table")] else None]
+        sums += [
+            one if is_so else None for one, is_so in zip(fields, needs[len(NAMES) :], strict=True)
+        ]
+        size = rays.element_size() * sum(one.numel() for one in sums if one is not None)
+        threads = count_shares(thread_count(rays), size)
+        shares = [
+            [None if one is None else one.new_zeros(one.shape) for one in sums]
+            for _ in range(threads)
+        ]
+        own = [
+            {"table_bar": one, "bars": _channels(of_fields, fields)} for one, *of_fields in shares
+        ]
+        packets, given = _packets(ctx.cells, tensors, threads)
+        numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
+        bars = {
+            f"{name}_bar": one.new_empty(one.shape) if is_so else None
+            for name, one, is_so in zip(NAMES[:3], tensors, needs, strict=False)
+        }
+        bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
+        kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs[: len(NAMES)]))
+        made = bars | {"numbers_bar": numbers_bar}
+        kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
+        for share in shares[1:]:
+            for total, part in zip(shares[0], share, strict=True):
+                if total is not None and part is not None:
+                    total += part
+        table_bar, *field_bars = shares[0]
+        rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()
+        numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
+        others = numbers_bar, table_bar, fronts_bar, *field_bars
+        return None, None, rays_bar, angles_bar, coefficients_bar, *others
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
@@ -101,45 +185,6 @@ def _empty(layout: Layout, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Room for outputs and masses, or their changes."""
     count = len(rays)
     return rays.new_empty(layout.outputs, count), rays.new_empty(layout.extinction, count)
-
-
-def _transpose(
-    layout: Layout,
-    cells: Cells,
-    tensors: Sequence[Tensor],
-    needs: Sequence[bool],
-    ends: dict[str, Tensor],
-) -> list[Tensor | None]:
-    """Cotangents of the `tensors` that `needs` them; of numbers and fronts always."""
-    rays, _, _, numbers, table, fronts, *fields = tensors
-    needs_table = needs[NAMES.index("table")]
-    # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-    sums = [table if needs_table else None]
-    sums += [one if is_so else None for one, is_so in zip(fields, needs[len(NAMES) :], strict=True)]
-    size = rays.element_size() * sum(one.numel() for one in sums if one is not None)
-    threads = count_shares(thread_count(rays), size)
-    shares = [
-        [None if one is None else one.new_zeros(one.shape) for one in sums] for _ in range(threads)
-    ]
-    own = [{"table_bar": one, "bars": _channels(of_fields, fields)} for one, *of_fields in shares]
-    packets, given = _packets(cells, tensors, threads)
-    numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
-    bars = {
-        f"{name}_bar": one.new_empty(one.shape) if is_so else None
-        for name, one, is_so in zip(NAMES[:3], tensors, needs, strict=False)
-    }
-    bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
-    kernel = adjoint_kernel(layout, _case(layout, cells, needs[: len(NAMES)]))
-    made = bars | {"numbers_bar": numbers_bar}
-    kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
-    for share in shares[1:]:
-        for total, part in zip(shares[0], share, strict=True):
-            if total is not None and part is not None:
-                total += part
-    table_bar, *field_bars = shares[0]
-    rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()
-    numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
-    return [rays_bar, angles_bar, coefficients_bar, numbers_bar, table_bar, fronts_bar, *field_bars]
 
 
 def _packets(cells: Cells, tensors: Sequence[Tensor], threads: int) -> tuple[int, dict[str, Any]]:

@@ -1,18 +1,95 @@
-"""The kernels of the walks along packets of rays (`rays.h`, `walk.h`, `back.h`)."""
+"""The kernels of the walks along packets of rays (`rays.h`, `back.h`), and what they are
+made for: what stands where in a node's values.
+"""
 
 from __future__ import annotations
 
 import functools
 from typing import NamedTuple
 
+import torch
+
 from ddrecon.kernels.text import TextKernel, declarations
-from ddrecon.march.fused.layout import Layout
+from ddrecon.light.point_light import PointBeam
+from ddrecon.march.emission import Emission
+from ddrecon.medium.phase_cells import count_tables, is_steep
+from ddrecon.numerics.chebyshev import COEFFICIENTS
 
 _GIVEN = """
 F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
 """
 _CHANGES = "F *d_rays, *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts"
+
+
+class Layout(NamedTuple):
+    """How many channels a node has of each kind, in the order they stand in.
+
+    `colors` C leave the volume. A node holds the `extinction`'s field (K = 1 or C channels),
+    `diffuse` light (1 or C), K masses for each beam, `scattering` (0: it is the extinction's field
+    again; else 1 or C), and `peak`: -1 without a forward peak, 0 where it is one number a color,
+    else 1 or C channels. `phases`: 1, or C where colors have phase functions of their own.
+
+    Where the phase function differs from cell to cell, `form` is how it depends on the number that
+    does (`bundle.py`): a node holds these `numbers` (1 or C), of which there are so many `tables`
+    (1 or C), and 1 or C channels of what `remaining` scatters of diffuse light. Else `SAME`, 0 and
+    1. `beams`: whether each is a point light. `bits` of a number: 32 or 64.
+    """
+
+    colors: int
+    extinction: int
+    diffuse: int
+    scattering: int
+    peak: int
+    phases: int
+    form: str
+    numbers: int
+    tables: int
+    remaining: int
+    beams: tuple[bool, ...]
+    bits: int
+
+    @staticmethod
+    def of(emission: Emission) -> Layout:
+        """How the fields of `emission` stand in a node."""
+        phase, form = emission.seen.phase, "SAME"
+        if phase.cells is not None:
+            form = "LINEAR" if emission.peak is None else "EVEN"
+            form = "STEEP" if is_steep(phase.kind) else form
+        counts = {name: len(field) for name, field in emission.fields.items()}
+        return Layout(
+            emission.colors,
+            counts["extinction"],
+            counts["diffuse"],
+            counts.get("scattering", 0),
+            -1 if emission.peak is None else counts.get("peak", 0),
+            emission.seen.colors,
+            form,
+            counts.get("number", 0),
+            count_tables(phase),
+            counts.get("remaining", 0),
+            tuple(isinstance(beam, PointBeam) for beam in emission.beams),
+            torch.finfo(emission.diffuse.dtype).bits,
+        )
+
+    @property
+    def ray_terms(self) -> int:
+        """Numbers of each beam that a ray is given: coefficients of p, or where to find them."""
+        if self.form == "SAME":
+            return self.phases * COEFFICIENTS
+        return 2 * self.tables if self.form == "LINEAR" else 3
+
+    @property
+    def channels(self) -> int:
+        """All channels of a node."""
+        masses = len(self.beams) * self.extinction
+        others = self.scattering + max(self.peak, 0) + self.numbers + self.remaining
+        return self.extinction + self.diffuse + masses + others
+
+    @property
+    def outputs(self) -> int:
+        """Numbers a ray brings: C of diffuse light, then C of each beam."""
+        return (1 + len(self.beams)) * self.colors
 
 
 class Case(NamedTuple):
@@ -32,7 +109,7 @@ class Case(NamedTuple):
 def integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
     text = f"walk<F, {_written(layout, Case(is_sliced))}, VALUES>(item, of_all, {{}}, out, masses);"
-    return _kernel("integrate", layout, 1, text, "F *out; double *masses", "out masses", "walk")
+    return _kernel("integrate", layout, 1, text, "F *out; double *masses", "out masses", "rays")
 
 
 @functools.cache
@@ -47,7 +124,7 @@ def tangent_kernel(layout: Layout, case: Case) -> TextKernel:
     walk<F, {_written(layout, case)}, TANGENT>(item, of_all, changes, d_out, d_masses);
     """
     given, made = f"{_CHANGES}, *d_out, *d_masses", "d_out d_masses"
-    return _kernel("integrate_tangent", layout, 2, text, given, made, "walk")
+    return _kernel("integrate_tangent", layout, 2, text, given, made, "rays")
 
 
 @functools.cache
@@ -86,5 +163,6 @@ def names_of(given: str) -> str:
 
 
 def _written(layout: Layout, case: Case) -> str:
-    """The types `Layout` and `Case` of C++."""
-    return f"Layout<{layout.written()}>, Case<{', '.join(str(int(is_so)) for is_so in case)}>"
+    """The types `Layout` and `Case` of C++, which find where each channel stands."""
+    of_layout = ", ".join(map(str, (*layout[:-2], *map(int, layout.beams))))
+    return f"Layout<{of_layout}>, Case<{', '.join(str(int(is_so)) for is_so in case)}>"

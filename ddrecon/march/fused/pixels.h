@@ -1,8 +1,8 @@
 #pragma once
-#include "ddrecon/march/fused/spread.h"
-// Pixels between the rays of a lattice: values, where they are in doubt, the adjoint. An item is
-// some pixels. Pixels go in packets, as rays do; the lattice is a slice
-// whose cells are its rays, and values are to third order (`numerics/third_order.py`).
+#include "ddrecon/march/fused/runs.h"
+// Pixels between the rays of a lattice: values, and their adjoint. An item is some pixels. Pixels
+// go in packets, as rays do; the lattice is a slice whose cells are its rays, and values are to
+// third order (`numerics/third_order.py`).
 
 namespace ddrecon {
 
@@ -47,16 +47,13 @@ template <class F> struct Pixels {
         value = packet.value(v, lines(), true, bend);
         return value - bend;
     }
+
     // Whether pixels n on, as many as lanes, are neighbors in an image.
     INLINE bool is_whole(int n, int end) const {
         return n + LANES <= end && hit[n + LANES - 1] - hit[n] == LANES - 1;
     }
-
-    // `out` [channels, pixels], and which pixels are `rough` [total], whose neighbors are more
-    // `uneven` than `bound`: a number that grows along rows of tiles, else 0.
-    void interpolate(int item, const F* uneven, const F* bound, F* out, int* rough) const {
-        // Rows of the lattice whose rough pixels are neighbors: as high as a voxel.
-        constexpr int TILE = 2;
+    // To `out` [channels, pixels].
+    void interpolate(int item, F* out) const {
         const int end = this->end(item);
         for (int n = item * length; n < end; n += LANES) {
             const Packet packet = packet_at(n);
@@ -69,24 +66,13 @@ template <class F> struct Pixels {
                     for (int l = 0; l < LANES && n + l < end; ++l)
                         row[hit[n + l]] = P::lane(value, l);
             }
-            auto around = [&](int r, int c) -> V {
-                return P::gather(uneven, packet.y.cells[r] * columns + packet.x.cells[c]);
-            };
-            const V most =
-                P::most(P::most(around(1, 1), around(1, 2)), P::most(around(2, 1), around(2, 2)));
-            for (int l = 0; l < LANES && n + l < end; ++l) {
-                const int row = P::lane_of(packet.y.cells[1], l) / TILE;
-                const F column = F(P::lane_of(packet.x.cells[1], l)) + P::lane(packet.x.a, l);
-                const int place = 1 + 16 * row * columns + (int)(F(16) * column);
-                rough[n + l] = P::lane(most, l) > bound[0] ? place : 0;
-            }
         }
     }
     // Adds to `values_bar` what `out_bar` is for the values.
     void spread(int item, const F* out_bar, F* values_bar) const {
         // So many channels at a time.
         constexpr int MOST = 6;
-        const int end = this->end(item);
+        const int end = this->end(item), size = rows * columns;
         for (int n = item * length; n < end; n += LANES) {
             const Packet packet = packet_at(n);
             for (int first = 0; first < channels; first += MOST) {
@@ -100,26 +86,23 @@ template <class F> struct Pixels {
                     else
                         for (int l = 0; l < LANES && n + l < end; ++l)
                             P::put(bar, l, row[hit[n + l]]);
-                    // What was held at zero does not move.
+                    // What was clamped to zero does not move.
                     const V found = value_at(packet, channel(first + k));
                     bars[k] = P::pick(found < P::all(F(0)), P::all(F(0)), bar);
                 }
-                F* const field = values_bar + first * rows * columns;
-                spread_packet(packet, bars, count, field);
+                F* const field = values_bar + first * size;
+#if defined(__CUDA_ARCH__)
+                for (int k = 0; k < count; ++k)
+                    spread_place(field + k * size, packet.y, packet.x, lines(), bars[k], -bars[k]);
+#else
+                for (int r = 0; r < packet.runs.count; ++r) {
+                    const Shares<F> shares(packet.runs.run[r], packet.y, packet.x, lines(), true);
+                    for (int k = 0; k < count; ++k)
+                        shares.add_cubic(field + k * size, bars[k], -bars[k]);
+                }
+#endif
             }
         }
-    }
-    INLINE void spread_packet(const Packet& packet, const V* bars, int count, F* field) const {
-        const int size = rows * columns;
-#if defined(__CUDA_ARCH__)
-        for (int k = 0; k < count; ++k)
-            spread_place(field + k * size, packet.y, packet.x, lines(), bars[k], -bars[k]);
-#else
-        for (int r = 0; r < packet.runs.count; ++r) {
-            const Shares<F> shares(packet.runs.run[r], packet.y, packet.x, lines(), true);
-            for (int k = 0; k < count; ++k) shares.add_bent(field + k * size, bars[k], -bars[k]);
-        }
-#endif
     }
 };
 

@@ -1,15 +1,77 @@
 #pragma once
-#include "ddrecon/march/fused/layout.h"
+#include "ddrecon/march/fused/optics.h"
 #include "ddrecon/march/fused/runs.h"
-// A packet of rays: where its nodes lie, and what they emit.
+// A packet of rays: what stands where in a node's values (`kernels.py`), where its nodes lie, what
+// they emit, and the integral of that.
 
 namespace ddrecon {
+
+// How p depends on the number that differs from cell to cell (`bundle.py`).
+enum Form { SAME, LINEAR, EVEN, STEEP };
+
+// Channels that colors share, of a kind with one, are those of each. Without a peak it has -1
+// channels; as a number for each color, 0.
+template <
+    int COLORS, int EXTINCTIONS, int DIFFUSES, int SCATTERINGS, int PEAKS, int PHASE_COUNT,
+    Form FORM, int NUMBERS, int TABLES, int REMAINING, bool... POINTS>
+struct Layout {
+    static constexpr int C = COLORS, EXTINCTION = EXTINCTIONS, SCATTERING = SCATTERINGS;
+    static constexpr int BEAMS = sizeof...(POINTS), PHASES = PHASE_COUNT;
+    static constexpr bool HAS_PEAK = PEAKS >= 0, IS_PEAK_FIELD = PEAKS > 0;
+    static constexpr bool HAS_NUMBERS = FORM != SAME, IS_LINEAR = FORM == LINEAR;
+    static constexpr bool IS_STEEP = FORM == STEEP;
+    static constexpr bool HAS_RUNGS = (FORM == EVEN || IS_STEEP) && HAS_PEAK;
+    // All outputs: of diffuse light, then of each beam.
+    static constexpr int MASSES = BEAMS * EXTINCTION, OUT = (1 + BEAMS) * C;
+    static constexpr int FIRST_MASS = EXTINCTION + DIFFUSES, AFTER_MASSES = FIRST_MASS + MASSES;
+    static constexpr int FIRST_PEAK = AFTER_MASSES + SCATTERING;
+    static constexpr int FIRST_NUMBER = FIRST_PEAK + (IS_PEAK_FIELD ? PEAKS : 0);
+    static constexpr int FIRST_REMAINING = FIRST_NUMBER + NUMBERS;
+    static constexpr int CHANNELS = FIRST_REMAINING + REMAINING;
+    // Coefficients of p over the depth of the peak, or where there is none over the number.
+    static constexpr int TERMS = HAS_PEAK ? COEFFICIENTS : 1 + IS_LINEAR;
+    // Numbers of each beam that a ray is given: such coefficients, or where to find them.
+    static constexpr int RAY_TERMS =
+        HAS_NUMBERS ? (IS_LINEAR ? 2 * TABLES : 3) : PHASES * COEFFICIENTS;
+    static constexpr bool HAS_TABLES = HAS_NUMBERS ? TABLES > 1 : PHASES > 1;
+    static constexpr int RUNG_COUNT =
+        HAS_RUNGS ? 2 * (1 + (IS_STEEP ? STEEP_RUNGS : EVEN_RUNGS)) : 1;
+
+    // Of color c: its extinction, also among masses; diffuse light, what scatters that, and beams.
+    static constexpr INLINE int extinction(int c) { return EXTINCTION > 1 ? c : 0; }
+    static constexpr INLINE int diffuse(int c) { return EXTINCTION + (DIFFUSES > 1 ? c : 0); }
+    static constexpr INLINE int diffusing(int c) {
+        return REMAINING ? FIRST_REMAINING + (REMAINING > 1 ? c : 0) : scattering(c);
+    }
+    static constexpr INLINE int scattering(int c) {
+        return SCATTERING ? AFTER_MASSES + (SCATTERING > 1 ? c : 0) : extinction(c);
+    }
+    static constexpr INLINE int mass(int b, int c) {
+        return FIRST_MASS + b * EXTINCTION + extinction(c);
+    }
+    static constexpr INLINE int peak(int c) { return FIRST_PEAK + (PEAKS > 1 ? c : 0); }
+    static constexpr INLINE int number(int c) { return FIRST_NUMBER + (NUMBERS > 1 ? c : 0); }
+    // Its phase function, the table of that, and what rays are given of it.
+    static constexpr INLINE int phase(int c) { return PHASES > 1 ? c : 0; }
+    static constexpr INLINE int table(int c) {
+        return HAS_TABLES ? c * 2 * (ANGLE_STEPS + 1) * RUNG_COUNT * TERMS : 0;
+    }
+    static constexpr INLINE int curve(int b, int c) {
+        return b * RAY_TERMS + (HAS_TABLES ? c * (HAS_NUMBERS ? 2 : COEFFICIENTS) : 0);
+    }
+    static constexpr INLINE bool is_cubic(int c) { return c >= FIRST_MASS && c < AFTER_MASSES; }
+    // Whether beam b is a point light.
+    static constexpr INLINE bool is_point(int b) {
+        const bool points[] = {POINTS..., false};
+        return points[b];
+    }
+};
 
 // What a kernel is given. Nodes lie in `slices` [N] of `fields`, channels of cells, at `planes` [N]
 // across them [u]; or, where there are none, anywhere: at such parts of the way from near to far.
 // `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
 // [2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
-// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E13, or what `cellwise.py`
+// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E13, or what `bundle.py`
 // has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
 // [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the
 // mass before the rays, if any. `walked` [packets, words]: bits of the segments to be walked, if
@@ -58,29 +120,30 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     static constexpr int DIRECTIONS = VIEW + 2 * HAS_VIEW;
     typedef Dual<V> D;
     typedef Dual<V, DIRECTIONS ? DIRECTIONS : 1> Slopes;
-    typedef typename Either<IS_TANGENT, D, V>::type N;
-    typedef typename Either<MODE == ADJOINT, Slopes, N>::type E;
+    typedef typename If<IS_TANGENT, D, V>::type N;
+    typedef typename If<MODE == ADJOINT, Slopes, N>::type E;
     // Of distances along rays; of feet of point lights; of lengths, by either; of coefficients.
-    typedef typename Either<IS_TANGENT && VARIES_RAYS, D, V>::type Distance;
-    typedef typename Either<IS_TANGENT && VARIES_ANGLES, D, V>::type Foot;
-    typedef typename Either<IS_TANGENT && (VARIES_RAYS || VARIES_ANGLES), D, V>::type Length;
-    typedef typename Either<IS_TANGENT && VARIES_CURVES, D, V>::type Coefficient;
+    typedef typename If<IS_TANGENT && VARIES_RAYS, D, V>::type Distance;
+    typedef typename If<IS_TANGENT && VARIES_ANGLES, D, V>::type Foot;
+    typedef typename If<IS_TANGENT && (VARIES_RAYS || VARIES_ANGLES), D, V>::type Length;
+    typedef typename If<IS_TANGENT && VARIES_CURVES, D, V>::type Coefficient;
     // Of angles in tables, and of what is read there.
-    typedef typename Either<
-        HAS_VIEW, E,
-        typename Either<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type Angle;
-    typedef typename Either<L::HAS_RUNGS, E, Angle>::type Curve;
-    typedef typename Either<IS_TANGENT, Dual<W>, W>::type Mass;
+    typedef typename If<
+        HAS_VIEW, E, typename If<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type
+        Angle;
+    typedef typename If<L::HAS_RUNGS, E, Angle>::type Curve;
+    typedef typename If<IS_TANGENT, Dual<W>, W>::type Mass;
     typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
 
     // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
-    // at and `t` held in the box; values; emission, depth, exp(-depth), and p; the beams' angles.
+    // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p; the beams'
+    // angles.
     struct Node : Spot<F, IS_SLICED, V> {
         Runs<F> runs;
         bool is_empty, is_lit;
         Distance s, t;
         N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
-        V held[L::MASSES + 1], decay[L::OUT];
+        V limit[L::MASSES + 1], decay[L::OUT];
         E p[L::OUT];
         Cubic<F, V> angle[L::BEAMS + 1];
     };
@@ -114,7 +177,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             for (int k = 0; k < L::BEAMS * L::RAY_TERMS; ++k)
                 coefficients[k] =
                     load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
-        // Nodes before the box and behind it are held at its faces: between them nothing is added.
+        // Nodes before the box and behind it are clamped to its faces: between them nothing is
+        // added.
         const V near = value_of(ray[6]), far = value_of(ray[7]);
         while (first_node < last_node && P::every(value_of(distance(ray, first_node + 1)) <= near))
             ++first_node;
@@ -176,13 +240,13 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return from < to;
     }
 
-    // Of any kind of numbers that a ray has: the distance of node n; the same held in the box; and
-    // where it is then across slices, along y, and along x.
+    // Of any kind of numbers that a ray has: the distance of node n; the same clamped to the box;
+    // and where it is then across slices, along y, and along x.
     template <class X> X distance(const X* ray, int n) const {
         if (IS_SLICED) return (given.planes[n] - ray[0]) / ray[3];
         return ray[6] + given.planes[n] * (ray[7] - ray[6]);
     }
-    template <class X> static X hold(const X* ray, const X& s) {
+    template <class X> static X clamp(const X* ray, const X& s) {
         return P::least(P::most(s, ray[6]), ray[7]);
     }
     template <class X> static X place(const X* ray, const X& s, int axis) {
@@ -194,7 +258,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     // Where node n lies, and the matter there.
     void locate(int n, Node& node) const {
         node.s = distance(ray, n);
-        node.t = hold(ray, node.s);
+        node.t = clamp(ray, node.s);
         auto at = [&](int axis, int size) {
             return Place<F, V>::at(value_of(place(ray, node.s, axis)), size);
         };
@@ -227,9 +291,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                     const Window<F> w(node.runs.run[r], node.y, node.x, lines);
                     for (int c = from; c < to; ++c) {
                         V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = w.value(fields[c] + offset, L::is_bent(c), bend);
+                        const V v = w.value(fields[c] + offset, L::is_cubic(c), bend);
                         known = P::pick(w.is_in, v, known);
-                        if (!L::is_bent(c)) continue;
+                        if (!L::is_cubic(c)) continue;
                         V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
                         known_bend = P::pick(w.is_in, bend, known_bend);
                     }
@@ -240,8 +304,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         for (int c = from; c < to; ++c) {
             V bend = P::all(F(0));
             P::template part<PART>(node.v[c]) =
-                node.value(fields[c] + offset, lines, L::is_bent(c), bend);
-            if (L::is_bent(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
+                node.value(fields[c] + offset, lines, L::is_cubic(c), bend);
+            if (L::is_cubic(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
         }
     }
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
@@ -264,9 +328,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         for (int c = from; c < to; ++c) {
             const F* field = given.fields[c] + slice(n);
             Slope bend(none), other(none);
-            Slope v = sides[0].value(field, lines, L::is_bent(c), bend);
+            Slope v = sides[0].value(field, lines, L::is_cubic(c), bend);
             if (has_kink) {
-                v = F(0.5) * (v + sides[1].value(field, lines, L::is_bent(c), other));
+                v = F(0.5) * (v + sides[1].value(field, lines, L::is_cubic(c), other));
                 bend = F(0.5) * (bend + other);
             }
             take(c, v, bend);
@@ -283,7 +347,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         };
         take_slopes(n, node.s, from, to, [&](int c, const Slope& v, const Slope& bend) {
             node.v[c].by[0] += along(v);
-            if (L::is_bent(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
+            if (L::is_cubic(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
         });
     }
 
@@ -363,10 +427,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         sample(node, n, L::EXTINCTION, L::AFTER_MASSES);
         if (L::FIRST_PEAK < L::CHANNELS) sample(node, n, L::FIRST_PEAK, L::CHANNELS);
         for (int k = 0; k < L::MASSES; ++k) {
-            const N bent = number(2 * L::C) * node.bend[k],
-                    held = F(1) / P::root(F(1) + bent * bent);
-            node.v[L::FIRST_MASS + k] -= node.bend[k] * held;
-            node.held[k] = value_of(held);
+            const N off = number(2 * L::C) * node.bend[k], limit = F(1) / P::root(F(1) + off * off);
+            node.v[L::FIRST_MASS + k] -= node.bend[k] * limit;
+            node.limit[k] = value_of(limit);
         }
         for (int c = 0; c < L::C; ++c) {
             const N scattering = node.v[L::diffusing(c)];
@@ -412,5 +475,50 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return Point::subtended(Length(foot[beam]), Length(across[beam]), Length(a.t), Length(b.t));
     }
 };
+
+// The integral along a packet of rays, from the camera into the volume (E1 to E3): `out`
+// [outputs, R] and `masses` [K, R]; or in a TANGENT the changes of both.
+template <class F, class L, class Which, Mode MODE, class Masses>
+void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Masses* masses) {
+    typedef ddrecon::Rays<F, L, Which, MODE> Rays;
+    typedef typename Rays::P P;
+    typedef typename Rays::N N;
+    constexpr int PART = MODE == TANGENT;
+    const Rays rays(item, given, changes);
+    N total[L::OUT];
+    typename Rays::Mass m[L::EXTINCTION];
+    for (int i = 0; i < L::OUT; ++i) total[i] = N(P::all(F(0)));
+    for (int k = 0; k < L::EXTINCTION; ++k) m[k] = rays.front(k);
+    typename Rays::Node nodes[2], *a = nodes, *b = nodes + 1;
+    for (int from, to = rays.first_node; rays.next_stretch(from, to);) {
+        rays.locate(from, *a);
+        a->is_lit = false;
+        for (int n = from + 1; n <= to; ++n) {
+            rays.locate(n, *b);
+            b->is_lit = !(a->is_empty && b->is_empty);
+            // Between empty nodes nothing is added: what light there is does not matter.
+            if (b->is_lit) {
+                if (!a->is_lit) rays.emit(n - 1, *a, m);
+                // The mass passed on the way to the next node, and what it emits behind that.
+                for (int k = 0; k < L::EXTINCTION; ++k) m[k] += rays.mass_between(*a, *b, k);
+                rays.emit(n, *b, m);
+                // E2, E3: what arrives from the segment between both.
+                for (int i = 0; i < L::OUT; ++i) {
+                    const N decay = Decay<F>::of(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+                    total[i] += F(0.5) * (a->w[i] + b->w[i]) * rays.measure(*a, *b, i) * decay;
+                }
+            }
+            typename Rays::Node* const passed = a;
+            a = b;
+            b = passed;
+        }
+    }
+    for (int l = 0; l < LANES && rays.begin + l <= rays.last; ++l) {
+        for (int i = 0; i < L::OUT; ++i)
+            out[rays.row_of(i) + rays.begin + l] = P::lane(P::template part<PART>(total[i]), l);
+        for (int k = 0; k < L::EXTINCTION; ++k)
+            masses[rays.row_of(k) + rays.begin + l] = P::lane_of(P::template part<PART>(m[k]), l);
+    }
+}
 
 } // namespace ddrecon

@@ -91,11 +91,11 @@ template <class F> struct Window {
             rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
     }
     // As `Spot::value`.
-    INLINE V value(const F* f, bool is_bent, V& bend) const {
+    INLINE V value(const F* f, bool is_cubic, V& bend) const {
         V row[4];
         UNROLLED
         for (int r = 0; r < 4; ++r) {
-            if (!is_bent && (r == 0 || r == 3)) continue;
+            if (!is_cubic && (r == 0 || r == 3)) continue;
             if (stride == 1)
                 row[r] = P::read(f + rows[r] + first);
             else
@@ -103,9 +103,172 @@ template <class F> struct Window {
                     row[r][l] = f[rows[r] + (long long)(first + l) * stride];
         }
         auto cell = [&](int r, int c) HERE { return Permute<F>::pick(row[r], x.cells[c]); };
-        return is_bent ? curved(y, x, cell, bend) : linear(y, x, cell);
+        return is_cubic ? curved(y, x, cell, bend) : linear(y, x, cell);
     }
 };
 
 #endif
+
+// Cotangents of values at packets of places in a slice go back to the cells. Neighboring rays meet
+// the same cells. Of a run, cells of its columns add up all shares in vectors, and are written
+// once:
+//
+//                  lane l, with weights L of its columns i, j
+//         row m    .  .  .  .  .  .  .
+//         row i    .  .  #  #  .  .  .      # += (1 - a) bar L
+//         row j    .  .  #  #  .  .  .      # += a bar L
+//         row p    .  .  .  .  .  .  .
+//               first column
+//
+// Where lanes lie in the order of their columns, and a few to each, columns pick them instead: the
+// first of those that lie right of each column, the second, and so on. That is 1.2 times as fast.
+
+#if defined(__CUDA_ARCH__)
+template <class F> INLINE void spread_place(
+    F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
+    const F ya = y.a, xa = x.a;
+    // Linear weights, and those of a (1 - a) / 2 second differences.
+    const F y_linear[4] = {0, 1 - ya, ya, 0}, x_linear[4] = {0, 1 - xa, xa, 0};
+    const F y_bend[4] = {1 - ya, 3 * ya - 2, 1 - 3 * ya, ya};
+    const F x_bend[4] = {1 - xa, 3 * xa - 2, 1 - 3 * xa, xa};
+    for (int j = 0; j < 4; ++j)
+        for (int i = 0; i < 4; ++i) {
+            const F weight =
+                bar * y_linear[j] * x_linear[i] + bend_bar * (y.excess * y_bend[j] * x_linear[i] +
+                                                              x.excess * y_linear[j] * x_bend[i]);
+            if (weight != F(0))
+                Packets<F>::add(field, y.cells[j] * lines.row + x.cells[i] * lines.column, weight);
+        }
+}
+#else
+// What the lanes of a run count for columns `first` to `first` + LANES - 1 of cells.
+template <class F> struct Shares {
+    typedef Packets<F> P;
+    typedef Permute<F> Lanes;
+    typedef typename P::V V;
+    typedef typename P::I I;
+    static constexpr int MOST_ALIKE = 8;
+    Run run;
+    Lines lines;
+    int first, alike = 0;
+    long long rows[4];
+    V ya, y_excess, xa, x_excess, at_low, at_high;
+    // If up to so many lanes lie `alike` right of the same column: for each column the lanes whose
+    // first to fourth it is. Else each lane's weights of columns, and those of a (1 - a) / 2 second
+    // differences.
+    I lanes_of[MOST_ALIKE][4];
+    V linear[LANES], cubic[LANES];
+
+    Shares(
+        const Run& run, const Place<F, V>& y, const Place<F, V>& x, const Lines& lines,
+        bool is_cubic)
+        : run(run),
+          lines(lines),
+          first(run.first),
+          ya(y.a),
+          y_excess(y.excess),
+          xa(x.a),
+          x_excess(x.excess) {
+        for (int r = 0; r < 4; ++r)
+            rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
+        if constexpr (HAS_PERMUTATION<F>)
+            if (lines.columns >= LANES) pick_lanes(x);
+        if (alike) return;
+        // 1 in column k of a run: entries LANES - 1 - k on.
+        F ones[2 * LANES - 1] = {};
+        ones[LANES - 1] = F(1);
+        auto column = [&](int k) -> V { return P::read(ones + LANES - 1 - (k - first)); };
+        const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
+        for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            V at[4];
+            for (int c = 0; c < 4; ++c) at[c] = column(((const int*)&x.cells[c])[l]);
+            const F w1 = xa[l], w0 = F(1) - w1;
+            linear[l] = w0 * at[1] + w1 * at[2];
+            if (is_cubic)
+                cubic[l] = excess[l] * ((w1 - F(2) * w0) * at[1] + (w0 - F(2) * w1) * at[2] +
+                                        w0 * at[0] + w1 * at[3]);
+        }
+    }
+    void pick_lanes(const Place<F, V>& x) {
+        const I numbers = P::numbers(), none = I{} + LANES;
+        const int count = __builtin_popcount(run.lanes), begin = P::lane_of(x.cells[1], run.lane);
+        // The run's lanes first, the columns right of which they lie, and those after new ones.
+        const I lanes = Lanes::gather_lanes(numbers, run.lanes, none);
+        const I column = Lanes::pick_any(x.cells[1], lanes, none), is_lane = numbers < count;
+        const I before = Lanes::pick_any(column, (numbers - 1) & (LANES - 1), none);
+        const I step = P::pick(is_lane & (numbers > 0), column - before, I{});
+        if (!__builtin_reduce_and((step == 0) | (step == 1))) return;
+        const unsigned starts = P::bits_of((step == 1) | (numbers == 0));
+        const I start = Lanes::gather_lanes(numbers, starts, I{} + count);
+        const I next = Lanes::pick_any(start, numbers + 1, I{} + count);
+        const int most = __builtin_reduce_max(next - start);
+        if (most > MOST_ALIKE) return;
+        // The first column is that left of the first lane's, or where LANES end with the row.
+        const int last = lines.columns - LANES;
+        first = begin - 1 < last ? (begin > 0 ? begin - 1 : 0) : last;
+        const int shift = begin - 1 - first, end = begin + __builtin_popcount(starts) + 1;
+        run.low = begin > 0 ? begin - 1 : 0;
+        run.high = end < lines.columns ? end : lines.columns - 1;
+        for (int k = 0; k < most; ++k) {
+            const I which = P::pick(start + k < next, start + k, none);
+            const I lane = Lanes::pick_any(lanes, which, none), at = numbers - shift;
+            for (int c = 0; c < 4; ++c)
+                lanes_of[k][c] = Lanes::pick_any(lane, (at - c) & (2 * LANES - 1), none);
+        }
+        // Beyond the ends of the row the columns at its ends count once more.
+        at_low = __builtin_convertvector(-(x.cells[0] == x.cells[1]), V);
+        at_high = __builtin_convertvector(-(x.cells[3] == x.cells[2]), V);
+        alike = most;
+    }
+    // To a row of cells what linear values there have as bars, and corrections along the row.
+    template <bool IS_CUBIC> void add_row(F* row, V bar, V bend_bar = V{}) const {
+        V sum = P::all(F(0));
+        if (!alike)
+            for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                sum += ((const F*)&bar)[l] * linear[l];
+                if (IS_CUBIC) sum += ((const F*)&bend_bar)[l] * cubic[l];
+            }
+        if constexpr (HAS_PERMUTATION<F>) {
+            V by_j = bar * xa, by_i = bar - by_j, by_m = V{}, by_p = V{};
+            if (IS_CUBIC) {
+                const V bend = x_excess * bend_bar;
+                by_p = bend * xa;
+                by_m = bend - by_p;
+                by_j += (by_m - F(2) * by_p) + at_high * by_p;
+                by_i += (by_p - F(2) * by_m) + at_low * by_m;
+            }
+            for (int k = 0; k < alike; ++k) {
+                sum +=
+                    Lanes::pick_any(by_i, lanes_of[k][1]) + Lanes::pick_any(by_j, lanes_of[k][2]);
+                if (IS_CUBIC)
+                    sum += Lanes::pick_any(by_m, lanes_of[k][0]) +
+                           Lanes::pick_any(by_p, lanes_of[k][3]);
+            }
+        }
+        if (lines.column == 1 && lines.columns >= LANES) {
+            P::write(row + first, P::read(row + first) + sum);
+        } else {
+            const F* values = (const F*)&sum;
+            for (int j = run.low; j <= run.high; ++j)
+                row[(long long)j * lines.column] += values[j - first];
+        }
+    }
+    void add(F* field, V bar) const {
+        const V in_j = bar * ya;
+        add_row<false>(field + rows[1], bar - in_j);
+        add_row<false>(field + rows[2], in_j);
+    }
+    void add_cubic(F* field, V bar, V bend_bar) const {
+        const V bend_j = bend_bar * ya, bend_i = bend_bar - bend_j;
+        const V in_m = y_excess * bend_i, in_p = y_excess * bend_j, in_j = bar * ya;
+        add_row<false>(field + rows[0], in_m);
+        add_row<false>(field + rows[3], in_p);
+        add_row<true>(field + rows[1], (bar - in_j) + (in_p - F(2) * in_m), bend_i);
+        add_row<true>(field + rows[2], in_j + (in_m - F(2) * in_p), bend_j);
+    }
+};
+#endif
+
 } // namespace ddrecon
