@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.grid import Triple
-from ddrecon.light.lights import DirectionalLight, Light
 from ddrecon.scene import Scene, View
 
 
@@ -42,26 +41,6 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
         View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center))
         for index, angle in enumerate(angles)
     ]
-
-
-def turn_lights(scene: Scene, count: int) -> list[list[Light]]:
-    """`count` >= 1 times the lights of `scene`, the directional ones turned in equal steps.
-
-    They turn about the axis that `place_turntable` has. The first are those of the scene.
-    """
-    axis = upright_axis([item.camera for item in scene.views])
-    turned = list[list[Light]]()
-    for index in range(count):
-        rotation = _rotation(axis, 2 * math.pi * index / count)
-        turned.append(
-            [
-                replace(light, direction=rotation.to(light.direction) @ light.direction)
-                if isinstance(light, DirectionalLight)
-                else light
-                for light in scene.lights
-            ]
-        )
-    return turned
 
 
 def _rotation(axis: int, angle: float) -> Tensor:

@@ -133,10 +133,6 @@ class NumberSteps:
         found = find_curvatures(point, self.numbers, old, weights)
         self.curvatures = self.curvatures | {name: (iteration, m) for name, m in found.items()}
 
-    def forget(self) -> None:
-        """Forgets what belongs to another resolution."""
-        self.curvatures = {}
-
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         return {"begun": self.begun, "curvatures": dict(self.curvatures)}

@@ -155,16 +155,6 @@ class Parameter:
             "moments": list(self.moments),
         }
 
-    def backup(self) -> dict[str, Any]:
-        """Its state, but that moments of a large field are rounded to 1 in 256 (bfloat16).
-
-        It is gone back to only where a step led astray.
-        """
-        state = self.state()
-        if self.value.numel() >= tuning.HALVED and self.value.dtype is torch.float32:
-            state["moments"] = [moment.bfloat16() for moment in self.moments]
-        return state
-
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)

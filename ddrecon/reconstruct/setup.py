@@ -54,7 +54,8 @@ class Problem:
         loss = choose_loss(settings, train)
         views = replace(scene, views=[*train.views, *test.views])
         noises = known_noises(views, settings, loss)
-        power = mean_power(targets_of(train, loss, noises))
+        powers = [target.power for target in targets_of(train, loss, noises).values()]
+        power = float(torch.stack(powers).mean())
         support = start_support(train, settings)
         levels = factors(scene, settings.refine_at)
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
@@ -158,23 +159,15 @@ def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
     encoded = [view.name for view in train.views if view.step]
     linear = [view.name for view in train.views if not view.step]
     if encoded and linear:
+        some, others = (
+            ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+            for names in (encoded, linear)
+        )
         raise SceneError(
-            f"optimize.loss: some training pictures are sRGB files ({_name_some(encoded)}), others"
-            f" linear ({_name_some(linear)}); say how to compare them, loss: display or loss: l2"
+            f"optimize.loss: some training pictures are sRGB files ({some}), others linear"
+            f" ({others}); say how to compare them, loss: display or loss: l2"
         )
     return "display" if encoded else "l2"
-
-
-def _name_some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-
-
-def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
-    """The noise of the picture of each view of `scene`, by name: given, or estimated from it."""
-    return {
-        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
-        for view in scene.views
-    }
 
 
 def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
@@ -186,10 +179,15 @@ def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
     """The noise of the picture of each view of `scene`, by name, where it is known, else nothing.
 
-    It is known where the scene gives that of every training view, or where `loss` compares by it.
+    It is known where the scene gives that of every training view, or where `loss` compares by it:
+    then it is estimated from pictures where it is not given.
     """
-    is_given = all(view.is_test or given_noise(view, settings) for view in scene.views)
-    return noises_of(scene, settings) if is_given or loss == "photon" else {}
+    if loss != "photon" and not all(v.is_test or given_noise(v, settings) for v in scene.views):
+        return {}
+    return {
+        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
+        for view in scene.views
+    }
 
 
 def noise_targets(level: Scene, scene: Scene, noises: Mapping[str, Noise]) -> dict[str, Target]:
@@ -213,11 +211,6 @@ def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str
         view.name: Target.of(target_of(view), view.mask, loss, noises.get(view.name))
         for view in scene.views
     }
-
-
-def mean_power(targets: Mapping[str, Target]) -> float:
-    """The mean square of the `targets`, as they are compared."""
-    return float(torch.stack([target.power for target in targets.values()]).mean())
 
 
 def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter]:

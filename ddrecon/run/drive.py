@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
+from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
@@ -20,10 +20,9 @@ from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
-from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
-from ddrecon.run.differences import fingerprint
+from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.leftovers import remove_run
-from ddrecon.run.quality import describe_loss, loss_text, render_run
+from ddrecon.run.quality import describe_loss, find_results, loss_text
 from ddrecon.run.report_volume import turntable_images
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
@@ -76,10 +75,7 @@ def _begin(scene: Scene, scene_file: SceneFile) -> Reconstruction:
 def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     """Restores `run` from the run folder `path`; returns the file it took."""
     state, loaded = load_checkpoint(path / CHECKPOINTS, scene)
-    try:
-        run.restore(state)
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise FormatError(loaded, UNUSABLE) from error
+    restore_run(run, state, loaded)
     if run.iteration > run.schedule.most:
         raise UsageError(
             f"{path}: {run.iteration} iterations are made already; "
@@ -104,12 +100,12 @@ def follow_run(
         while not run.is_done:
             run.step()
             if cells_are_shared() and preview_every and run.iteration % preview_every == 0:
-                render_run(run)
+                find_results(run)
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
     if cells_are_shared():
-        scene, light_field, *_ = render_run(run)
-        turntable_images(scene, light_field)
+        found = find_results(run)
+        turntable_images(found.scene, found.light_field)
     return run
 
 

@@ -25,10 +25,6 @@ class LossLog:
     def __init__(self, path: Path):
         self.path = path
 
-    def start(self) -> None:
-        """Begins anew."""
-        self._write([])
-
     def cut(self, iteration: int) -> None:
         """Removes the rows after `iteration`, where a resumed run goes on, and what is no row."""
         self._write(row for row in self.rows() if row.iteration <= iteration)

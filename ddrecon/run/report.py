@@ -37,7 +37,7 @@ from ddrecon.report.page import (
 from ddrecon.report.pictures import find_white, pixels, shrink
 from ddrecon.run.quality import Findings
 from ddrecon.run.report_volume import turntable, volume_section
-from ddrecon.scene import View
+from ddrecon.scene import Scene, View
 from ddrecon.terms import engine_of_scene, needed_terms
 
 SHOWN = 24
@@ -57,31 +57,38 @@ TIMING_HEAD = [
 """The columns of the table of timings."""
 
 
-def write_run_report(path: Path, findings: Findings) -> None:
-    """Writes the report of `findings` to `path`."""
+def write_run_report(
+    path: Path,
+    findings: Findings,
+    rows: Sequence[Row],
+    summary: Mapping[str, Any],
+    environment: Mapping[str, Any],
+) -> None:
+    """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
-    environment = {k: v for k, v in findings.environment.items() if k != "engines"}
-    diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
+    known = {key: value for key, value in environment.items() if key != "engines"}
+    settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
+    diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
-        section("Volume", volume_section(findings)),
-        section("Loss", side_by_side(*curves(findings.rows))),
+        section("Volume", volume_section(findings, summary)),
+        section("Loss", side_by_side(*curves(rows))),
         section("Views", *view_section(findings)),
         section("Turntable", turntable(findings)),
-        section("Timings", _timings(findings.rows)),
+        section("Timings", _timings(rows)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
-        section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
-        section("Versions", versions(environment)),
+        section("Settings", fold("scene.yaml, all defaults filled in", settings)),
+        section("Versions", versions(known)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
-    write_page(path, title, _lead(findings), sections, is_alive=True)
+    write_page(path, title, _lead(scene, summary), sections, is_alive=True)
 
 
-def _lead(findings: Findings) -> str:
+def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
     """The sentence below the title."""
-    cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
-    summary, test = findings.summary, ""
+    cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
+    test = ""
     if summary["test_psnr"] is not None:
         test = (
             f", {summary['test_psnr']:.2f} dB (SSIM {summary['test_ssim']:.4f}) of views held out"

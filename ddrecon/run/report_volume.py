@@ -27,8 +27,11 @@ ENLARGED = 2
 """They have at most so many times the pixels of the first view along a side."""
 
 
-def volume_section(findings: Findings) -> str:
-    """Every field that was found, and beside it what the scene file has in its place."""
+def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
+    """Every field that was found, and beside it what the scene file has in its place.
+
+    And what of the volume the `summary` says was left out.
+    """
     scene = findings.scene
     named = fields_of(scene)
     both = (*named.items(), *findings.given.items())
@@ -44,16 +47,10 @@ def volume_section(findings: Findings) -> str:
     eye = towards.tolist()
     still = _stills(named)
     viewer = volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
-    return "\n".join([viewer, *_remarks(findings.summary)])
-
-
-def _remarks(summary: Mapping[str, Any]) -> list[str]:
-    """What the run did to the volume by itself."""
-    remarks = []
-    if "support" in summary:
-        left_out = 100 * (1 - summary["support"]["cells"])
-        remarks.append(paragraph(f"Left out by the support: {left_out:.3g} % of the cells."))
-    return remarks
+    if "support" not in summary:
+        return viewer
+    left_out = 100 * (1 - summary["support"]["cells"])
+    return f"{viewer}\n{paragraph(f'Left out by the support: {left_out:.3g} % of the cells.')}"
 
 
 def _stills(fields: dict[str, Tensor]) -> str:

@@ -7,6 +7,7 @@ whose data and prior were disturbed as much as they err.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from ddrecon.numerics.conjugate_gradients import Solved, conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.numbers import number_curvature, single_numbers
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.uncertainty.information import Information
 from ddrecon.uncertainty.prior import DIAGONAL, Prior, normal_like, rounding_of
 
@@ -76,20 +78,33 @@ class Posterior:
         self.curvature, self.temperature = curvature, temperature
         self.seed, self.tolerance, self.most = seed, tolerance, MOST
         self.prior = Prior(curvature, temperature)
-        value = curvature.join(curvature.values)
-        self.low, self.high = (bound - value for bound in find_bounds(curvature))
+        value, parameters = curvature.join(curvature.values), curvature.parameters
+
+        def entries(number_of: Callable[[Parameter], float]) -> Tensor:
+            return curvature.join(
+                {p.name: torch.full_like(p.value, number_of(p)) for p in parameters}
+            )
+
+        self.low, self.high = entries(lambda p: p.low) - value, entries(lambda p: p.high) - value
         # What rounding leaves of a cell that no picture shows is at its bound.
-        near = {p.name: torch.full_like(p.value, rounding_of(p)) for p in curvature.parameters}
-        self.near = curvature.join(near)
-        self.is_kept = find_kept(curvature)
+        self.near = entries(rounding_of)
+        # Cells outside of a field's support stay as they are.
+        supports = [(p, p.support) for p in parameters if p.support is not None]
+        kept = {p.name: (support == 0).expand(p.value.shape).to(p.value) for p, support in supports}
+        self.is_kept = curvature.join(kept) > 0
         at_bound = self._is_held(torch.zeros_like(gradient), -gradient)
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
-        numbers = single_numbers(curvature.parameters)
-        self.numbers = {p.name: p.value.numel() for p in numbers}
+        numbers = single_numbers(parameters)
         self.is_number = curvature.join({p.name: torch.ones_like(p.value) for p in numbers}).bool()
-        self.between = number_curvature(curvature, numbers)
+        # Between them H is what pictures say, and how they are given without.
+        held = [torch.atleast_1d(self.prior.held[p.name].double().cpu()) for p in numbers]
+        blocks = [
+            block if block.ndim == 2 else block * torch.eye(p.value.numel())
+            for p, block in zip(numbers, held, strict=True)
+        ]
+        self.between = number_curvature(curvature, numbers) + torch.block_diag(*blocks).double()
         self.information = information or Information(curvature, generator_of(seed, PROBED))
 
     def sample(self, number: int) -> Sample:
@@ -97,9 +112,12 @@ class Posterior:
         generator = generator_of(self.seed, number)
         scale = self.temperature**0.5
         noise, level = (scale * part for part in self.prior.root_noise(generator))
-        prior = self._within(self.prior.without_levels(self._solve_prior(noise), self.is_kept))
+        draw = self._without_gauge(self.prior.solve(noise, self.is_kept))
+        prior = self._within(self.prior.without_levels(draw, self.is_kept))
         right = noise + level - self.gradient
-        begin = self._begin(prior, right)
+        # It begins at the draw, and a part of the way on to what pictures leave of it (E39).
+        is_fixed = self.is_kept | self._is_held(prior, right)
+        begin = self._within(prior + BEGIN * (self._precondition(right, is_fixed) - prior))
         # What is lacking there: both parts of the data in one adjoint.
         changes, disturbed = self.curvature.tangents(begin), self._disturbances(generator)
         weights = self.curvature.weights
@@ -128,15 +146,6 @@ class Posterior:
     def product(self, vector: Tensor) -> Tensor:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
-
-    def _begin(self, prior: Tensor, right: Tensor) -> Tensor:
-        """Where a sample begins: from the draw `prior` on towards what pictures leave of it (E39).
-
-        `right` is what it came of.
-        """
-        is_fixed = self.is_kept | self._is_held(prior, right)
-        left = self._precondition(right, is_fixed)
-        return self._within(prior + BEGIN * (left - prior))
 
     def _is_held(self, change: Tensor, residual: Tensor) -> Tensor:
         """Which entries are at a bound that `residual` presses them against."""
@@ -206,18 +215,10 @@ class Posterior:
             self._rough_product, precondition, fields, PRECONDITION, INNER
         ).value.masked_fill(is_out, 0)
         at = self.is_number
-        if self.numbers:
+        if len(self.between):
             gauge = None if self.gauge is None else self.gauge[at]
-            held = self.between + self._held_numbers()
-            ready[at] = solve_numbers_within(held, free[at], is_fixed[at], gauge)
+            ready[at] = solve_numbers_within(self.between, free[at], is_fixed[at], gauge)
         return self._without_gauge(ready)
-
-    def _held_numbers(self) -> Tensor:
-        """How single numbers are held but by pictures, [k, k]."""
-        parts = [(self.prior.held[name].double().cpu(), n) for name, n in self.numbers.items()]
-        return torch.block_diag(
-            *(held if held.ndim == 2 else held * torch.eye(n) for held, n in parts)
-        ).double()
 
     def _rough_product(self, vector: Tensor) -> Tensor:
         """About H times `vector`: J^T W J by its `information`."""
@@ -232,10 +233,6 @@ class Posterior:
         free = int((~is_fixed).sum())
         return (max(float(residual @ ready), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
-    def _solve_prior(self, right: Tensor) -> Tensor:
-        """The draw from the prior whose disturbance is `right`."""
-        return self._without_gauge(self.prior.solve(right, self.is_kept))
-
     def _within(self, change: Tensor) -> Tensor:
         """`change`, cut where a bound is."""
         return torch.maximum(torch.minimum(change, self.high), self.low)
@@ -249,24 +246,6 @@ class Posterior:
 def generator_of(seed: int, number: int) -> torch.Generator:
     """What draws the numbers of sample `number` >= 0, or those `PROBED`."""
     return torch.Generator().manual_seed((seed % 2**31) * 1_000_003 + number + 2)
-
-
-def find_bounds(curvature: Curvature) -> tuple[Tensor, Tensor]:
-    """The lowest and the highest value of every entry, [n] each."""
-    values, parameters = curvature.values, curvature.parameters
-    low = {p.name: torch.full_like(values[p.name], p.low) for p in parameters}
-    high = {p.name: torch.full_like(values[p.name], p.high) for p in parameters}
-    return curvature.join(low), curvature.join(high)
-
-
-def find_kept(curvature: Curvature) -> Tensor:
-    """Which entries stay as they are, [n]: cells outside of a field's support."""
-    kept = {
-        p.name: (p.support == 0).expand(p.value.shape).to(p.value)
-        for p in curvature.parameters
-        if p.support is not None
-    }
-    return curvature.join(kept) > 0
 
 
 def find_gauge(curvature: Curvature) -> Tensor | None:

@@ -69,32 +69,25 @@ class Prior:
         tolerance: float = SOLVE,
     ) -> Tensor:
         """(R + T K + diag(`more`))^-1 times `right`, with 0 where `is_fixed`."""
-        rights = self.curvature.split(right)
-        # Levels of smoothed fields are held so weakly that a draw needs more digits than a step.
-        has_more_digits = more is None
-        nothing: dict[str, Tensor] = {}
-        fixed = nothing if is_fixed is None else self.curvature.split(is_fixed)
-        added = nothing if more is None else self.curvature.split(more)
+        fixed = torch.zeros_like(right).bool() if is_fixed is None else is_fixed
+        is_fixed_of = self.curvature.split(fixed)
+        added = self.curvature.split(torch.zeros_like(right) if more is None else more)
         parts = {}
-        for name, part in rights.items():
-            held, more_here, fixed_here = self.held[name], added.get(name), fixed.get(name)
-            roughness = self.curvature.roughness.get(name)
-            if fixed_here is not None:
-                part = part.masked_fill(fixed_here, 0)
+        for name, part in self.curvature.split(right).items():
+            held, roughness = self.held[name], self.curvature.roughness.get(name)
+            part = part.masked_fill(is_fixed_of[name], 0)
             if held.ndim == 2:
-                matrix = held if more_here is None else held + more_here.diag()
-                solved = torch.linalg.solve(matrix, part)
+                solved = torch.linalg.solve(held + added[name].diag(), part)
+            elif roughness is None:
+                solved = part / (held + added[name])
             else:
-                diagonal = held if more_here is None else held + more_here
-                if roughness is None:
-                    solved = part / diagonal
-                else:
-                    if has_more_digits:
-                        roughness, diagonal = roughness.double(), diagonal.double()
-                    exact = part.to(roughness.stiffness)
-                    solved = _solve_field(roughness, diagonal, exact, fixed_here, tolerance)
-                    solved = solved.to(part)
-            parts[name] = solved if fixed_here is None else solved.masked_fill(fixed_here, 0)
+                diagonal = held + added[name]
+                # Levels of smoothed fields are held so weakly that a draw needs more digits.
+                if more is None:
+                    roughness, diagonal = roughness.double(), diagonal.double()
+                exact = part.to(roughness.stiffness)
+                solved = _solve_field(roughness, diagonal, exact, is_fixed_of[name], tolerance)
+            parts[name] = solved.to(part).masked_fill(is_fixed_of[name], 0)
         return self.curvature.join(parts)
 
     def without_levels(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
@@ -142,7 +135,7 @@ def _times(held: Tensor, part: Tensor) -> Tensor:
 
 
 def _solve_field(
-    roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor | None, tolerance: float
+    roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor, tolerance: float
 ) -> Tensor:
     """(R + `diagonal`)^-1 `right` of a field, with 0 in cells that are fixed, by multigrid."""
     colors, size = right.reshape(-1, *right.shape[-3:]), float(right.abs().max())
@@ -153,14 +146,11 @@ def _solve_field(
     roughness, diagonal, colors = roughness.times(1 / unit), diagonal / unit, colors / size
     # No level is held so weakly that it is lost in rounding.
     diagonal = diagonal.clamp(min=10 * torch.finfo(right.dtype).eps)
+    # Cells that are fixed lose so much that nothing is left in them.
+    strong = 1e4 * (roughness.diagonal().max() + diagonal.max())
+    loss = torch.where(is_fixed, strong, diagonal)
     # R has the form of the diffusion operator: stiffness is conductance between cells.
-    conductances = roughness.conductances()
-    loss = diagonal.expand(right.shape)
-    if is_fixed is not None:
-        # Cells that are fixed lose so much that nothing is left in them.
-        strong = 1e4 * (roughness.diagonal().max() + diagonal.max())
-        loss = torch.where(is_fixed, strong, loss)
-    z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in conductances)
+    z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in roughness.conductances())
     operator = Operator((z, y, x), loss.reshape(colors.shape).contiguous())
     solved = SOLVERS["multigrid"](operator, colors, None, tolerance).value.view(right.shape)
     return solved * (size / unit)

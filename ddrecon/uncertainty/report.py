@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +13,24 @@ from ddrecon.report.error_bar import draw_error_bar
 from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
-from ddrecon.uncertainty.samples import Uncertainty
 
 STRONG = 0.5
 """Correlations above this are told of."""
 
 
-def write_uncertainty_report(path: Path, found: Uncertainty, record: Mapping[str, Any]) -> None:
-    """Writes the page about what was `found`, which `record` has in numbers."""
-    means, deviations, told = found.means, found.deviations, found.told
+def write_uncertainty_report(
+    path: Path, stated: Mapping[str, Mapping[str, Tensor]], record: Mapping[str, Any]
+) -> None:
+    """Writes the page about the fields `stated` by kind and name, and what `record` has of them."""
     sections = [
         section(
             name.capitalize(),
-            *_field(name, means[name], deviations[name], told[name], record["fields"][name]),
+            *_field(name, {kind: values[name] for kind, values in stated.items()}, numbers),
         )
-        for name in record["fields"]
+        for name, numbers in record["fields"].items()
     ]
     if record["numbers"]:
         sections.append(section("Numbers", *_numbers(record)))
-    if record["next_views"]:
-        sections.append(section("Next picture", *_next_views(record)))
     sections.append(section("How", *_how(record)))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
     write_page(path, title, _lead(record), sections, is_alive=False)
@@ -47,16 +45,13 @@ def _lead(record: Mapping[str, Any]) -> str:
     )
 
 
-def _field(
-    name: str, mean: Tensor, deviation: Tensor, told: Tensor, numbers: Mapping[str, float]
-) -> list[str]:
+def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]) -> list[str]:
     """Slices of a field."""
-    white = find_white_value(mean)
-    strongest = find_white_value(deviation)
+    white, strongest = (find_white_value(stated[kind]) for kind in ("mean", "std"))
     pictures = [
-        (mean, white, f"{name}, mean of the samples: white is {white:.3g}"),
-        (deviation, strongest, f"standard deviation: white is {strongest:.3g}"),
-        (told, 1.0, "told by pictures: black is nothing, white is all"),
+        (stated["mean"], white, f"{name}, mean of the samples: white is {white:.3g}"),
+        (stated["std"], strongest, f"standard deviation: white is {strongest:.3g}"),
+        (stated["told"], 1.0, "told by pictures: black is nothing, white is all"),
     ]
     shown = "".join(
         picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
@@ -100,53 +95,9 @@ def _numbers(record: Mapping[str, Any]) -> list[str]:
     return parts
 
 
-def _next_views(record: Mapping[str, Any]) -> list[str]:
-    """The table of pictures that would tell most."""
-    views = record["next_views"]
-    has_lights = any(view["light_directions"] for view in views)
-    rows = [
-        (
-            view["name"],
-            f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %",
-            _vector([row[3] for row in view["matrix"][:3]]),
-            "; ".join(_vector(way) for way in view["light_directions"]),
-        )[: 4 if has_lights else 3]
-        for view in views
-    ]
-    head = ["picture", "of the variance, at least", "camera at x, y, z", "light travels along"]
-    return [
-        paragraph(
-            "How much of the variance of all cells each of these pictures would take away at least,"
-            " if it errs as the others do. Matrices of cameras are in uncertainty.json."
-        ),
-        table(head[: 4 if has_lights else 3], rows),
-    ]
-
-
-def _vector(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)
-
-
 def _how(record: Mapping[str, Any]) -> list[str]:
     """What stands behind the numbers."""
-    count = record["samples"]
-    error = 100 / max(2 * (count - 1), 1) ** 0.5
-    return [
-        paragraph(
-            f"A deviation from {count} samples is itself off by about {error:.0f} %."
-            " Told is the part of a cell's variance that pictures took away from what smoothing"
-            " alone leaves open, in the mean of the cells around."
-        ),
-        paragraph(
-            "All this is about the optimum that was found, for pictures that err by noise alone:"
-            " what the model of light lacks is not in it."
-        ),
-        table(["pictures", ""], _noise(record["noise"])),
-    ]
-
-
-def _noise(noise: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is known of how pictures err, and of what they tell."""
+    noise, error = record["noise"], 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
     rows = [
         ("deviation of a pixel, in radiance", f"{noise['deviation']:.3g}"),
         ("known from", str(noise["from"])),
@@ -154,4 +105,15 @@ def _noise(noise: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
     if noise["told"] is not None:
         rows.append(("of these spent on telling the volume", f"{noise['told']:.0f}"))
-    return rows
+    return [
+        paragraph(
+            f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
+            " Told is the part of a cell's variance that pictures took away from what smoothing"
+            " alone leaves open, in the mean of the cells around."
+        ),
+        paragraph(
+            "All this is about the optimum that was found, for pictures that err by noise alone:"
+            " what the model of light lacks is not in it."
+        ),
+        table(["pictures", ""], rows),
+    ]

@@ -45,11 +45,16 @@ class Uncertainty:
         tolerance: float | None = None,
         errors: PictureErrors | None = None,
     ):
+        train, targets, power = run.level.train, run.level.targets, run.problem.power
         self.parameters = run.parameters
-        self.curvature = curvature_of(run)
-        gradient = gradient_of(run, self.curvature)
-        targets = run.level.targets
-        known = know_errors(self.curvature, targets, _noises(run, noise))
+        self.curvature = Curvature(train, run.parameters, targets, power, run.memory.last)
+        values = {parameter.name: parameter.value for parameter in run.parameters}
+        compared, memory = Comparison(train.views, targets), self.curvature.new_memory()
+        objective = differentiate(train, list(targets), values, compared, memory)
+        gradient = self.curvature.join(add_penalties(objective, run.parameters, power)[1])
+        said = {view.name: noise or given_noise(view, run.problem.settings) for view in train.views}
+        noises = {name: noise for name, noise in said.items() if noise is not None}
+        known = know_errors(self.curvature, targets, noises)
         information = Information(self.curvature, generator_of(seed, PROBED))
         # What residuals said takes a solve to find: a run that goes on has it.
         self.errors = (
@@ -109,21 +114,20 @@ class Uncertainty:
             for name, part in before.items()
         }
 
-    def number_names(self) -> list[str]:
-        """The names of the entries of all parameters that are no fields, in their order."""
-        names = []
+    def described_numbers(self) -> dict[str, dict[str, float]]:
+        """The value at the optimum and the deviation of each entry of what is `tabled`, by name."""
+        names = list[str]()
         for parameter in self.tabled:
-            value = parameter.value
-            parts = component_names(parameter.name, value) if value.ndim else ()
+            name, value = parameter.name, parameter.value
+            parts = component_names(name, value) if value.ndim else ()
             parts = parts or tuple(str(i) for i in range(value.numel()))
-            one = [parameter.name]
-            names += one if value.numel() == 1 else [f"{parameter.name}.{part}" for part in parts]
-        return names
-
-    def number_values(self) -> Tensor:
-        """Their values at the optimum."""
-        values = {name: value.cpu().double() for name, value in self.curvature.values.items()}
-        return self._numbers_in(self.curvature.join(values))
+            names += [name] if value.numel() == 1 else [f"{name}.{part}" for part in parts]
+        values = self._numbers_in(self.curvature.join(self.curvature.values)).double().tolist()
+        deviations = self._numbers_in(self._variance("post").sqrt()).tolist()
+        return {
+            name: {"value": value, "deviation": deviation}
+            for name, value, deviation in zip(names, values, deviations, strict=True)
+        }
 
     def correlations(self) -> Tensor:
         """The correlation [m, m] of each of them with each other."""
@@ -131,10 +135,6 @@ class Uncertainty:
         centered = numbers - numbers.mean(0)
         size = centered.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
         return (centered / size).T @ (centered / size)
-
-    def number_deviations(self) -> Tensor:
-        """Their standard deviations."""
-        return self._numbers_in(self._variance("post").sqrt())
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
@@ -167,26 +167,3 @@ class Uncertainty:
         parts = self.curvature.split(vector)
         tabled = [parts[parameter.name].flatten() for parameter in self.tabled]
         return torch.cat(tabled) if tabled else vector[:0]
-
-
-def curvature_of(run: Reconstruction) -> Curvature:
-    """The curvature of the objective of `run` where it is."""
-    level, memory = run.level.train, run.memory
-    return Curvature(level, run.parameters, run.level.targets, run.problem.power, memory.last)
-
-
-def gradient_of(run: Reconstruction, curvature: Curvature) -> Tensor:
-    """The derivative of the objective of `run`, of all its training views, where it is."""
-    views = list(run.level.train.views)
-    compared = Comparison(views, run.level.targets)
-    names = [view.name for view in views]
-    values = {parameter.name: parameter.value for parameter in run.parameters}
-    objective = differentiate(run.level.train, names, values, compared, curvature.new_memory())
-    return curvature.join(add_penalties(objective, run.parameters, run.problem.power)[1])
-
-
-def _noises(run: Reconstruction, noise: Noise | None) -> dict[str, Noise]:
-    """The noise of training pictures by name, as `noise` or their scene says."""
-    settings, views = run.problem.settings, run.level.train.views
-    found = {view.name: noise or given_noise(view, settings) for view in views}
-    return {name: said for name, said in found.items() if said is not None}

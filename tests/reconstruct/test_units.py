@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from ddrecon.uncertainty.next_view import NextView, shots_around
 from media import make_camera, make_scene, random_values
 from torch import Tensor
 
@@ -18,7 +19,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.next_view import NextView, shots_around
 from ddrecon.uncertainty.samples import Uncertainty
 
 EYES = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}

@@ -8,7 +8,7 @@ from weakref import WeakSet
 
 import pytest
 import torch
-from media import half_empty, make_scene
+from media import half_empty, make_scene, render_tangent
 from torch import Tensor
 from torch.nn.functional import interpolate
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -20,7 +20,6 @@ from ddrecon.light.reduced import reduced_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
-from ddrecon.variables.tangents import render_tangent
 
 WHITE = {"sigma_a": (0.0,), "sigma_s": (10.0,)}
 
