@@ -6,8 +6,8 @@ from typing import Any
 
 from ddrecon.engine import name_engines
 from ddrecon.memory import gibibytes, memory_of, needs_of
-from ddrecon.reconstruct.setup import select_views, start_support
-from ddrecon.reconstruct.support import describe_support, support_text
+from ddrecon.reconstruct.setup import select_views
+from ddrecon.reconstruct.support import describe_support, find_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.doubts import find_doubts
@@ -93,7 +93,7 @@ def _describe_support(scene: Scene) -> dict[str, float] | None:
     if scene.optimize is None:
         return None
     train = select_views(scene, is_test=False)
-    support = start_support(train, scene.optimize)
+    support = find_support(train, scene.optimize)
     return describe_support(support, scene.volume.grid)
 
 

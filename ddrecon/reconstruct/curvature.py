@@ -84,10 +84,6 @@ class Curvature:
         named = zip(self.values.items(), parts, strict=True)
         return {name: part.view(value.shape) for (name, value), part in named}
 
-    def product(self, vector: Tensor) -> Tensor:
-        """(J^T W J + R) times `vector`."""
-        return self.data_product(vector) + self.penalty_product(vector)
-
     def data_product(self, vector: Tensor) -> Tensor:
         """J^T W J times `vector`."""
         changes = self.tangents(vector)

@@ -95,7 +95,7 @@ class Parameter:
         if current_engine() == "warp":
             from ddrecon.reconstruct.fused.passes import step_adam
 
-            many = self.moments, keep, self.steps, rate, smallest, keep[0], (self.low, self.high)
+            many = self.moments, self.steps, rate, smallest, (self.low, self.high)
             value, self.moments = step_adam(before, gradient, *many)
         else:
             first = self.moments[0].lerp(gradient, 1 - keep[0])

@@ -45,10 +45,6 @@ class Roughness:
         """That of `factor` times the weight."""
         return Roughness(self.grid, factor * self.stiffness)
 
-    def double(self) -> Roughness:
-        """The same in float64."""
-        return Roughness(self.grid, self.stiffness.double())
-
     def product(self, change: Tensor) -> Tensor:
         """R times `change` [..., z, y, x]."""
         return join_slopes([self.stiffness * s for s in slopes(change, self.grid)], self.grid)

@@ -56,7 +56,7 @@ class Problem:
         noises = known_noises(views, settings, loss)
         powers = [target.power for target in targets_of(train, loss, noises).values()]
         power = float(torch.stack(powers).mean())
-        support = start_support(train, settings)
+        support = find_support(train, settings)
         levels = factors(scene, settings.refine_at)
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 
@@ -230,15 +230,3 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         for parameter in parameters:
             parameter.release = 0.0
     return parameters
-
-
-def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
-    """Where density may be, by the views of `train`; None is anywhere.
-
-    Raises SceneError where that is nowhere.
-    """
-    density = settings.parameters.get("density")
-    support = None if density is None else find_support(train.views, density)
-    if support is not None:
-        support.on(train.volume.grid)
-    return support

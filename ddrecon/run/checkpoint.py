@@ -11,7 +11,7 @@ import json
 import os
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,33 +136,29 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def differences(old: Any, new: Any, key: str = "") -> list[str]:
+def differences(old: Any, new: Any) -> list[str]:
     """The differences between two trees of mappings, lists and plain values, a text for each.
 
-    A text reads `key.path is A there, B now`; `key` is where both trees stand.
+    A text reads `key.path is A there, B now`.
     """
-    one, other = _entries(old), _entries(new)
-    if one is None or other is None:
-        return [f"{key} is {_shorten(old)} there, {_shorten(new)} now"] if old != new else []
+    one, other = dict(_leaves(old)), dict(_leaves(new))
+    pairs = {key: (one.get(key, ABSENT), other.get(key, ABSENT)) for key in [*one, *other]}
     return [
-        text
-        for name in dict.fromkeys([*one, *other])
-        for text in differences(
-            one.get(name, ABSENT), other.get(name, ABSENT), f"{key}.{name}" if key else str(name)
-        )
+        f"{key} is {_shorten(there)} there, {_shorten(now)} now"
+        for key, (there, now) in pairs.items()
+        if there != now
     ]
 
 
-def _entries(value: Any) -> Mapping[Any, Any] | None:
-    """The children of `value` by name or number; None if it has none.
-
-    A list of numbers counts as one value, and is shown whole.
-    """
-    if isinstance(value, Mapping):
-        return value
-    if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
-        return dict(enumerate(value))
-    return None
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """The plain values of a `tree`, each after its path; a list of numbers counts as one value."""
+    if isinstance(tree, list) and any(isinstance(entry, Mapping) for entry in tree):
+        tree = dict(enumerate(tree))
+    if not isinstance(tree, Mapping):
+        yield path, tree
+        return
+    for name, child in tree.items():
+        yield from _leaves(child, f"{path}.{name}" if path else str(name))
 
 
 def _shorten(value: Any) -> str:

@@ -23,7 +23,7 @@ from ddrecon.scene_file.build_volume import build_volume
 from ddrecon.scene_file.choices import choose_rounds, share_colors
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
-from ddrecon.variables.wildcards import name_each
+from ddrecon.variables.values import name_each
 
 
 def load_scene(

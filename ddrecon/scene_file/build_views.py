@@ -110,7 +110,6 @@ def _build_view(
     )
     if section.background is not None and not isinstance(section.background, Path):
         background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
-    noise = section.noise
 
     def color(value: Color, default: float) -> Tensor | None:
         """[1] or [3], None where it is the default."""
@@ -128,7 +127,7 @@ def _build_view(
         color(section.offset, 0.0),
         background,
         step,
-        None if noise is None else Noise(noise.read, noise.shot, step),
+        None if section.noise is None else Noise(section.noise.read, section.noise.shot, step),
     )
 
 

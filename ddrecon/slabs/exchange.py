@@ -29,7 +29,7 @@ from ddrecon.slabs.slab import Slab
 def add_halo(own: Tensor, slab: Slab) -> Tensor:
     """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E40)."""
     field: Tensor = _Exchange.apply(
-        lambda own: with_halo(own, slab), lambda field_bar: return_halo(field_bar, slab), own
+        lambda own: _with_halo(own, slab), lambda field_bar: _return_halo(field_bar, slab), own
     )
     return field
 
@@ -118,29 +118,36 @@ class _Exchange(torch.autograd.Function):
         return ctx.give(*changes)
 
 
-def return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
-    """The transpose of `with_halo`: own cells' cotangents, with those that neighbors found."""
-    axis, (below, above), size = slab.axis - 3, slab.halo, slab.size
-    own_bar = slab.own(field_bar).clone()
-    lent = swap_with_neighbors(
-        field_bar.narrow(axis, 0, below) if below else None,
-        field_bar.narrow(axis, below + size, above) if above else None,
+def swap_ends(field: Tensor, axis: int, layers: tuple[int, int]) -> list[Tensor | None]:
+    """What the ranks below and above have for this one, who get the ends of `field` along `axis`.
+
+    That are its first and its last `layers`, as many as those have for it; 0 where no rank is.
+    """
+    below, above = layers
+    got = swap_with_neighbors(
+        field.narrow(axis, 0, below) if below else None,
+        field.narrow(axis, field.shape[axis] - above, above) if above else None,
     )
+    return list(got)
+
+
+def _return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
+    """The transpose of `_with_halo`: own cells' cotangents, with those that neighbors found."""
+    axis, (below, above) = slab.axis - 3, slab.halo
+    own_bar = slab.own(field_bar).clone()
+    lent = swap_ends(field_bar, axis, slab.halo)
     if lent[0] is not None:
         own_bar.narrow(axis, 0, below).add_(lent[0])
     if lent[1] is not None:
-        own_bar.narrow(axis, size - above, above).add_(lent[1])
+        own_bar.narrow(axis, slab.size - above, above).add_(lent[1])
     return own_bar
 
 
-def with_halo(own: Tensor, slab: Slab) -> Tensor:
+def _with_halo(own: Tensor, slab: Slab) -> Tensor:
     """`own` cells [..., z, y, x] with those of neighbors, without derivatives."""
-    axis, (below, above) = slab.axis - 3, slab.halo
-    got = swap_with_neighbors(
-        own.narrow(axis, 0, below) if below else None,
-        own.narrow(axis, own.shape[axis] - above, above) if above else None,
-    )
-    return torch.cat([part for part in (got[0], own, got[1]) if part is not None], axis)
+    axis = slab.axis - 3
+    below, above = swap_ends(own, axis, slab.halo)
+    return torch.cat([part for part in (below, own, above) if part is not None], axis)
 
 
 def _gather(own: Tensor, axis: int, sizes: list[int], rank: int) -> Tensor:

@@ -84,7 +84,8 @@ class Prior:
                 diagonal = held + added[name]
                 # Levels of smoothed fields are held so weakly that a draw needs more digits.
                 if more is None:
-                    roughness, diagonal = roughness.double(), diagonal.double()
+                    stiffness = roughness.stiffness.double()
+                    roughness, diagonal = Roughness(roughness.grid, stiffness), diagonal.double()
                 exact = part.to(roughness.stiffness)
                 solved = _solve_field(roughness, diagonal, exact, is_fixed_of[name], tolerance)
             parts[name] = solved.to(part).masked_fill(is_fixed_of[name], 0)

@@ -8,9 +8,10 @@ lead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,14 +27,20 @@ from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
+    STEEPEST_G,
+    XYZ,
     is_of_volume,
     kind_of,
     split_name,
 )
-from ddrecon.variables.legal import require_form, require_range
 
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
 """What a camera does to radiance, and what it is where a view has none (E28)."""
+
+
+EVERY = "views.*."
+"""How names for all training views at once begin: `views.*.exposure`."""
+Settings = TypeVar("Settings")
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -128,6 +135,75 @@ def require_legal(scene: Scene, *, waits: bool = False) -> None:
             require_range(name, value)
 
 
+def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict[str, Settings]:
+    """`parameters` with each name of all training views replaced by those of each of `views`.
+
+    These are the views to train on that have an image. What a view's own name says wins.
+    """
+    train = [view.name for view in views if view.image is not None and not view.is_test]
+    named: dict[str, Settings] = {}
+    for name, settings in parameters.items():
+        if not name.startswith(EVERY):
+            named[name] = settings
+            continue
+        key = name.removeprefix(EVERY)
+        for owner in (f"views.{view}.{key}" for view in train):
+            named[owner] = parameters.get(owner, settings)
+    return named
+
+
+def require_form(
+    name: str, value: Tensor, now: Tensor, like: Tensor, cells: tuple[int, ...]
+) -> None:
+    """Raises UsageError unless `value` can be the variable `name`, which is `now`, on `cells`.
+
+    Its precision and device are to be those of `like`. Nothing is read from a GPU.
+    """
+    if not isinstance(value, Tensor):
+        raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
+    if (value.dtype, value.device) != (like.dtype, like.device):
+        raise UsageError(
+            f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
+            f"{like.device}; convert it by .to(...)"
+        )
+    shapes = _shapes(name, tuple(now.shape), cells)
+    if tuple(value.shape) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        raise UsageError(f"{name}: has shape {list(value.shape)}; expected {expected}")
+
+
+def require_range(name: str, value: Tensor) -> None:
+    """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
+    kind = kind_of(name)
+    least, most = (float(end) for end in value.detach().aminmax())
+    found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
+    if not math.isfinite(least + most):
+        raise UsageError(f"{name}: must be finite, {found}")
+    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
+        # A scene may scatter further forward than a run makes it.
+        raise UsageError(f"{name}: must be above -1 and below 1, {found}")
+    if kind.low == 0 and not 0 <= least <= most <= kind.high:
+        bounds = "at least 0" if kind.high == math.inf else f"from 0 to {kind.high:g}"
+        raise UsageError(f"{name}: must be {bounds}, {found}")
+    if kind.is_direction and least == most == 0:
+        raise UsageError(f"{name}: must not be zero")
+
+
+def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Those that the variable `name` may have in place of the one it has `now`."""
+    kind, last = kind_of(name), split_name(name)[1]
+    if last == "density":
+        return [cells]
+    if last.startswith(PHASE):
+        return [now, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
+    if kind.is_color:
+        tails = [(), cells] if kind.is_cellwise else [now[1:]]
+        return [(color, *tail) for tail in tails for color in (1, 3)]
+    if kind.is_cellwise:
+        return [(), cells, (1, *cells)]
+    return [(3,)] if kind.components == XYZ else [now]
+
+
 def _unknown(scene: Scene, name: str) -> UsageError:
     names = [known for known in variable_names(scene) if not known.startswith("views.")]
     return UsageError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
@@ -187,11 +263,7 @@ def _own_name(volume: Volume, name: str) -> str:
     medium, last = split_name(name)
     if last != f"{PHASE}g":
         return name
-    part = (
-        volume
-        if volume.media is None
-        else volume.media.get(medium.removeprefix("media.").strip("."), volume)
-    )
+    part = (volume.media or {}).get(medium.removeprefix("media.").strip("."), volume)
     return f"{medium}g" if isinstance(part.phase, HenyeyGreenstein) else name
 
 
@@ -215,8 +287,16 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if volume.media is not None:
         return mix_media(
             {
-                medium: _replace_volume(part, _values_of(f"media.{medium}.", values))
+                medium: _replace_volume(
+                    part,
+                    {
+                        name.removeprefix(owner): value
+                        for name, value in values.items()
+                        if name.startswith(owner)
+                    },
+                )
                 for medium, part in volume.media.items()
+                for owner in [f"media.{medium}."]
             }
         )
     density, cells = values.get("density"), volume.grid.shape
@@ -242,15 +322,6 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         )
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
-
-
-def _values_of(medium: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those of `values` that are of one `medium`, by what they are called in it."""
-    return {
-        name.removeprefix(medium): value
-        for name, value in values.items()
-        if name.startswith(medium)
-    }
 
 
 def _replace_light(light: Light, name: str, values: Mapping[str, Tensor], scene: Scene) -> Light:

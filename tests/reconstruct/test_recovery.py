@@ -121,12 +121,13 @@ STARTS: dict[str, Tensor] = {
 def test_a_number_alone_comes_back(name: str) -> None:
     scene = photographed(scene_of(cloud(12), 3, 16))
     truth, start = value_of(scene, name), STARTS[name]
-    found = value_of(recovered(scene, {name: start}, 40), name)
+    result = recovered(scene, {name: start}, 40)
+    found = value_of(result, name)
     if name.endswith(".direction"):
         found = found * (truth.norm() / found.norm())
     if name.endswith(".camera"):
         # A twist is about the camera as it is: what is left of it.
-        truth, found = pose_of(scene), pose_of(recovered(scene, {name: start}, 40))
+        truth, found = pose_of(scene), pose_of(result)
         start = pose_of(with_values(scene, {name: start}))
     assert float((found - truth).norm()) < 0.01 * float((start - truth).norm())
 

@@ -4,7 +4,7 @@ import torch
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.scene import View
-from ddrecon.variables.wildcards import name_each
+from ddrecon.variables.values import name_each
 
 
 def view(name: str, is_test: bool = False, has_image: bool = True) -> View:
