@@ -23,7 +23,6 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.leftovers import remove_run
 from ddrecon.run.quality import describe_loss, find_results, loss_text
-from ddrecon.run.report_volume import turntable_images
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
@@ -104,8 +103,7 @@ def follow_run(
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
     if cells_are_shared():
-        found = find_results(run)
-        turntable_images(found.scene, found.light_field)
+        find_results(run)
     return run
 
 

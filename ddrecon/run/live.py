@@ -25,8 +25,7 @@ from ddrecon.report.page import page_text, section, side_by_side
 from ddrecon.run.checkpoint import newest_checkpoint
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import find_results
-from ddrecon.run.report import curves, view_section
-from ddrecon.run.report_volume import volume_section
+from ddrecon.run.report import curves, view_section, volume_section
 from ddrecon.run.run_folder import load_run, require_run
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import AUTO, Iterations

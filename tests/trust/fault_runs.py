@@ -26,9 +26,8 @@ import torch
 from tiny_scene import write_scene
 
 from ddrecon.cli.commands import main
-from ddrecon.run import report_volume, run_folder
+from ddrecon.run import run_folder
 
-report_volume.FRAMES = 2
 SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
 """What click says of an interrupt before the command has begun."""

@@ -41,11 +41,6 @@ def webp_of(image: np.ndarray) -> bytes:
     return encode(image, ".webp", lossless=True, quality=90, method=4)
 
 
-def moving_webp_of(frames: np.ndarray) -> bytes:
-    """`frames` as moving WebP that goes on for ever: far smaller than PNG."""
-    return encode(frames, ".webp", quality=QUALITY, **_timing(frames))
-
-
 def write_animation(path: Path, frames: np.ndarray) -> None:
     """Writes `frames` as an animated PNG that goes on for ever to `path`."""
     with replace_file(path) as temporary:
