@@ -20,9 +20,8 @@ from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoi
 from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.uncertainty.folder import write_found, write_sample
-from ddrecon.uncertainty.picture_errors import PictureErrors
 from ddrecon.uncertainty.posterior import Sample
-from ddrecon.uncertainty.samples import Uncertainty
+from ddrecon.uncertainty.samples import PictureErrors, Uncertainty
 
 
 @dataclass(frozen=True)

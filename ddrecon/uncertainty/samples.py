@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ddrecon.losses import Target
 from ddrecon.numerics.around import mean_around
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
@@ -17,7 +19,6 @@ from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.uncertainty.information import Information
-from ddrecon.uncertainty.picture_errors import PictureErrors, find_errors, know_errors
 from ddrecon.uncertainty.posterior import (
     NUMBERS,
     PROBED,
@@ -27,6 +28,29 @@ from ddrecon.uncertainty.posterior import (
     generator_of,
 )
 from ddrecon.variables.values import component_names
+
+LEAST_LEFT = 0.1
+"""At least this part of all numbers is taken for noise: a run that fits all else shows none."""
+
+
+@dataclass(frozen=True)
+class PictureErrors:
+    """How much pictures err. `temperature` is the objective's unit of it (E33).
+
+    `deviation` [radiance] is the root mean square error of a number of a picture, `count` how many
+    independent ones there are. `told` is how many numbers they tell, None where that was not needed
+    since the noise is `known`.
+    """
+
+    temperature: float
+    deviation: float
+    count: int
+    told: float | None
+    is_known: bool
+
+    def described(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**vars(self), "from": "the scene" if self.is_known else "residuals"}
 
 
 class Uncertainty:
@@ -54,12 +78,16 @@ class Uncertainty:
         gradient = self.curvature.join(add_penalties(objective, run.parameters, power)[1])
         said = {view.name: noise or given_noise(view, run.problem.settings) for view in train.views}
         noises = {name: noise for name, noise in said.items() if noise is not None}
-        known = know_errors(self.curvature, targets, noises)
+        measured = measure_errors(self.curvature, targets, noises)
         information = Information(self.curvature, generator_of(seed, PROBED))
-        # What residuals said takes a solve to find: a run that goes on has it.
-        self.errors = (
-            known or errors or find_errors(self.curvature, targets, gradient, seed, information)
-        )
+        if errors is None and not measured.is_known:
+            # What pictures told takes a solve to find: a run that goes on has it.
+            rough, count = measured.temperature, measured.count
+            about = Posterior(self.curvature, gradient, rough, seed, information=information)
+            told = about.count_told()
+            left = max(count - told, LEAST_LEFT * count)
+            measured = replace(measured, temperature=rough * count / left, told=told)
+        self.errors = errors or measured
         if tolerance is None:
             tolerance = NUMBERS if self.tabled else TOLERANCE
         temperature = self.errors.temperature
@@ -167,3 +195,30 @@ class Uncertainty:
         parts = self.curvature.split(vector)
         tabled = [parts[parameter.name].flatten() for parameter in self.tabled]
         return torch.cat(tabled) if tabled else vector[:0]
+
+
+def measure_errors(
+    curvature: Curvature, targets: Mapping[str, Target], noises: Mapping[str, Noise]
+) -> PictureErrors:
+    """How much the pictures `targets` of the views of `curvature` err, if they told nothing.
+
+    By their `noises`, if all have them: the weights of `curvature` are then those of this noise.
+    Else by what is left at the optimum.
+    """
+    weights, is_known = curvature.weights, noises.keys() >= curvature.weights.keys()
+    off = {
+        name: noises[name].deviation(t.image) if is_known else curvature.images[name] - t.image
+        for name, t in targets.items()
+    }
+    squares = {name: error**2 for name, error in off.items()}
+    seen = {name: (w > 0).expand_as(squares[name]) for name, w in weights.items()}
+    # Independent numbers: gray has one color.
+    is_gray = {name: bool((t.image == t.image[:1]).all()) for name, t in targets.items()}
+    count = sum(int(each.sum()) // (3 if is_gray[name] else 1) for name, each in seen.items())
+    temperature = sum(float((w * squares[name]).sum()) for name, w in weights.items()) / count
+    if is_known:
+        # Each pixel counts by its own noise, all together as the objective has them.
+        for name, weight in weights.items():
+            weights[name] = (weight > 0).to(weight) * temperature / squares[name]
+    mean = torch.cat([squares[name][each] for name, each in seen.items()]).mean()
+    return PictureErrors(temperature, float(mean.sqrt()), count, None, is_known)

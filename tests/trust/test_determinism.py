@@ -35,7 +35,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def cloud(
-    path: Path, dtype: torch.dtype = torch.float32, cells: str = "[16, 12, 14]", **settings: str
+    path: Path, dtype: torch.dtype = torch.float32, cells: str = "[12, 10, 9]", **settings: str
 ) -> Scene:
     """The tiny scene, not so tiny, with a lumpy density."""
     overrides = [
@@ -109,7 +109,7 @@ def test_same_seed_same_bits(path: Path) -> None:
 
 
 def test_the_number_of_threads_changes_nothing_much(path: Path) -> None:
-    scene = cloud(path, cells="[48, 40, 40]")
+    scene = cloud(path, cells="[24, 20, 20]")
     with threads(1):
         one = found(scene)
     with threads(2):
@@ -141,7 +141,7 @@ def test_the_size_of_chunks_changes_nothing_much(
 ) -> None:
     scene = cloud(path)
     whole = found(scene)
-    monkeypatch.setattr(march, "CHUNK_NODES", 300)
+    monkeypatch.setattr(march, "CHUNK_NODES", 100)
     assert distance(found(scene), whole) < EQUAL
 
 
