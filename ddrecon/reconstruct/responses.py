@@ -13,7 +13,7 @@ from torch import Tensor
 from ddrecon.losses import Target
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
-from ddrecon.variables.values import RESPONSE
+from ddrecon.variables.kinds import RESPONSE
 
 
 def fit_held_out(

@@ -35,14 +35,15 @@ from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, is_of_volume, kind_of, split_name
-from ddrecon.variables.values import (
+from ddrecon.variables.kinds import (
+    EXTINCTION_AND_ALBEDO,
+    PHASE,
     RESPONSE,
-    density_names,
-    fields_of,
-    value_of,
-    variable_names,
+    is_of_volume,
+    kind_of,
+    split_name,
 )
+from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
 """Where a run folder keeps its checkpoints."""

@@ -27,16 +27,13 @@ from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
+    RESPONSE,
     STEEPEST_G,
     XYZ,
     is_of_volume,
     kind_of,
     split_name,
 )
-
-RESPONSE = {"exposure": 1.0, "offset": 0.0}
-"""What a camera does to radiance, and what it is where a view has none (E28)."""
-
 
 EVERY = "views.*."
 """How names for all training views at once begin: `views.*.exposure`."""
