@@ -90,19 +90,15 @@ class LiveRun:
             self.maker.join()
 
     def _remake(self) -> None:
-        start = monotonic()
+        """Makes volume and views as the last checkpoint has them."""
+        start, path = monotonic(), self.folder / "scene.yaml"
         # What cannot be shown now may be with the next checkpoint.
         with suppress(DdreconError):
-            self.sections = self._make_sections()
+            run = load_run(self.folder, lambda dtype: load_scene(path, dtype=dtype))
+            self.iterations, found = run.problem.settings.iterations, find_results(run)
+            volume = section("Volume", volume_section(found, {}))
+            self.sections = [volume, section("Views", *view_section(found))]
         self.next_make = monotonic() + (monotonic() - start) * (1 / SHARE - 1)
-
-    def _make_sections(self) -> list[str]:
-        """Volume and views as the last checkpoint has them."""
-        path = self.folder / "scene.yaml"
-        run = load_run(self.folder, lambda dtype: load_scene(path, dtype=dtype))
-        self.iterations, found = run.problem.settings.iterations, find_results(run)
-        volume = section("Volume", volume_section(found, {}))
-        return [volume, section("Views", *view_section(found))]
 
 
 def _written(file: Path | None) -> int:
