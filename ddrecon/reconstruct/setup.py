@@ -18,8 +18,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
-from ddrecon.variables.default_rates import unit_of
-from ddrecon.variables.kinds import is_of_volume, kind_of
+from ddrecon.variables.kinds import is_of_volume, kind_of, unit_of
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 

@@ -21,9 +21,8 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
-from ddrecon.run.leftovers import remove_run
 from ddrecon.run.quality import describe_loss, find_results, loss_text
-from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
+from ddrecon.run.run_folder import CHECKPOINTS, RunFolder, remove_run
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import SceneFile

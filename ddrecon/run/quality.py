@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.pictures.scales import COMPARED, LINEAR
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.responses import fit_held_out
+from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.reconstruct.setup import choose_loss, targets_of
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene

@@ -17,8 +17,7 @@ from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoint
-from ddrecon.run.leftovers import remove_samples
-from ddrecon.run.run_folder import CHECKPOINTS
+from ddrecon.run.run_folder import CHECKPOINTS, remove_samples
 from ddrecon.uncertainty.folder import write_found, write_sample
 from ddrecon.uncertainty.posterior import Sample
 from ddrecon.uncertainty.samples import PictureErrors, Uncertainty

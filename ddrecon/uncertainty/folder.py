@@ -9,8 +9,12 @@ from typing import Any
 from torch import Tensor
 
 from ddrecon.io.files.json_file import write_json
+from ddrecon.io.images.table import png_of
+from ddrecon.report.error_bar import draw_error_bar
+from ddrecon.report.page import paragraph, picture, section, table, write_page
+from ddrecon.report.pictures import slices
+from ddrecon.report.volumes import find_white_value
 from ddrecon.run.run_folder import write_values
-from ddrecon.uncertainty.report import write_uncertainty_report
 from ddrecon.uncertainty.samples import Uncertainty
 from ddrecon.variables.kinds import kind_of
 
@@ -89,4 +93,109 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
             for name, number in record["numbers"].items()
         ),
         f"deviations and report written to {path}",
+    ]
+
+
+STRONG = 0.5
+"""Correlations above this are told of."""
+
+
+def write_uncertainty_report(
+    path: Path, stated: Mapping[str, Mapping[str, Tensor]], record: Mapping[str, Any]
+) -> None:
+    """Writes the page about the fields `stated` by kind and name, and what `record` has of them."""
+    sections = [
+        section(
+            name.capitalize(),
+            *_field(name, {kind: values[name] for kind, values in stated.items()}, numbers),
+        )
+        for name, numbers in record["fields"].items()
+    ]
+    if record["numbers"]:
+        sections.append(section("Numbers", *_numbers(record)))
+    sections.append(section("How", *_how(record)))
+    title = f"ddrecon: how sure {path.absolute().parent.name} is"
+    write_page(path, title, _lead(record), sections, is_alive=False)
+
+
+def _lead(record: Mapping[str, Any]) -> str:
+    noise = record["noise"]
+    source = "what the reconstruction leaves" if noise["told"] is not None else "the scene"
+    return (
+        f"{record['samples']} samples in {record['seconds']:.1f} s. "
+        f"Pictures err by {noise['deviation']:.3g} of radiance, by {source}."
+    )
+
+
+def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]) -> list[str]:
+    """Slices of a field."""
+    white, strongest = (find_white_value(stated[kind]) for kind in ("mean", "std"))
+    pictures = [
+        (stated["mean"], white, f"{name}, mean of the samples: white is {white:.3g}"),
+        (stated["std"], strongest, f"standard deviation: white is {strongest:.3g}"),
+        (stated["told"], 1.0, "told by pictures: black is nothing, white is all"),
+    ]
+    shown = "".join(
+        picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
+    )
+    return [
+        paragraph(
+            f"Deviation {numbers['deviation']:.3g} of {numbers['root_mean_square']:.3g} (root mean"
+            f" squares over all cells); {100 * numbers['told']:.0f} % told on average."
+            " Slices across z, x and y from left to right."
+        ),
+        f'<div class="views">{shown}</div>',
+    ]
+
+
+def _numbers(record: Mapping[str, Any]) -> list[str]:
+    """The table of numbers with their error bars, and of those that hang together."""
+    names = list(record["numbers"])
+    rows = [
+        (
+            name,
+            f"{number['value']:.5g} ± {number['deviation']:.2g}",
+            draw_error_bar(name, number["value"], number["deviation"]),
+        )
+        for name, number in record["numbers"].items()
+    ]
+    parts = [
+        table(["number", "value ± deviation", ""], rows),
+        paragraph("Thick: one deviation. Thin: two. The upright line is 0."),
+    ]
+    pairs = [
+        (names[i], names[j], f"{row[j]:+.2f}")
+        for i, row in enumerate(record["correlations"])
+        for j in range(i)
+        if abs(row[j]) > STRONG
+    ]
+    if pairs:
+        parts += [
+            paragraph(f"Numbers that hang together (correlation above {STRONG} by these samples):"),
+            table(["", "", "correlation"], pairs),
+        ]
+    return parts
+
+
+def _how(record: Mapping[str, Any]) -> list[str]:
+    """What stands behind the numbers."""
+    noise, error = record["noise"], 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
+    rows = [
+        ("deviation of a pixel, in radiance", f"{noise['deviation']:.3g}"),
+        ("known from", str(noise["from"])),
+        ("numbers in all pictures", str(noise["count"])),
+    ]
+    if noise["told"] is not None:
+        rows.append(("of these spent on telling the volume", f"{noise['told']:.0f}"))
+    return [
+        paragraph(
+            f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
+            " Told is the part of a cell's variance that pictures took away from what smoothing"
+            " alone leaves open, in the mean of the cells around."
+        ),
+        paragraph(
+            "All this is about the optimum that was found, for pictures that err by noise alone:"
+            " what the model of light lacks is not in it."
+        ),
+        table(["pictures", ""], rows),
     ]

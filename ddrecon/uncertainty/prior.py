@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.gauges import calibration_prior
+from ddrecon.reconstruct.numbers import calibration_prior
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import AXES, Roughness
 from ddrecon.scene import Scene

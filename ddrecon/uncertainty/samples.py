@@ -18,11 +18,11 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
-from ddrecon.uncertainty.information import Information
 from ddrecon.uncertainty.posterior import (
     NUMBERS,
     PROBED,
     TOLERANCE,
+    Information,
     Posterior,
     Sample,
     generator_of,

@@ -7,7 +7,7 @@ import torch
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.gauges import calibration_prior
+from ddrecon.reconstruct.numbers import calibration_prior
 from ddrecon.reconstruct.tuning import SHIFT, TURN
 
 GRID = Grid((4, 6, 5), (-1.0, -1.0, -1.0), (1.0, 2.0, 1.0))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ddrecon.cameras import twist
-from ddrecon.reconstruct.gauges import find_gauges
+from ddrecon.reconstruct.numbers import find_gauges
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene
 from ddrecon.settings import ParameterSettings

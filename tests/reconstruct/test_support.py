@@ -161,5 +161,5 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
 
 
 def test_what_is_no_support_is_refused() -> None:
-    with pytest.raises(SceneError, match="g.support: 'masks' is for density alone"):
+    with pytest.raises(SceneError, match=r"g\.support: 'masks' is for density alone"):
         ball("optimize.parameters.g={support: masks}")
