@@ -264,25 +264,16 @@ def _by_entry(changes: Tensor, count: int) -> Tensor:
     return changes * torch.eye(count).to(changes)[..., None, None]
 
 
-@dataclass
 class Gauge:
-    """`parameters` whose changes from `start` [n] have no part in `directions` [n, k].
+    """`parameters` whose changes from the values they have now have no part in `directions` [n, k].
 
-    The directions are orthonormal, of all entries one after another. With `is_relative`, changes
-    are those of logarithms.
+    The directions are of all entries one after another, and made orthonormal. With `is_relative`,
+    changes are those of logarithms.
     """
 
-    parameters: Sequence[Parameter]
-    start: Tensor
-    directions: Tensor
-    is_relative: bool
-
-    @staticmethod
-    def of(parameters: Sequence[Parameter], directions: Tensor, is_relative: bool) -> Gauge:
-        """The gauge that `directions`, not yet orthonormal, span about the values as they are."""
-        gauge = Gauge(parameters, directions[:, 0], torch.linalg.qr(directions)[0], is_relative)
-        gauge.start = gauge._values()
-        return gauge
+    def __init__(self, parameters: Sequence[Parameter], directions: Tensor, is_relative: bool):
+        self.parameters, self.is_relative = parameters, is_relative
+        self.directions, self.start = torch.linalg.qr(directions)[0], self._values()
 
     def hold(self) -> None:
         """Takes the part of the directions out of the parameters' values."""
@@ -310,10 +301,10 @@ def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
         return found if len(found) == len(views) > 1 else []
 
     if exposures := of_all("exposure"):
-        gauges.append(Gauge.of(exposures, _common_gain(exposures), is_relative=True))
+        gauges.append(Gauge(exposures, _common_gain(exposures), is_relative=True))
     if cameras := of_all("camera"):
         directions = torch.cat([_common_motion(view, train) for view in views])
-        gauges.append(Gauge.of(cameras, directions, is_relative=False))
+        gauges.append(Gauge(cameras, directions, is_relative=False))
     return gauges
 
 

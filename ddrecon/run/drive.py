@@ -16,7 +16,6 @@ from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
-from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
@@ -135,7 +134,11 @@ def drive_run(
                     folder.save_in_time(run)
                     row = run.step()
                     folder.log.add(row)
-                    bar.set_postfix_str(progress_text(run.total, row), refresh=False)
+                    known = run.total.test_psnr
+                    test = "" if known is None else f"/{known:.1f}"
+                    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
+                    told = f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
+                    bar.set_postfix_str(told, refresh=False)
                     bar.update()
                     if preview_every and row.iteration % preview_every == 0:
                         folder.preview(run)
@@ -157,13 +160,6 @@ def drive_run(
         leave_ranks()
     with alone():
         return folder.finish(run)
-
-
-def progress_text(total: Row, row: Row) -> str:
-    """The progress line: loss, PSNR of training and (last known) test views, solver iterations."""
-    test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
-    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
-    return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
 
 
 def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
