@@ -92,13 +92,8 @@ class NumberSteps:
         self._refresh(point, compared, iteration)
         # All in units of their rates.
         places, unit = _places(moved), torch.cat([_units(p) for p in moved])
-        matrix = torch.zeros(len(unit), len(unit), dtype=torch.float64)
-        for name, share in shares.items():
-            seen, (_, known) = _places(_shown_by(name, self.numbers)), self.curvatures[name]
-            if keys := [key for key in seen if key in places]:
-                rows, columns = (torch.cat([p[key] for key in keys]) for p in (seen, places))
-                matrix[columns[:, None], columns] += share * known[rows[:, None], rows]
-        matrix *= unit * unit[:, None]
+        known = {name: share * self.curvatures[name][1] for name, share in shares.items()}
+        matrix = _sum_between(moved, known, self.numbers) * unit * unit[:, None]
         slopes = [_gradient(p, point.values[p.name], gradients[p.name]) for p in moved]
         right = -torch.cat(slopes) * unit
         for p in moved:
@@ -206,15 +201,23 @@ def find_curvatures(
 
 def number_curvature(curvature: Curvature, numbers: Sequence[Parameter]) -> Tensor:
     """The part [k, k] of J^T W J of `curvature` between the entries of `numbers` (E45)."""
-    scene, places = curvature.scene, _places(numbers)
-    size = sum(len(place) for place in places.values())
-    total = torch.zeros(size, size, dtype=torch.float64)
-    names = [view.name for view in scene.views] if numbers else []
+    names = [view.name for view in curvature.scene.views] if numbers else []
     found = find_curvatures(curvature, numbers, names, curvature.weights)
-    for name, matrix in found.items():
-        if len(matrix):
-            place = torch.cat([places[p.name] for p in _shown_by(name, numbers)])
-            total[place[:, None], place] += matrix
+    return _sum_between(numbers, found, numbers)
+
+
+def _sum_between(
+    chosen: Sequence[Parameter], matrices: Mapping[str, Tensor], numbers: Sequence[Parameter]
+) -> Tensor:
+    """The sum of `matrices` of views by name, between the `chosen` of the `numbers` they are of."""
+    places = _places(chosen)
+    size = sum(_count(p) for p in chosen)
+    total = torch.zeros(size, size, dtype=torch.float64)
+    for name, matrix in matrices.items():
+        seen = _places(_shown_by(name, numbers))
+        if keys := [key for key in seen if key in places]:
+            rows, columns = (torch.cat([at[key] for key in keys]) for at in (seen, places))
+            total[columns[:, None], columns] += matrix[rows[:, None], rows]
     return total
 
 
