@@ -59,11 +59,3 @@ def test_of_what_is_alike_everywhere_it_is_nearly_all(monkeypatch: pytest.Monkey
     # The diagonal alone takes rough changes for told as well as smooth ones are.
     diagonal = fake.split(information.diagonal * vector)["density"]
     assert float((diagonal - exact).norm() / exact.norm()) > 0.5
-
-
-def test_it_is_symmetric_and_nowhere_below_zero() -> None:
-    fake: Any = Blurred()
-    information = Information(fake, torch.Generator().manual_seed(1))
-    one, other = random_values(2, 1729, dtype=torch.float32) - 0.5
-    torch.testing.assert_close(other @ information.product(one), one @ information.product(other))
-    assert float(one @ information.product(one)) > 0

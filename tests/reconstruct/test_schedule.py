@@ -164,16 +164,3 @@ def test_noise_that_is_said_to_be_less_does_not_end_it(noisy_scene: Scene, ended
     for _ in ended.rows:
         row = run.step()
     assert not run.is_done and row.chi_square == pytest.approx(4, rel=0.1)
-
-
-def test_a_run_that_ends_by_itself_resumes_to_the_same_bits(
-    noisy_scene: Scene, ended: Result
-) -> None:
-    run = Reconstruction(noisy_scene)
-    while not run.is_done:
-        run.step()
-        if run.iteration % 13 == 0:
-            state, run = run.state(), Reconstruction(noisy_scene)
-            run.restore(state)
-    assert run.iteration == len(ended.rows)
-    assert torch.equal(run.current_scene().volume.density, ended.scene.volume.density)
