@@ -101,7 +101,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     if unknown:
         raise _unknown(scene, unknown[0])
     lights = [
-        _replace_light(light, f"lights.{index}", values, scene)
+        _replace_light(light, f"lights.{index}.", values, scene)
         for index, light in enumerate(scene.lights)
     ]
     views = [_replace_view(view, values, scene) for view in scene.views]
@@ -284,16 +284,8 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if volume.media is not None:
         return mix_media(
             {
-                medium: _replace_volume(
-                    part,
-                    {
-                        name.removeprefix(owner): value
-                        for name, value in values.items()
-                        if name.startswith(owner)
-                    },
-                )
+                medium: _replace_volume(part, _within(f"media.{medium}.", values))
                 for medium, part in volume.media.items()
-                for owner in [f"media.{medium}."]
             }
         )
     density, cells = values.get("density"), volume.grid.shape
@@ -321,11 +313,15 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     return changed
 
 
-def _replace_light(light: Light, name: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
-    tensors = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+def _within(owner: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those of `values` whose names begin with `owner`, by the rest of their names."""
+    return {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
+
+
+def _replace_light(light: Light, owner: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
+    tensors, volume = _within(owner, values), scene.volume
     for key, value in tensors.items():
-        volume = scene.volume
-        require_form(f"{name}.{key}", value, getattr(light, key), volume.density, volume.grid.shape)
+        require_form(owner + key, value, getattr(light, key), volume.density, volume.grid.shape)
     changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
     return changed
 
@@ -351,12 +347,13 @@ def _view_value(view: View, part: str) -> Tensor:
 
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
-    names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
-    given: dict[str, Any] = {p: values[name] for p, name in names.items() if name in values}
+    owner = f"views.{view.name}."
+    known = [part for part in _view_parts(view) if owner + part in values]
+    given: dict[str, Any] = {part: values[owner + part] for part in known}
     if not given:
         return view
     for part, value in given.items():
-        require_form(names[part], value, _view_value(view, part), view.camera.pose, (0, 0, 0))
+        require_form(owner + part, value, _view_value(view, part), view.camera.pose, (0, 0, 0))
     response = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:
