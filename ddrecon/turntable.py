@@ -1,4 +1,4 @@
-"""Cameras and lights around a volume, turned about the upright axis through the box's middle."""
+"""Cameras around a volume, turned about the upright axis through the box's middle."""
 
 from __future__ import annotations
 

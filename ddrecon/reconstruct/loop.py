@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -26,7 +27,7 @@ from ddrecon.reconstruct.levels import resample_solutions
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
-from ddrecon.reconstruct.schedule import Schedule, pick_views
+from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
@@ -179,8 +180,8 @@ class Reconstruction:
             "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
-            "schedule": self.schedule.state(),
-            "numbers": self.numbers.state(),
+            "schedule": asdict(self.schedule.progress),
+            "numbers": {"begun": self.numbers.begun, "curvatures": dict(self.numbers.curvatures)},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -189,9 +190,10 @@ class Reconstruction:
             parameter.restore(state["parameters"][parameter.name])
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
-        self.schedule.restore(state["schedule"])
+        self.schedule.progress = Progress(**state["schedule"])
         self._enter_stage(state["stage"])
-        self.numbers.restore(state["numbers"])
+        numbers = state["numbers"]
+        self.numbers.begun, self.numbers.curvatures = numbers["begun"], dict(numbers["curvatures"])
         for kind, field in state.get("solutions", {}).items():
             self.memory.last[kind] = field.to(self.problem.scene.volume.density)
 

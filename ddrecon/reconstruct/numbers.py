@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -133,14 +132,6 @@ class NumberSteps:
         }
         found = find_curvatures(point, self.numbers, old, weights)
         self.curvatures = self.curvatures | {name: (iteration, m) for name, m in found.items()}
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
-        return {"begun": self.begun, "curvatures": dict(self.curvatures)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up a `state`."""
-        self.begun, self.curvatures = state["begun"], dict(state["curvatures"])
 
 
 def find_curvatures(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -132,14 +132,6 @@ class Schedule:
         if chi_square is not None:
             text += f"; chi^2 per pixel is {chi_square:.3g}"
         return {"kind": kind, "text": text, "chi_square": chi_square}
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it."""
-        return asdict(self.progress)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a `state`."""
-        self.progress = Progress(**state)
 
     @property
     def _part_ends(self) -> list[int]:

@@ -29,6 +29,8 @@ from ddrecon.uncertainty.posterior import (
 )
 from ddrecon.variables.values import component_names
 
+SUMS = ("count", "products", "residual", "sums", "numbers")
+"""What samples leave in an `Uncertainty`."""
 LEAST_LEFT = 0.1
 """At least this part of all numbers is taken for noise: a run that fits all else shows none."""
 
@@ -166,20 +168,12 @@ class Uncertainty:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
-        return {
-            "count": self.count,
-            "products": self.products,
-            "residual": self.residual,
-            "sums": self.sums,
-            "numbers": self.numbers,
-            "errors": vars(self.errors),
-        }
+        return {name: getattr(self, name) for name in SUMS} | {"errors": vars(self.errors)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where `state` was."""
-        self.count, self.products = state["count"], state["products"]
-        self.residual, self.numbers = state["residual"], list(state["numbers"])
-        self.sums = dict(state["sums"])
+        for name in SUMS:
+            setattr(self, name, state[name])
 
     def _variance(self, key: str) -> Tensor:
         mean = self.sums[key] / max(self.count, 1)
