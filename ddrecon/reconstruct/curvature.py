@@ -73,7 +73,7 @@ class Curvature:
         return sum(value.numel() for value in self.values.values())
 
     def join(self, parts: Mapping[str, Tensor]) -> Tensor:
-        """`parts` by name as one vector; what is lacking is 0."""
+        """`parts` by name as one vector; what is missing is 0."""
         like = self.values.items()
         joined = [parts.get(name, torch.zeros_like(value)).reshape(-1) for name, value in like]
         return torch.cat(joined)

@@ -111,8 +111,8 @@ class Reconstruction:
         """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
         level, power = self.level, self.problem.power
-        views, wanted = level.train.views, self.problem.settings.views_per_iteration
-        drawn = pick_views(len(views), wanted, self.iteration, self.seed)
+        views, count = level.train.views, self.problem.settings.views_per_iteration
+        drawn = pick_views(len(views), count, self.iteration, self.seed)
         compared = Comparison(
             [views[i] for i in drawn], level.targets, self._is_test_due, level.noise_targets
         )

@@ -54,7 +54,7 @@ class Point:
 class NumberSteps:
     """The steps of the single numbers among `parameters`, which the views of `train` show.
 
-    Fields take part by their level, one number a color, where numbers of the medium are sought,
+    Fields take part by their level, one number a color, where numbers of the medium are optimized,
     since pictures show their product. `curvatures` are J^T W J of each view that was looked at, by
     name, and the iteration that it is of; `begun` is the first at this resolution.
     """
@@ -65,7 +65,7 @@ class NumberSteps:
             self.numbers += [p for p in parameters if p.is_field]
         self.gauges = find_gauges(train, parameters)
         poses = [p for p in self.numbers if p.key == "camera"]
-        # Where some cameras are sought no calibration is to be mended: they may be far off.
+        # Where some cameras are optimized no calibration is to be mended: they may be far off.
         self.calibrated = poses if len(poses) == len(train.views) > 1 else []
         self.curvatures: dict[str, tuple[int, Tensor]] = {}
         self.begun = 0
@@ -276,8 +276,8 @@ class Gauge:
         values = values.exp() if self.is_relative else values
         sizes = [parameter.value.numel() for parameter in self.parameters]
         for parameter, value in zip(self.parameters, values.split(sizes), strict=True):
-            held = value.view(parameter.value.shape).clamp(parameter.low, parameter.high)
-            parameter.value = held.requires_grad_()
+            value = value.view(parameter.value.shape).clamp(parameter.low, parameter.high)
+            parameter.value = value.requires_grad_()
 
     def _values(self) -> Tensor:
         values = torch.cat([parameter.value.detach().flatten() for parameter in self.parameters])

@@ -163,16 +163,16 @@ def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
     return fall
 
 
-def pick_views(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
+def pick_views(count: int, drawn: int, iteration: int, seed: int) -> list[int]:
     """The numbers of the views, of `count`, that `iteration` compares.
 
-    They are `wanted` views (0: all). Every view comes once before any comes again, in an order that
+    They are `drawn` views (0: all). Every view comes once before any comes again, in an order that
     `seed` decides.
     """
-    if not 0 < wanted < count:
+    if not 0 < drawn < count:
         return list(range(count))
     # Over a run, views are taken from shuffled passes over all of them, one after another.
-    places = range(iteration * wanted, (iteration + 1) * wanted)
+    places = range(iteration * drawn, (iteration + 1) * drawn)
     orders = {number: _shuffle(count, seed, number) for number in {i // count for i in places}}
     return [orders[place // count][place % count] for place in places]
 

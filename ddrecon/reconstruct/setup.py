@@ -121,7 +121,9 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
             "no training picture shows anything where its pixels count; masks are white there",
         )
     if _is_dark(train, settings):
-        raise SceneError("lights: none shines, and none is sought: give one a brightness above 0")
+        raise SceneError(
+            "lights: none shines, and none is optimized: give one a brightness above 0"
+        )
     known = variable_names(train)
     problems = [
         f"optimize.parameters.{name}: there is no training view of this name with an image"
@@ -137,7 +139,7 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
 
 
 def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
-    """Whether there is nothing to be seen: no light that shines or is sought, no background."""
+    """Whether there is nothing to be seen: no light that shines or is optimized, no background."""
     has_light = any(
         all(bool(value.any()) for name, value in vars(light).items() if name in BRIGHTNESS)
         for light in train.lights
@@ -220,9 +222,9 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
     }
     parameters, begun = [], with_values(scene, starts)
     for name, start in starts.items():
-        wanted = settings.parameters[name]
-        rate, unit = wanted.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
-        parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
+        chosen = settings.parameters[name]
+        rate, unit = chosen.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
+        parameters.append(Parameter(name, chosen, rate, start, scene.volume.grid, unit))
     # Lights wait for fields alone, and not for those whose level is moved with the lights (E43).
     has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
     if has_levels or not any(parameter.is_field for parameter in parameters):

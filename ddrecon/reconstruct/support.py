@@ -90,16 +90,16 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     return support
 
 
-def _shown(view: View, wanted: str) -> Tensor:
+def _shown(view: View, support: str) -> Tensor:
     """Which pixels of `view` show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
     with `auto`, where the brightest color is above black, or is not known.
     """
-    if wanted == MASKS and view.mask is not None:
+    if support == MASKS and view.mask is not None:
         return view.mask > 0
     image = target_of(view)
-    shown = image.amax(0) > (brightest_black(image, view.step) if wanted == AUTO else 0.0)
+    shown = image.amax(0) > (brightest_black(image, view.step) if support == AUTO else 0.0)
     return shown if view.mask is None else shown | (view.mask == 0)
 
 

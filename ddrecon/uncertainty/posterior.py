@@ -29,7 +29,7 @@ TOLD = 0.4
 MOST = 40
 """Products with J^T W J that a sample may take."""
 ROUNDS = 10
-"""Times that cells are let go of or held at a bound."""
+"""Times that cells are let go of or fixed at a bound."""
 INNER = 6
 """Steps of each solve that conjugate gradients are preconditioned with,"""
 PRECONDITION = 0.1
@@ -37,7 +37,7 @@ PRECONDITION = 0.1
 PROBED = -1
 """The number of random vectors that belong to no sample, but to information."""
 GAUGE = 1e6
-"""How much more than by pictures a number is held by what no picture shows."""
+"""How much more than by pictures a number is constrained by what no picture shows."""
 BEGIN = 0.25
 """The part of the way from a draw of the prior to what pictures roughly leave of it (E39)."""
 
@@ -91,17 +91,19 @@ class Posterior:
         supports = [(p, p.support) for p in parameters if p.support is not None]
         kept = {p.name: (support == 0).expand(p.value.shape).to(p.value) for p, support in supports}
         self.is_kept = curvature.join(kept) > 0
-        at_bound = self._is_held(torch.zeros_like(gradient), -gradient)
+        at_bound = self._is_at_bound(torch.zeros_like(gradient), -gradient)
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
         numbers = single_numbers(parameters)
         self.is_number = curvature.join({p.name: torch.ones_like(p.value) for p in numbers}).bool()
-        # Between them H is what pictures say, and how they are given without.
-        held = [torch.atleast_1d(self.prior.held[p.name].double().cpu()) for p in numbers]
+        # Between them H is what pictures say, and how they are constrained without.
+        precisions = [
+            torch.atleast_1d(self.prior.precision[p.name].double().cpu()) for p in numbers
+        ]
         blocks = [
             block if block.ndim == 2 else block * torch.eye(p.value.numel())
-            for p, block in zip(numbers, held, strict=True)
+            for p, block in zip(numbers, precisions, strict=True)
         ]
         self.between = number_curvature(curvature, numbers) + torch.block_diag(*blocks).double()
         self.information = information or Information(curvature, generator_of(seed, PROBED))
@@ -115,17 +117,17 @@ class Posterior:
         prior = self._within(self.prior.without_levels(draw, self.is_kept))
         right = noise + level - self.gradient
         # It begins at the draw, and a part of the way on to what pictures leave of it (E39).
-        is_fixed = self.is_kept | self._is_held(prior, right)
+        is_fixed = self.is_kept | self._is_at_bound(prior, right)
         begin = self._within(prior + BEGIN * (self._precondition(right, is_fixed) - prior))
-        # What is lacking there: both parts of the data in one adjoint.
+        # The residual there: both parts of the data in one adjoint.
         changes, disturbed = self.curvature.tangents(begin), self._disturbances(generator)
         weights = self.curvature.weights
-        lacking = right - self.prior.product(begin)
-        lacking += self.curvature.adjoint(
+        residual = right - self.prior.product(begin)
+        residual += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self.minimize(begin, lacking)
-        return Sample(change, prior, products, residual)
+        change, products, left = self.minimize(begin, residual)
+        return Sample(change, prior, products, left)
 
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
         """W^(1/2) times white noise, by the name of a view."""
@@ -146,13 +148,13 @@ class Posterior:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
-    def _is_held(self, change: Tensor, residual: Tensor) -> Tensor:
+    def _is_at_bound(self, change: Tensor, residual: Tensor) -> Tensor:
         """Which entries are at a bound that `residual` presses them against."""
         is_low, is_high = change - self.low <= self.near, self.high - change <= self.near
         return is_low & (residual < 0) | is_high & (residual > 0)
 
     def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
-        """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
+        """The least, within bounds, of a quadratic, from `change` with its `residual`.
 
         And how many products that took, and what is left. Which cells are at a bound is guessed,
         the others are solved for, and the guess is mended (active sets: Bertsekas 1982,
@@ -160,20 +162,20 @@ class Posterior:
         """
         products, left = 1, 1.0
         for _ in range(ROUNDS):
-            is_fixed = self.is_kept | self._is_held(change, residual)
-            ready = self._precondition(residual, is_fixed)
-            left = self.size(residual, is_fixed, ready)
+            is_fixed = self.is_kept | self._is_at_bound(change, residual)
+            guess = self._precondition(residual, is_fixed)
+            left = self.size(residual, is_fixed, guess)
             if left <= self.tolerance or products >= self.most:
                 break
             most, tolerance = self.most - products, self.tolerance / left
-            solved = self._correct(residual, is_fixed, most, tolerance, ready)
+            solved = self._correct(residual, is_fixed, most, tolerance, guess)
             products, residual = products + solved.products, solved.lacking
-            wanted = change + solved.value
-            change = self._within(wanted)
+            moved = change + solved.value
+            change = self._within(moved)
             # What was cut at bounds counts roughly first: where that does, no product is spent.
-            cut = change - wanted
+            cut = change - moved
             rough = residual - self._rough_product(cut)
-            left = self.size(rough, self.is_kept | self._is_held(change, rough))
+            left = self.size(rough, self.is_kept | self._is_at_bound(change, rough))
             if left <= self.tolerance:
                 break
             residual, products = residual - self.product(cut), products + 1
@@ -185,17 +187,17 @@ class Posterior:
         is_fixed: Tensor,
         most: int,
         tolerance: float = TOLERANCE,
-        ready: Tensor | None = None,
+        guess: Tensor | None = None,
     ) -> Solved:
         """The change of all that is not fixed that H takes to `right`.
 
-        `ready` is what the preconditioner makes of it, where that is known.
+        `guess` is what the preconditioner makes of it, where that is known.
         """
 
         def precondition(part: Tensor) -> Tensor:
             return self._precondition(part, is_fixed)
 
-        return conjugate_gradients(self.product, precondition, right, tolerance, most, ready)
+        return conjugate_gradients(self.product, precondition, right, tolerance, most, guess)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
         """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
@@ -210,27 +212,27 @@ class Posterior:
 
         free = self._without_gauge(vector.masked_fill(is_fixed, 0))
         fields = free.masked_fill(is_out, 0)
-        ready = conjugate_gradients(
+        guess = conjugate_gradients(
             self._rough_product, precondition, fields, PRECONDITION, INNER
         ).value.masked_fill(is_out, 0)
         at = self.is_number
         if len(self.between):
             gauge = None if self.gauge is None else self.gauge[at]
-            ready[at] = solve_numbers_within(self.between, free[at], is_fixed[at], gauge)
-        return self._without_gauge(ready)
+            guess[at] = solve_numbers_within(self.between, free[at], is_fixed[at], gauge)
+        return self._without_gauge(guess)
 
     def _rough_product(self, vector: Tensor) -> Tensor:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
 
-    def size(self, residual: Tensor, is_fixed: Tensor, ready: Tensor | None = None) -> float:
+    def size(self, residual: Tensor, is_fixed: Tensor, guess: Tensor | None = None) -> float:
         """How large `residual` is, about 1 being what a right side is on average.
 
-        `ready` is `residual` preconditioned, where that is known.
+        `guess` is `residual` preconditioned, where that is known.
         """
-        ready = self._precondition(residual, is_fixed) if ready is None else ready
+        guess = self._precondition(residual, is_fixed) if guess is None else guess
         free = int((~is_fixed).sum())
-        return (max(float(residual @ ready), 0.0) / (self.temperature * max(free, 1))) ** 0.5
+        return (max(float(residual @ guess), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
     def _within(self, change: Tensor) -> Tensor:
         """`change`, cut where a bound is."""
@@ -280,14 +282,14 @@ def solve_numbers_within(
     `gauge` [k, j] has what no picture shows in its columns.
     """
     free = ~is_fixed.to(matrix.device)
-    bent, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
-    bent = bent * unit * unit[:, None]
+    scaled, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
+    scaled = scaled * unit * unit[:, None]
     if gauge is not None:
-        held = gauge.to(matrix)[free] * unit[:, None]
-        held = held / held.norm(dim=0).clamp(min=1e-300)
-        bent = bent + GAUGE * held @ held.T
+        constraint = gauge.to(matrix)[free] * unit[:, None]
+        constraint = constraint / constraint.norm(dim=0).clamp(min=1e-300)
+        scaled = scaled + GAUGE * constraint @ constraint.T
     solved = torch.zeros_like(right)
-    solved[free] = (unit * torch.linalg.solve(bent, unit * right.to(matrix)[free])).to(right)
+    solved[free] = (unit * torch.linalg.solve(scaled, unit * right.to(matrix)[free])).to(right)
     return solved
 
 

@@ -148,7 +148,7 @@ class Kind:
     vector points matters, and a step keeps its length. `tv` is the default weight of total
     variation, taken of what `losses.compress` makes of one that `is_compressed`;
     `difference_steps` are those of finite differences. `release` is the part of a run after which
-    the variable begins to move where fields are sought, of which a lamp would learn wrong things
+    the variable begins to move where fields are optimized, of which a lamp would learn wrong things
     while they are empty.
     """
 
