@@ -11,7 +11,7 @@ import json
 import os
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,29 +136,27 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def differences(old: Any, new: Any) -> list[str]:
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
     """The differences between two trees of mappings, lists and plain values, a text for each.
 
-    A text reads `key.path is A there, B now`.
+    A text reads `key.path is A there, B now`; both trees stand at `path`.
     """
-    one, other = dict(_leaves(old)), dict(_leaves(new))
+    one, other = _children(old), _children(new)
+    if one is None or other is None:
+        return [f"{path} is {_shorten(old)} there, {_shorten(new)} now"] if old != new else []
     pairs = {key: (one.get(key, ABSENT), other.get(key, ABSENT)) for key in [*one, *other]}
     return [
-        f"{key} is {_shorten(there)} there, {_shorten(now)} now"
-        for key, (there, now) in pairs.items()
-        if there != now
+        text
+        for key, pair in pairs.items()
+        for text in differences(*pair, f"{path}.{key}" if path else str(key))
     ]
 
 
-def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The plain values of a `tree`, each after its path; a list of numbers counts as one value."""
+def _children(tree: Any) -> Mapping[Any, Any] | None:
+    """By name or number; None of a plain value, as which a list of numbers counts."""
     if isinstance(tree, list) and any(isinstance(entry, Mapping) for entry in tree):
-        tree = dict(enumerate(tree))
-    if not isinstance(tree, Mapping):
-        yield path, tree
-        return
-    for name, child in tree.items():
-        yield from _leaves(child, f"{path}.{name}" if path else str(name))
+        return dict(enumerate(tree))
+    return tree if isinstance(tree, Mapping) else None
 
 
 def _shorten(value: Any) -> str:
