@@ -19,7 +19,13 @@ from ddrecon.errors import DataWarning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
-from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import (
+    LAST,
+    PREVIOUS,
+    differences,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -152,6 +158,10 @@ def test_what_has_changed_is_named(run: Run, folder: Path) -> None:
     np.save("side.npy", 2 * np.load("side.npy"))
     result = run(*RESUME)
     assert result.exit_code == 2 and f"the content of {folder / 'side.npy'} is" in result.stderr
+
+
+def test_an_empty_section_is_a_difference() -> None:
+    assert differences({"a": {}}, {"a": {}, "g": {}}) == ["g is absent there, {} now"]
 
 
 def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:
