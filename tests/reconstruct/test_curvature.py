@@ -9,7 +9,6 @@ import torch
 from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.engine import use_engine
 from ddrecon.losses import LOSSES, Target, compress, total_variation
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
@@ -128,15 +127,10 @@ def test_roughness_is_the_square_of_its_root_and_has_its_diagonal() -> None:
     torch.testing.assert_close(roughness.diagonal().flatten(), matrix.diagonal())
 
 
-@pytest.mark.slow
-def test_products_are_those_of_a_symmetric_matrix_with_both_engines() -> None:
-    found = []
-    for engine in ("torch", "warp"):
-        use_engine(engine)
-        curvature = curvature_of(small_scene(torch.float64))
-        one, other = random_values(2, curvature.size)
-        found.append([curvature.data_product(one), curvature.data_product(other)])
-        assert float(other @ found[-1][0]) == pytest.approx(float(one @ found[-1][1]), rel=1e-9)
-        assert float(one @ found[-1][0]) > 0
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(a.abs().max()))
+def test_products_are_those_of_a_symmetric_matrix() -> None:
+    """Also with a transport round."""
+    curvature = curvature_of(small_scene(torch.float64))
+    one, other = random_values(2, curvature.size)
+    products = curvature.data_product(one), curvature.data_product(other)
+    assert float(other @ products[0]) == pytest.approx(float(one @ products[1]), rel=1e-9)
+    assert float(one @ products[0]) > 0
