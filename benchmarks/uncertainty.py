@@ -62,8 +62,8 @@ class Case:
         curvature.roughness = {"density": self.roughness}
         prior = Prior(curvature, self.temperature)
         # Its level errs as much as its cells do.
-        self.held = {name: held / ROUGHEST**2 for name, held in prior.held.items()}
-        prior.held = self.held
+        self.precision = {name: each / ROUGHEST**2 for name, each in prior.precision.items()}
+        prior.precision = self.precision
         draw = prior.solve(sum(prior.root_noise(generator)) * self.temperature**0.5)
         self.truth = (base.flatten() + draw).clamp(min=0).view_as(base)
         with torch.no_grad():
@@ -84,7 +84,7 @@ class Case:
         curvature = self.curvature_at(value, self.targets)
         curvature.roughness = {"density": self.roughness}
         posterior = Posterior(curvature, torch.zeros(curvature.size), self.temperature, self.seed)
-        posterior.prior.held = self.held
+        posterior.prior.precision = self.precision
         return posterior
 
     def optimum(self, begin: Tensor, number: int | None = None) -> Tensor:

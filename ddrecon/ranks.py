@@ -37,19 +37,19 @@ class _Group:
     """This process's place among `count` ranks, and where they leave each other notes, `store`.
 
     `has_slabs`: they share out the cells of a scene, not its views. `bytes` were handed to
-    exchanges so far, which took `seconds`.
+    exchanges so far, which took `seconds`. One rank exchanges nothing.
     """
 
-    rank: int
-    count: int
-    store: Any
+    rank: int = 0
+    count: int = 1
+    store: Any = None
     has_slabs: bool = False
     bytes: int = 0
     seconds: float = 0.0
 
 
-_group: _Group | None = None
-"""Of this process, once it has joined others."""
+_group = _Group()
+"""Of this process; it is alone until it has joined others."""
 
 
 def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
@@ -60,7 +60,7 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
     where the others cannot be reached, UsageError for an environment that torchrun does not make.
     """
     global _group
-    if _group is not None or int(os.environ.get("WORLD_SIZE", 1)) < 2 or "RANK" not in os.environ:
+    if _group.count > 1 or int(os.environ.get("WORLD_SIZE", 1)) < 2 or "RANK" not in os.environ:
         return
     import torch.distributed as dist
 
@@ -110,38 +110,38 @@ def _meet(store: Any, rank: int, count: int, wait: timedelta) -> None:
 def leave_ranks() -> None:
     """Parts from the other ranks, which need not do so at the same time."""
     global _group
-    if _group is not None:
+    if _group.count > 1:
         import torch.distributed
 
-        _group = None
+        _group = _Group()
         torch.distributed.destroy_process_group()
 
 
 def rank_count() -> int:
     """How many ranks share the work."""
-    return 1 if _group is None else _group.count
+    return _group.count
 
 
 def own_rank() -> int:
     """The number of this rank, from 0."""
-    return 0 if _group is None else _group.rank
+    return _group.rank
 
 
 def cells_are_shared() -> bool:
     """Whether ranks share out the cells of a scene, instead of its views."""
-    return _group is not None and _group.has_slabs
+    return _group.has_slabs
 
 
 def is_first() -> bool:
     """Whether this is the rank that writes and prints."""
-    return own_rank() == 0
+    return _group.rank == 0
 
 
 @contextmanager
 def alone() -> Iterator[None]:
     """Has each rank work by itself, as if there were no others."""
     global _group
-    group, _group = _group, None
+    group, _group = _group, _Group()
     try:
         yield
     finally:
@@ -150,7 +150,7 @@ def alone() -> Iterator[None]:
 
 def exchanged() -> tuple[int, float]:
     """Bytes that this rank has handed to exchanges so far, and the seconds that they took."""
-    return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
+    return _group.bytes, _group.seconds
 
 
 def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
@@ -158,7 +158,7 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
 
     They go in one exchange. Raises RanksError where a rank has ended.
     """
-    if _group is None or not tensors:
+    if _group.count == 1 or not tensors:
         return list(tensors)
     import torch
 
@@ -175,7 +175,6 @@ def gather_from_ranks(part: Tensor) -> list[Tensor]:
     """The `part` that each rank has, by rank; all are of one shape."""
     import torch
 
-    assert _group is not None
     part = part.contiguous()
     parts = [torch.empty_like(part) for _ in range(_group.count)]
     with _exchange(part.nbytes):
@@ -203,7 +202,6 @@ def swap_with_neighbors(
     """
     import torch.distributed as dist
 
-    assert _group is not None
     got: list[Tensor | None] = []
     jobs: list[Any] = []
     for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
@@ -220,7 +218,7 @@ def swap_with_neighbors(
 
 def sum_numbers(numbers: Sequence[float]) -> list[float]:
     """The sums over ranks of each of `numbers`."""
-    if _group is None:
+    if _group.count == 1:
         return list(numbers)
     import torch
 
@@ -235,7 +233,7 @@ def is_any(flag: bool) -> bool:
 
 def from_first(value: T) -> T:
     """The `value` that the first rank has: plain values and tensors, these on the processor."""
-    if _group is None:
+    if _group.count == 1:
         return value
     import torch
 
@@ -257,7 +255,6 @@ def from_first(value: T) -> T:
 @contextmanager
 def _exchange(count: int) -> Iterator[None]:
     """An exchange of `count` bytes, which becomes a RanksError where a rank has ended."""
-    assert _group is not None
     begun = perf_counter()
     try:
         yield
@@ -273,7 +270,7 @@ def tell_failure(error: BaseException) -> str | None:
     The others learn of it, as the reason why this rank has ended.
     """
     text = str(error)
-    if _group is None:
+    if _group.count == 1:
         return text
     if isinstance(error, RanksError):
         # All ranks have lost the one that failed: it is told once a machine.
@@ -283,31 +280,31 @@ def tell_failure(error: BaseException) -> str | None:
         if _group.rank == 0:
             return text
         end = monotonic() + TOLD_SECONDS
-        while monotonic() < end and not _group.store.check(["ddrecon/failed/0"]):
+        while monotonic() < end and not _note(0):
             sleep(0.05)
         # The first adds where it has kept the state.
-        if _group.store.check(["ddrecon/failed/0"]) and _note(0).startswith(one_line(text)):
+        if _note(0).startswith(one_line(text)):
             return None
     except RuntimeError:
-        pass  # the first rank has ended, and has taken the notes with it
+        pass  # as in `_told`
     return f"rank {_group.rank}: {text}"
 
 
 def _told() -> str | None:
     """What a rank that failed has said of it."""
-    assert _group is not None
     try:
-        failed = [
-            rank for rank in range(_group.count) if _group.store.check([f"ddrecon/failed/{rank}"])
-        ]
-        return f"rank {failed[0]} has failed: {_note(failed[0])}" if failed else None
+        for rank in range(_group.count):
+            if note := _note(rank):
+                return f"rank {rank} has failed: {note}"
     except RuntimeError:
-        return None
+        pass  # the first rank has ended, and has taken the notes with it
+    return None
 
 
 def _note(rank: int) -> str:
-    assert _group is not None
-    return str(_group.store.get(f"ddrecon/failed/{rank}").decode())
+    """What `rank` has said of its failure; empty where nothing."""
+    key = f"ddrecon/failed/{rank}"
+    return str(_group.store.get(key).decode()) if _group.store.check([key]) else ""
 
 
 def _reason(error: BaseException) -> str:

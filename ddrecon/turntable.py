@@ -1,4 +1,4 @@
-"""Cameras and lights around a volume, turned about the upright axis through the box's middle."""
+"""Cameras around a volume, turned about the upright axis through the box's middle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, rotation
 from ddrecon.grid import Triple
-from ddrecon.light.lights import DirectionalLight, Light
 from ddrecon.scene import Scene, View
 
 
@@ -42,22 +41,6 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
         for index in range(count)
     )
     return [View(f"ring_{index:03d}", camera) for index, camera in enumerate(turned)]
-
-
-def turn_lights(scene: Scene, count: int) -> list[list[Light]]:
-    """`count` >= 1 times the lights of `scene`, the directional ones turned in equal steps.
-
-    They turn about the axis that `place_turntable` has. The first are those of the scene.
-    """
-    axis = upright_axis([item.camera for item in scene.views])
-
-    def turned(light: Light, turn: Tensor) -> Light:
-        if not isinstance(light, DirectionalLight):
-            return light
-        return replace(light, direction=turn.to(light.direction) @ light.direction)
-
-    turns = [_turn(axis, 2 * math.pi * index / count) for index in range(count)]
-    return [[turned(light, turn) for light in scene.lights] for turn in turns]
 
 
 def _turn(axis: int, angle: float) -> Tensor:

@@ -18,8 +18,7 @@ from typing import Any, Literal, get_args, get_origin
 from ddrecon import settings
 from ddrecon.scene_file import schema
 from ddrecon.scene_file.read import alternatives, describe_type, type_hints
-from ddrecon.variables.default_rates import DENSITY_STEP
-from ddrecon.variables.kinds import KINDS, Kind
+from ddrecon.variables.kinds import DENSITY_STEP, KINDS, Kind
 
 FOLDER = Path(__file__).parent
 EXPERT = """\

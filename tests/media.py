@@ -6,10 +6,12 @@ Every test states what matters to it and nothing else.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
@@ -21,6 +23,7 @@ from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.variables.tangents import varied
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -139,3 +142,15 @@ def convergence_order(steps: list[float], errors: list[float]) -> float:
     )
     x = x - x.mean()
     return float((x * y).sum() / (x * x).sum())
+
+
+def render_tangent(
+    scene: Scene, name: str, images_of: Callable[[Scene], dict[Any, Tensor]]
+) -> dict[Any, tuple[Tensor, Tensor]]:
+    """What `images_of` renders of `scene`, each with its derivative by `name`."""
+    with varied(scene, name) as world:
+        pairs = {key: forward_ad.unpack_dual(image) for key, image in images_of(world).items()}
+        return {
+            key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
+            for key, (primal, tangent) in pairs.items()
+        }

@@ -6,8 +6,8 @@ from typing import Any
 
 from ddrecon.engine import name_engines
 from ddrecon.memory import gibibytes, memory_of
-from ddrecon.reconstruct.setup import select_views, start_support
-from ddrecon.reconstruct.support import describe_support, support_text
+from ddrecon.reconstruct.setup import select_views
+from ddrecon.reconstruct.support import describe_support, find_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import needs_of_scene
@@ -38,7 +38,7 @@ def describe(scene: Scene, expert: dict[str, Any], has_slabs: bool = False) -> d
     loss = support = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
-        support = describe_support(start_support(train, scene.optimize), grid)
+        support = describe_support(find_support(train, scene.optimize), grid)
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],

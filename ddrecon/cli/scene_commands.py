@@ -97,7 +97,6 @@ def render(
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.render_folder import (
         remove_targets,
-        render_gradient_to_folder,
         render_lines,
         render_to_folder,
         require_variation,
@@ -115,11 +114,7 @@ def render(
     if parameter is not None:
         require_variation(loaded, parameter)
     with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
-        settings = views, output, components
-        if parameter is None:
-            report = render_to_folder(loaded, *settings, session.progress)
-        else:
-            report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        report = render_to_folder(loaded, views, output, components, session.progress, parameter)
         if not is_first():
             return
         if count is not None:

@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ddrecon.cli.command import OUTPUT, OVERWRITE, REPORT, in_session
+from ddrecon.errors import UsageError
 
 if TYPE_CHECKING:
+    import torch
+
     from ddrecon.cli.session import Session
     from ddrecon.reconstruct.loop import Reconstruction
+    from ddrecon.scene import Scene
 
 SAMPLES = 16
 
@@ -42,12 +46,6 @@ SAMPLES = 16
     help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
 )
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
-@click.option(
-    "--next-view",
-    type=click.Choice(["ring", "lights"]),
-    help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
-    "(ring), or in directional lights that are (lights).",
-)
 @click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
 @REPORT
 @in_session
@@ -60,7 +58,6 @@ def uncertainty(
     read: float | None,
     tolerance: float | None,
     has_samples: bool,
-    next_view: str | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -69,26 +66,24 @@ def uncertainty(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
-    from ddrecon.uncertainty.drive import (
-        Request,
-        drive_uncertainty,
-        dtype_of,
-        follow_uncertainty,
-        state_of,
-        take_up,
-    )
+    from ddrecon.run.run_folder import load_run
+    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
-    from ddrecon.uncertainty.next_view import FEWEST
 
-    if next_view and samples < FEWEST:
-        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
-    state = state_of(run)
-    scene = session.build(session.read(run / "scene.yaml"), dtype_of(state))
-    taken = take_up(scene, state, run)
+
+    def build(dtype: torch.dtype) -> Scene:
+        return session.build(session.read(run / "scene.yaml"), dtype)
+
+    taken = load_run(run, build)
+    if taken.stage + 1 < len(taken.problem.factors):
+        raise UsageError(
+            f"{run}: the run stopped before its last resolution; finish it with "
+            "`ddrecon optimize --resume`"
+        )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, noise, tolerance, next_view)
+    request = Request(session.seed, noise, tolerance)
     if not is_first():
         follow_uncertainty(taken, samples, request)
         return

@@ -10,14 +10,12 @@ Parameters stand in one vector, entry by entry, in their own units and in their 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.light.lights import Light
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
@@ -52,9 +50,7 @@ class Curvature:
             world = with_values(scene, self.values)
             light_field = solve_light(world, memory)
             self.images = share_pictures(
-                scene,
-                scene.views,
-                lambda view: view_picture(light_field, world, world.view(view.name)),
+                scene, lambda view: view_picture(light_field, world, world.view(view.name))
             )
         # Later solves of the same light begin where this one ended.
         self.solutions = {key: u for key, u in memory.last.items() if key[0] == "forward"}
@@ -77,7 +73,7 @@ class Curvature:
         return sum(value.numel() for value in self.values.values())
 
     def join(self, parts: Mapping[str, Tensor]) -> Tensor:
-        """`parts` by name as one vector; what is lacking is 0."""
+        """`parts` by name as one vector; what is missing is 0."""
         like = self.values.items()
         joined = [parts.get(name, torch.zeros_like(value)).reshape(-1) for name, value in like]
         return torch.cat(joined)
@@ -87,10 +83,6 @@ class Curvature:
         parts = vector.split([value.numel() for value in self.values.values()])
         named = zip(self.values.items(), parts, strict=True)
         return {name: part.view(value.shape) for (name, value), part in named}
-
-    def product(self, vector: Tensor) -> Tensor:
-        """(J^T W J + R) times `vector`."""
-        return self.data_product(vector) + self.penalty_product(vector)
 
     def data_product(self, vector: Tensor) -> Tensor:
         """J^T W J times `vector`."""
@@ -102,36 +94,24 @@ class Curvature:
         parts = self.split(vector)
         return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
-    def tangents(
-        self,
-        vector: Tensor,
-        views: Sequence[View] | None = None,
-        lights: Sequence[Light] | None = None,
-    ) -> dict[str, Tensor]:
-        """J times `vector`: how the picture [3, h, w] of each view changes, by its name.
-
-        Those of the training views, or of other `views` of the same volume; in the light of the
-        scene, or of other `lights`, which are known.
-        """
+    def tangents(self, vector: Tensor) -> dict[str, Tensor]:
+        """J times `vector`: how the picture [3, h, w] of each training view changes, by name."""
         changes = self.split(vector)
         derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
         with torch.no_grad(), forward_ad.dual_level():
             duals = {
                 name: forward_ad.make_dual(value, changes[name])
                 for name, value in self.values.items()
-                if lights is None or not name.startswith("lights.")
             }
-            lit = self.scene if lights is None else replace(self.scene, lights=list(lights))
-            world = with_values(lit, duals)
+            world = with_values(self.scene, duals)
             light_field = solve_light(world, self.new_memory())
 
             def change_of(view: View) -> Tensor:
-                seen = world.view(view.name) if views is None else view
-                picture = view_picture(light_field, world, seen, derivatives)
+                picture = view_picture(light_field, world, world.view(view.name), derivatives)
                 tangent = forward_ad.unpack_dual(picture).tangent
                 return torch.zeros_like(picture) if tangent is None else tangent.clone()
 
-            return share_pictures(self.scene, views or self.scene.views, change_of)
+            return share_pictures(self.scene, change_of)
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

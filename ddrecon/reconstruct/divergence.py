@@ -65,9 +65,8 @@ def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:
 def describe_largest(name: str, values: Tensor, is_field: bool) -> str:
     """The entry of the parameter `name` of largest magnitude, and its value."""
     values = values.detach()
-    flat = int(values.abs().flatten().argmax())
-    index = [int(i) for i in torch.unravel_index(torch.tensor(flat), values.shape)]
-    return f"{_name_entry(name, index, is_field)} is {float(values.flatten()[flat]):.4g}"
+    index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
+    return f"{_name_entry(name, index, is_field)} is {float(values[tuple(index)]):.4g}"
 
 
 def _name_entry(name: str, index: list[int], is_field: bool) -> str:
@@ -75,13 +74,8 @@ def _name_entry(name: str, index: list[int], is_field: bool) -> str:
 
     Places are the last three numbers of the index into a field, the last two of that into a map.
     """
-    if is_field:
-        *color, z, y, x = index
-        return f"{name} at voxel [{x}, {y}, {z}]{_name_color(color)}"
-    if len(index) == 3:
-        return f"{name} at pixel [{index[2]}, {index[1]}]{_name_color(index[:1])}"
-    return f"{name}, entry {index}" if index else name
-
-
-def _name_color(index: list[int]) -> str:
-    return f", color {index[0]}" if index else ""
+    if not is_field and len(index) != 3:
+        return f"{name}, entry {index}" if index else name
+    what, count = ("voxel", 3) if is_field else ("pixel", 2)
+    place, color = index[-count:][::-1], index[:-count]
+    return f"{name} at {what} {place}" + (f", color {color[0]}" if color else "")

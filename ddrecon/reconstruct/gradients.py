@@ -48,10 +48,10 @@ def differentiate(
     back, and the derivatives by `values` are summed.
     """
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
-    cut = _Cut()
-    light_field = cut.cut(solve_light(with_values(scene, values), memory))
+    tensors, leaves = list[Tensor](), list[Tensor]()
+    light_field = _cut(solve_light(with_values(scene, values), memory), tensors, leaves)
     outside = {name: value for name, value in values.items() if not is_of_volume(name)}
-    inputs = [*values.values(), *cut.leaves]
+    inputs = [*values.values(), *leaves]
     own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
     # Views share what is made of values: so that each has a graph of its own, it is made anew.
     worlds = ((with_values(scene, outside), name) for name in (names if has_slabs else own))
@@ -62,11 +62,9 @@ def differentiate(
         (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E9).
-    reached = [
-        (tensor, bar) for tensor, bar in zip(cut.tensors, leaf_bars, strict=True) if bar is not None
-    ]
+    reached = [pair for pair in zip(tensors, leaf_bars, strict=True) if pair[1] is not None]
     # Nobody else holds it on its way: its memory is free as soon as it has been of use.
-    del light_field, cut, inputs, sums, leaf_bars
+    del light_field, tensors, leaves, inputs, sums, leaf_bars
     if reached:
         bars = [bar for _, bar in reached]
         product = _Product.apply(bars, *(tensor for tensor, _ in reached))
@@ -138,31 +136,25 @@ def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[T
     ]
 
 
-class _Cut:
-    """Where a graph is cut: the `tensors` before it, and the `leaves` that stand for them."""
+def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
+    """`record` with leaves in place of tensors that have a graph; both are added to the lists.
 
-    def __init__(self) -> None:
-        self.tensors: list[Tensor] = []
-        self.leaves: list[Tensor] = []
-
-    def cut(self, record: Any) -> Any:
-        """`record` with leaves inside; a tensor that occurs twice becomes one leaf."""
-        if isinstance(record, Tensor):
-            return self._leaf(record) if record.requires_grad else record
-        if isinstance(record, tuple):
-            return tuple(self.cut(entry) for entry in record)
-        if is_dataclass(record) and not isinstance(record, type):
-            parts = {part.name: self.cut(getattr(record, part.name)) for part in fields(record)}
-            return replace(record, **parts)
-        return record
-
-    def _leaf(self, tensor: Tensor) -> Tensor:
-        for known, leaf in zip(self.tensors, self.leaves, strict=True):
-            if known is tensor:
-                return leaf
-        self.tensors.append(tensor)
-        self.leaves.append(tensor.detach().requires_grad_())
-        return self.leaves[-1]
+    A tensor that occurs twice becomes one leaf.
+    """
+    if isinstance(record, Tensor):
+        if not record.requires_grad:
+            return record
+        known = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
+        if not known:
+            tensors.append(record)
+            leaves.append(record.detach().requires_grad_())
+        return known[0] if known else leaves[-1]
+    if isinstance(record, tuple):
+        return tuple(_cut(entry, tensors, leaves) for entry in record)
+    if is_dataclass(record) and not isinstance(record, type):
+        parts = {part.name: getattr(record, part.name) for part in fields(record)}
+        return replace(record, **{n: _cut(part, tensors, leaves) for n, part in parts.items()})
+    return record
 
 
 def solve_tolerances(misfit: float) -> dict[str, float]:

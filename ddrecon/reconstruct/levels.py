@@ -57,7 +57,8 @@ def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
             {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
         )
     sigma_a, sigma_s = (
-        _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
+        sigma if sigma.ndim == 1 else resample(sigma, grid)
+        for sigma in (volume.sigma_a, volume.sigma_s)
     )
     phase = volume.phase
     if phase.cells is not None:
@@ -94,10 +95,6 @@ def resample_solutions(
         return Ghosts.of(new).cut(field) if isinstance(new, Slab) else field
 
     return {kind: carried(field) for kind, field in solutions.items()}
-
-
-def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:
-    return sigma if sigma.ndim == 1 else resample(sigma, grid)
 
 
 def _view_at_level(view: View, factor: int) -> View:

@@ -7,8 +7,9 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
@@ -25,10 +26,10 @@ from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_t
 from ddrecon.reconstruct.levels import resample_solutions
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.numbers import NumberSteps, Point
-from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
-from ddrecon.reconstruct.schedule import Schedule, pick_views
+from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
+from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
 
@@ -109,31 +110,41 @@ class Reconstruction:
     def _iterate(self, start: float) -> Row:
         """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
-        level = self.level
+        level, power = self.level, self.problem.power
+        views, count = level.train.views, self.problem.settings.views_per_iteration
+        drawn = pick_views(len(views), count, self.iteration, self.seed)
         compared = Comparison(
-            self._views(), level.targets, self._is_test_due, noise_targets=level.noise_targets
+            [views[i] for i in drawn], level.targets, self._is_test_due, level.noise_targets
         )
         # Differentiate: the objective and its derivative by every parameter.
-        objective = self._differentiate(compared)
-        loss, gradients = add_penalties(objective, self.parameters, self.problem.power)
+        values = {parameter.name: parameter.value for parameter in self.parameters}
+        objective = self._differentiate(values, compared)
+        loss, gradients = add_penalties(objective, self.parameters, power)
         # Check: a derivative that is not finite would spoil the parameters for good.
-        numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
+        numbers = compared.read(objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         # Solutions are not in it: solves only begin there.
         self.before_step = None
-        backups = {parameter.name: parameter.backup() for parameter in self.parameters}
-        self.before_step = self.state() | {"parameters": backups}
+        self.before_step = self.state()
         del self.before_step["solutions"]
         # Step: every parameter against its derivative.
-        power = self.problem.power
         self.misfit = math.sqrt(numbers.of_images / power) if power else 1.0
-        self._step(gradients, compared)
+        self._step(values, gradients, compared)
         # Judge: is there more to be done, here or at all?
-        penalty = numbers.loss - numbers.of_images
-        self.schedule.note(self.iteration, numbers.losses, numbers.chi_squares, penalty)
+        penalty, means = numbers.loss - numbers.of_images, numbers.means
+        names = [view.name for view in compared.views]
+        losses, chi_squares = (
+            dict(zip(names, numbers.of_views.get(kind, ()), strict=False))
+            for kind in ("loss", "chi_square")
+        )
+        self.schedule.note(self.iteration, losses, chi_squares, penalty)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
-        test_psnr, test_ssim = self._test_quality()
+        test_psnr, test_ssim = None, None
+        if self._is_test_due and level.test.views:
+            test_psnr, test_ssim = render_quality(
+                level.test, self.parameters, level.test_targets, self.memory
+            )
         # Log.
         row = Row(
             iteration=self.iteration + 1,
@@ -141,14 +152,14 @@ class Reconstruction:
             loss=numbers.loss,
             data_loss=numbers.of_images,
             penalty=penalty,
-            psnr=numbers.psnr,
+            psnr=means["psnr"],
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
-            cells=self.level.train.volume.grid.cells,
-            ssim=numbers.ssim,
+            cells=level.train.volume.grid.cells,
+            ssim=means.get("ssim"),
             test_ssim=test_ssim,
-            chi_square=numbers.chi_square,
+            chi_square=means.get("chi_square"),
         )
         self.total = sum_rows(self.total, row)
         return row
@@ -169,8 +180,8 @@ class Reconstruction:
             "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
-            "schedule": self.schedule.state(),
-            "numbers": self.numbers.state(),
+            "schedule": asdict(self.schedule.progress),
+            "numbers": {"begun": self.numbers.begun, "curvatures": dict(self.numbers.curvatures)},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -179,9 +190,10 @@ class Reconstruction:
             parameter.restore(state["parameters"][parameter.name])
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
-        self.schedule.restore(state["schedule"])
+        self.schedule.progress = Progress(**state["schedule"])
         self._enter_stage(state["stage"])
-        self.numbers.restore(state["numbers"])
+        numbers = state["numbers"]
+        self.numbers.begun, self.numbers.curvatures = numbers["begun"], dict(numbers["curvatures"])
         for kind, field in state.get("solutions", {}).items():
             self.memory.last[kind] = field.to(self.problem.scene.volume.density)
 
@@ -190,27 +202,20 @@ class Reconstruction:
         self.stage, self.level = stage, self.problem.at(stage)
         before, volume = self.parameters[0].grid, self.level.train.volume
         self.memory.last = resample_solutions(self.memory.last, before, volume.grid)
-        self.numbers.forget()
+        self.numbers.curvatures = {}  # which belong to another resolution
         for parameter in self.parameters:
             if parameter.grid != volume.grid:
                 parameter.refine(volume.grid)
             if volume.support is not None and parameter.name == "density":
                 parameter.restrict(volume.support)
 
-    def _views(self) -> list[View]:
-        views, wanted = self.level.train.views, self.problem.settings.views_per_iteration
-        return [views[i] for i in pick_views(len(views), wanted, self.iteration, self.seed)]
-
-    def _values(self) -> dict[str, Tensor]:
-        return {parameter.name: parameter.value for parameter in self.parameters}
-
-    def _differentiate(self, compared: Comparison) -> Differentiated:
+    def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
         names = [view.name for view in compared.views]
         try:
-            return differentiate(self.level.train, names, self._values(), compared, self.memory)
+            return differentiate(self.level.train, names, values, compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
             compared.gather()
@@ -219,15 +224,20 @@ class Reconstruction:
         finally:
             self.memory.tolerance_floor = {}
 
-    def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
+    def _step(
+        self,
+        values: Mapping[str, Tensor],
+        gradients: Mapping[str, Tensor],
+        compared: Comparison,
+    ) -> None:
         """Moves what is due: fields and maps by Adam, and single numbers all at once (E43)."""
-        values = {name: value.detach() for name, value in self._values().items()}
         rates = {p.name: self.schedule.rate(self.iteration, p.release) for p in self.parameters}
         for p in self.parameters:
             if rates[p.name] and (p.is_field or p not in self.numbers.numbers):
                 p.step(gradients[p.name], rates[p.name], self.problem.power)
         due = [name for name, rate in rates.items() if rate]
-        point = Point(self.level.train, values, self.memory.last)
+        before = {name: value.detach() for name, value in values.items()}
+        point = Point(self.level.train, before, self.memory.last)
         self.numbers.step(point, gradients, compared, due, self.iteration)
 
     @property
@@ -235,16 +245,6 @@ class Reconstruction:
         """Whether test views, and SSIM, are looked at in this iteration."""
         iteration = self.iteration + 1
         return iteration % tuning.TEST_EVERY == 0 or self.schedule.is_over(iteration)
-
-    def _test_quality(self) -> tuple[float | None, float | None]:
-        """The mean PSNR [dB] and SSIM of the test views.
-
-        None without any, or where it is not their turn.
-        """
-        if not self._is_test_due or not self.level.test.views:
-            return None, None
-        level = self.level
-        return render_quality(level.test, self.parameters, level.test_targets, self.memory)
 
 
 def _compile_ahead(computation: Callable[[], object]) -> None:

@@ -3,29 +3,34 @@
 They are few, and look alike: a camera's turn and its shift, a lamp and an exposure, and the level
 of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J, whose
 columns of J are tangents. It is found anew ever more rarely; derivatives are exact at every step.
+
+What is known of them without pictures are gauges, and how calibrations err. A gauge is a change of
+several parameters together that no picture shows, and that is not made: twice the exposure of all
+cameras is half the light; all cameras moved together move the volume.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ddrecon.cameras import Camera
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.gauges import find_gauges, weigh_calibration
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import has_slabs, own_views
 from ddrecon.renderer import LightField, solve_light, view_picture
-from ddrecon.scene import Scene
-from ddrecon.variables.kinds import is_of_volume, kind_of
+from ddrecon.scene import Scene, View
+from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
 from ddrecon.variables.values import with_values
 
 
@@ -49,7 +54,7 @@ class Point:
 class NumberSteps:
     """The steps of the single numbers among `parameters`, which the views of `train` show.
 
-    Fields take part by their level, one number a color, where numbers of the medium are sought,
+    Fields take part by their level, one number a color, where numbers of the medium are optimized,
     since pictures show their product. `curvatures` are J^T W J of each view that was looked at, by
     name, and the iteration that it is of; `begun` is the first at this resolution.
     """
@@ -60,7 +65,7 @@ class NumberSteps:
             self.numbers += [p for p in parameters if p.is_field]
         self.gauges = find_gauges(train, parameters)
         poses = [p for p in self.numbers if p.key == "camera"]
-        # Where some cameras are sought no calibration is to be mended: they may be far off.
+        # Where some cameras are optimized no calibration is to be mended: they may be far off.
         self.calibrated = poses if len(poses) == len(train.views) > 1 else []
         self.curvatures: dict[str, tuple[int, Tensor]] = {}
         self.begun = 0
@@ -86,13 +91,8 @@ class NumberSteps:
         self._refresh(point, compared, iteration)
         # All in units of their rates.
         places, unit = _places(moved), torch.cat([_units(p) for p in moved])
-        matrix = torch.zeros(len(unit), len(unit), dtype=torch.float64)
-        for name, share in shares.items():
-            seen, (_, known) = _places(_shown_by(name, self.numbers)), self.curvatures[name]
-            if keys := [key for key in seen if key in places]:
-                rows, columns = (torch.cat([p[key] for key in keys]) for p in (seen, places))
-                matrix[columns[:, None], columns] += share * known[rows[:, None], rows]
-        matrix *= unit * unit[:, None]
+        known = {name: share * self.curvatures[name][1] for name, share in shares.items()}
+        matrix = _sum_between(moved, known, self.numbers) * unit * unit[:, None]
         slopes = [_gradient(p, point.values[p.name], gradients[p.name]) for p in moved]
         right = -torch.cat(slopes) * unit
         for p in moved:
@@ -132,18 +132,6 @@ class NumberSteps:
         }
         found = find_curvatures(point, self.numbers, old, weights)
         self.curvatures = self.curvatures | {name: (iteration, m) for name, m in found.items()}
-
-    def forget(self) -> None:
-        """Forgets what belongs to another resolution."""
-        self.curvatures = {}
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
-        return {"begun": self.begun, "curvatures": dict(self.curvatures)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up a `state`."""
-        self.begun, self.curvatures = state["begun"], dict(state["curvatures"])
 
 
 def find_curvatures(
@@ -204,15 +192,23 @@ def find_curvatures(
 
 def number_curvature(curvature: Curvature, numbers: Sequence[Parameter]) -> Tensor:
     """The part [k, k] of J^T W J of `curvature` between the entries of `numbers` (E45)."""
-    scene, places = curvature.scene, _places(numbers)
-    size = sum(len(place) for place in places.values())
-    total = torch.zeros(size, size, dtype=torch.float64)
-    names = [view.name for view in scene.views] if numbers else []
+    names = [view.name for view in curvature.scene.views] if numbers else []
     found = find_curvatures(curvature, numbers, names, curvature.weights)
-    for name, matrix in found.items():
-        if len(matrix):
-            place = torch.cat([places[p.name] for p in _shown_by(name, numbers)])
-            total[place[:, None], place] += matrix
+    return _sum_between(numbers, found, numbers)
+
+
+def _sum_between(
+    chosen: Sequence[Parameter], matrices: Mapping[str, Tensor], numbers: Sequence[Parameter]
+) -> Tensor:
+    """The sum of `matrices` of views by name, between the `chosen` of the `numbers` they are of."""
+    places = _places(chosen)
+    size = sum(_count(p) for p in chosen)
+    total = torch.zeros(size, size, dtype=torch.float64)
+    for name, matrix in matrices.items():
+        seen = _places(_shown_by(name, numbers))
+        if keys := [key for key in seen if key in places]:
+            rows, columns = (torch.cat([at[key] for key in keys]) for at in (seen, places))
+            total[columns[:, None], columns] += matrix[rows[:, None], rows]
     return total
 
 
@@ -260,3 +256,101 @@ def _by_entry(changes: Tensor, count: int) -> Tensor:
     if len(changes) == count:
         return changes
     return changes * torch.eye(count).to(changes)[..., None, None]
+
+
+class Gauge:
+    """`parameters` whose changes from the values they have now have no part in `directions` [n, k].
+
+    The directions are of all entries one after another, and made orthonormal. With `is_relative`,
+    changes are those of logarithms.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter], directions: Tensor, is_relative: bool):
+        self.parameters, self.is_relative = parameters, is_relative
+        self.directions, self.start = torch.linalg.qr(directions)[0], self._values()
+
+    def hold(self) -> None:
+        """Takes the part of the directions out of the parameters' values."""
+        values = self._values()
+        values = values - self.directions @ (self.directions.T @ (values - self.start))
+        values = values.exp() if self.is_relative else values
+        sizes = [parameter.value.numel() for parameter in self.parameters]
+        for parameter, value in zip(self.parameters, values.split(sizes), strict=True):
+            value = value.view(parameter.value.shape).clamp(parameter.low, parameter.high)
+            parameter.value = value.requires_grad_()
+
+    def _values(self) -> Tensor:
+        values = torch.cat([parameter.value.detach().flatten() for parameter in self.parameters])
+        return values.log() if self.is_relative else values
+
+
+def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
+    """The gauges of `parameters`, where those of every training view of several are among them."""
+    known = {parameter.name: parameter for parameter in parameters}
+    gauges, views = list[Gauge](), train.views
+
+    def of_all(key: str) -> list[Parameter]:
+        chosen = [known.get(f"views.{view.name}.{key}") for view in views]
+        found = [parameter for parameter in chosen if parameter is not None]
+        return found if len(found) == len(views) > 1 else []
+
+    if exposures := of_all("exposure"):
+        gauges.append(Gauge(exposures, _common_gain(exposures), is_relative=True))
+    if cameras := of_all("camera"):
+        directions = torch.cat([_common_motion(view, train) for view in views])
+        gauges.append(Gauge(cameras, directions, is_relative=False))
+    return gauges
+
+
+def _common_gain(exposures: Sequence[Parameter]) -> Tensor:
+    """The same gain of all, [n, C]: of each color by itself where all have three."""
+    like = exposures[0].value.detach()
+    if all(len(parameter.value) == len(like) for parameter in exposures):
+        return torch.eye(len(like), dtype=like.dtype, device=like.device).repeat(len(exposures), 1)
+    return like.new_ones(sum(len(parameter.value) for parameter in exposures), 1)
+
+
+def _common_motion(view: View, scene: Scene) -> Tensor:
+    """What the volume's turns, shifts and growth are in the twist of a `view`, [6, 7].
+
+    A twist is in the camera's own axes (E29). A volume that grows looks as if it came closer.
+    """
+    axes, origin = view.camera.pose[:, :3].detach(), view.camera.pose[:, 3].detach()
+    motion = axes.new_zeros(6, 7)
+    motion[:3, :3] = motion[3:, 3:6] = axes.T
+    away = origin - origin.new_tensor(scene.volume.grid.center_xyz)
+    if view.camera.is_perspective:
+        motion[3:, 6] = axes.T @ away
+    return motion
+
+
+def weigh_calibration(pose: Parameter, curvature: Tensor, unit: Tensor, scene: Scene) -> Tensor:
+    """The second derivative [6, 6] of what the calibration of a camera adds to its view's loss.
+
+    It is as strong as what the picture, by the loss's `curvature` [6, 6], says of a shift in the
+    image by `TRUST`; both are in the `unit` [6] of the twist `pose`, its rates.
+    """
+    assert pose.view is not None
+    of_shifts = curvature.diagonal()[3:5].mean() / PIXELS**2
+    prior = calibration_prior(scene.view(pose.view).camera, scene.volume.grid).cpu()
+    return prior * unit * unit[:, None] * (tuning.TRUST**2 * of_shifts)
+
+
+def calibration_prior(camera: Camera, grid: Grid) -> Tensor:
+    """The inverse covariance [6, 6] of a twist of `camera` where its calibration is off (E29).
+
+    The direction errs by `TURN`, and by itself: a camera turns about its own place, not about the
+    volume as a twist does. The place errs by `SHIFT` of the distance from the middle of `grid`.
+    """
+    pose = camera.pose.detach().double()
+    away = pose[:, :3].T @ (pose[:, 3] - pose.new_tensor(grid.center_xyz))
+    distance = float(away.norm())
+    if not camera.is_perspective:
+        # Parallel rays come from no place: only what is across them counts.
+        away, distance = torch.zeros_like(away), math.hypot(*grid.extent) / 2
+    x, y, z = away.tolist()
+    # Where the camera goes, in its own axes: turn x away + shift.
+    turned = pose.new_tensor([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    place = torch.cat([turned, torch.eye(3).to(pose)], 1) / (tuning.SHIFT * distance)
+    turn = torch.cat([torch.eye(3).to(pose), torch.zeros(3, 3).to(pose)], 1) / tuning.TURN
+    return place.T @ place + turn.T @ turn

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 
 import torch
@@ -16,10 +16,10 @@ from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.responses import fit_held_out
 from ddrecon.reconstruct.shares import gather_numbers, own_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
+from ddrecon.variables.kinds import RESPONSE
 from ddrecon.variables.values import variable_names, with_values
 
 
@@ -30,122 +30,98 @@ def target_of(view: View) -> Tensor:
     return view.image
 
 
-@dataclass
+@dataclass(frozen=True)
+class Numbers:
+    """What Python knows of an iteration: the `loss`, and its part of the images.
+
+    `of_views` are numbers of each view that was compared: its loss, "psnr" [dB], "ssim" where that
+    was looked at, and "chi_square" per pixel where noise is known.
+    """
+
+    loss: float
+    of_images: float
+    of_views: Mapping[str, Sequence[float]]
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Their means over views, by kind."""
+        return {kind: sum(row) / len(row) for kind, row in self.of_views.items()}
+
+
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    `losses`, `psnrs` [dB] and, where `has_similarity`, `similarities` are those compared so far, in
-    their order, and `chi_squares` those of views that have a target among `noise_targets`;
-    `pictures` are the images by name. `gather` makes
-    the numbers those of all views.
+    With `has_similarity` by SSIM as well, and by chi^2 where there are `noise_targets`. `pictures`
+    are this rank's images so far, by name, `found` their numbers in that order, by kind.
     """
 
-    views: Sequence[View]
-    targets: Mapping[str, Target]
-    has_similarity: bool = False
-    noise_targets: Mapping[str, Target] = field(default_factory=dict)
-    pictures: dict[str, Tensor] = field(default_factory=dict)
-    losses: list[Tensor] = field(default_factory=list)
-    psnrs: list[Tensor] = field(default_factory=list)
-    similarities: list[Tensor] = field(default_factory=list)
-    chi_squares: list[Tensor] = field(default_factory=list)
+    def __init__(
+        self,
+        views: Sequence[View],
+        targets: Mapping[str, Target],
+        has_similarity: bool = False,
+        noise_targets: Mapping[str, Target] | None = None,
+    ):
+        self.views, self.targets, self.noise_targets = views, targets, noise_targets or {}
+        kinds = {"loss": True, "psnr": True, "ssim": has_similarity, "chi_square": noise_targets}
+        self.found: dict[str, list[Tensor]] = {kind: [] for kind, is_so in kinds.items() if is_so}
+        self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its rendered `image` add to the objective.
 
         That is its share, by weight, of the views' mean loss.
         """
-        target = self.targets[view.name]
-        self.pictures[view.name] = image.detach()
-        loss = target.loss_of(image)
-        self.psnrs.append(target.psnr_of(image.detach()))
-        if self.has_similarity:
-            self.similarities.append(target.ssim_of(image.detach()))
-        if view.name in self.noise_targets:
-            self.chi_squares.append(self.noise_targets[view.name].loss_of(image.detach()))
-        value = self.share(view) * loss
-        self.losses.append(value.detach())
+        target, seen = self.targets[view.name], image.detach()
+        self.pictures[view.name] = seen
+        value = self.share(view) * target.loss_of(image)
+        self.found["loss"].append(value.detach())
+        self.found["psnr"].append(target.psnr_of(seen))
+        if "ssim" in self.found:
+            self.found["ssim"].append(target.ssim_of(seen))
+        if "chi_square" in self.found:
+            self.found["chi_square"].append(self.noise_targets[view.name].loss_of(seen))
         return value
-
-    def gather(self) -> None:
-        """Learns what other ranks have compared, of which they keep the pictures."""
-        names = [view.name for view in self.views]
-        kinds = self.losses, self.psnrs, self.similarities, self.chi_squares
-        wanted = True, True, self.has_similarity, bool(self.noise_targets)
-        rows = [row for row, is_wanted in zip(kinds, wanted, strict=True) if is_wanted]
-        for row, found in zip(rows, gather_numbers(rows, list(self.pictures), names), strict=True):
-            row[:] = found
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""
         return view.weight / sum(view.weight for view in self.views)
 
+    def gather(self) -> None:
+        """Learns what other ranks have compared, of which they keep the pictures."""
+        names = [view.name for view in self.views]
+        self.found = gather_numbers(self.found, list(self.pictures), names)
+
     def require_finite(self) -> None:
         """Raises NotFiniteError where a loss is not finite."""
-        for view, loss in zip(self.views, self.losses, strict=False):
+        for view, loss in zip(self.views, self.found["loss"], strict=False):
             if not math.isfinite(loss):
                 raise NotFiniteError(f"the loss of view {view.name} is not finite")
 
+    def read(
+        self,
+        objective: Differentiated,
+        loss: Tensor,
+        gradients: Mapping[str, Tensor],
+        parameters: Sequence[Parameter],
+    ) -> Numbers:
+        """The numbers of an iteration, all read at once, with `loss` and `gradients` of all.
 
-@dataclass(frozen=True)
-class Numbers:
-    """What Python knows of an iteration: the `loss`, its part of the images, their mean `psnr`.
-
-    And their mean `ssim`, None where that was not looked at; `losses`, and chi^2 per pixel where
-    noise is known, of each view by name.
-    """
-
-    loss: float
-    of_images: float
-    psnr: float
-    ssim: float | None
-    losses: Mapping[str, float]
-    chi_squares: Mapping[str, float]
-
-    @property
-    def chi_square(self) -> float | None:
-        """Their mean chi^2 per pixel; None where noise is not known."""
-        known = self.chi_squares.values()
-        return sum(known) / len(known) if known else None
-
-
-def read_numbers(
-    compared: Comparison,
-    objective: Differentiated,
-    loss: Tensor,
-    gradients: Mapping[str, Tensor],
-    parameters: Sequence[Parameter],
-) -> Numbers:
-    """The numbers of an iteration, all read at once, with `loss` and `gradients` of all there is.
-
-    Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
-    """
-    compared.gather()
-    extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-    groups = [
-        [loss, objective.loss],
-        compared.psnrs,
-        compared.similarities,
-        compared.chi_squares,
-        compared.losses,
-        extremes,
-    ]
-    flat = iter(torch.stack([number for group in groups for number in group]).tolist())
-    (total, of_images), psnrs, similarities, chi_squares, losses, ends = (
-        list(islice(flat, len(group))) for group in groups
-    )
-    if not all(math.isfinite(number) for number in losses + ends):
-        compared.require_finite()
-        require_finite(parameters, gradients)
-    count, names = len(psnrs), [view.name for view in compared.views]
-    return Numbers(
-        total,
-        of_images,
-        sum(psnrs) / count,
-        sum(similarities) / count if similarities else None,
-        {v.name: x / compared.share(v) for v, x in zip(compared.views, losses, strict=True)},
-        dict(zip(names, chi_squares, strict=False)),
-    )
+        Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not
+        finite.
+        """
+        self.gather()
+        extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
+        groups = [[loss, objective.loss], extremes, *self.found.values()]
+        flat = iter(torch.stack([number for group in groups for number in group]).tolist())
+        (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
+        of_views = dict(zip(self.found, rows, strict=True))
+        if not all(math.isfinite(number) for number in of_views["loss"] + ends):
+            self.require_finite()
+            require_finite(parameters, gradients)
+        shares = map(self.share, self.views)
+        losses = [x / share for x, share in zip(of_views["loss"], shares, strict=True)]
+        return Numbers(total, of_images, of_views | {"loss": losses})
 
 
 def add_penalties(
@@ -177,18 +153,67 @@ def render_quality(
     each best where exposures are among them.
     """
     known, names = variable_names(scene), [view.name for view in scene.views]
-    own, rows = own_views(scene, names), [list[Tensor](), list[Tensor]()]
+    own, found = own_views(scene, names), {"psnr": list[Tensor](), "ssim": list[Tensor]()}
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in known}
         rendered = with_values(scene, values)
         views = [rendered.view(name) for name in (names if cells_are_shared() else own)]
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
-            if view.name not in own:
-                continue
-            target = targets[view.name]
-            fitted, _ = fit_held_out(image, view, target, parameters)
-            rows[0].append(target.psnr_of(fitted))
-            rows[1].append(target.ssim_of(fitted))
-    numbers = [torch.stack(row).mean() for row in gather_numbers(rows, own, names)]
-    psnr, ssim = torch.stack(numbers).tolist()
+            if view.name in own:
+                target = targets[view.name]
+                fitted, _ = fit_held_out(image, view, target, parameters)
+                found["psnr"].append(target.psnr_of(fitted))
+                found["ssim"].append(target.ssim_of(fitted))
+    rows = gather_numbers(found, own, names).values()
+    psnr, ssim = torch.stack([torch.stack(row).mean() for row in rows]).tolist()
     return psnr, ssim
+
+
+def fit_held_out(
+    picture: Tensor, view: View, target: Target, parameters: Sequence[Parameter]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The `picture` [3, h, w] of a test `view` with the response that fits its own `target` best.
+
+    And what that is, by key: of exposure and offset those that are `parameters` of training views.
+    Least squares count errors in the dark more than PSNR does where pictures are displayed, and may
+    do harm to a picture that is far off: then the exposure alone is found, or none.
+    """
+    sizes = {p.key: len(p.value) for p in parameters if p.view is not None and p.key in RESPONSE}
+    exposure, offset = (
+        picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
+        for key, default in RESPONSE.items()
+    )
+    known = {"exposure": exposure, "offset": offset}
+    light = (picture - offset.view(-1, 1, 1)) / exposure.view(-1, 1, 1)
+    tried = [(picture, {key: known[key].expand(size) for key, size in sizes.items()})]
+    for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
+        if sizes.keys() >= set(keys):
+            fit = fit_response(light, target, known, {key: sizes[key] for key in keys})
+            shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
+            tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
+    return max(tried, key=lambda each: float(target.psnr_of(each[0])))
+
+
+def fit_response(
+    light: Tensor, target: Target, known: Mapping[str, Tensor], sizes: Mapping[str, int]
+) -> dict[str, Tensor]:
+    """The exposure and offset by which `light` [3, h, w] is nearest to `target`.
+
+    By least squares, weighed as the target's loss weighs small errors. Those in `sizes`, of so many
+    entries, 1 or 3, are found; the others are `known`. A background behind the volume counts as if
+    it were exposed with it.
+    """
+    basis = {"exposure": light, "offset": torch.ones_like(light)}
+    weight = target.slope if target.seen is None else target.slope * target.seen
+    right, columns = target.image, list[Tensor]()
+    for key, part in basis.items():
+        if key in sizes:
+            each = torch.eye(3).to(light) if sizes[key] == 3 else light.new_ones(1, 3)
+            columns.append(each[..., None, None] * part)
+        else:
+            right = right - known[key].view(-1, 1, 1) * part
+    matrix = (torch.cat(columns) * weight).flatten(1).double().cpu()
+    normal, right = matrix @ matrix.T, matrix @ (right * weight).flatten().double().cpu()
+    # What a picture does not show, such as the exposure of black, is 0.
+    found = (torch.linalg.pinv(normal, hermitian=True) @ right).to(light)
+    return {**known, **dict(zip(sizes, found.split(list(sizes.values())), strict=True))}

@@ -95,7 +95,7 @@ class Parameter:
         if current_engine() == "warp":
             from ddrecon.reconstruct.fused.passes import step_adam
 
-            many = self.moments, keep, self.steps, rate, smallest, keep[0], (self.low, self.high)
+            many = self.moments, self.steps, rate, smallest, (self.low, self.high)
             value, self.moments = step_adam(before, gradient, *many)
         else:
             first = self.moments[0].lerp(gradient, 1 - keep[0])
@@ -154,16 +154,6 @@ class Parameter:
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
         }
-
-    def backup(self) -> dict[str, Any]:
-        """Its state, but that moments of a large field are rounded to 1 in 256 (bfloat16).
-
-        It is gone back to only where a step led astray.
-        """
-        state = self.state()
-        if self.value.numel() >= tuning.HALVED and self.value.dtype is torch.float32:
-            state["moments"] = [moment.bfloat16() for moment in self.moments]
-        return state
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""

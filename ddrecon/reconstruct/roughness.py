@@ -1,4 +1,4 @@
-"""The quadratic that total variation is held under: what smoothing says of a field, as a Gaussian.
+"""The quadratic that total variation lies under: what smoothing says of a field, as a Gaussian.
 
 The length of a slope, |s|, lies below (|s|^2 / |s0| + |s0|) / 2, and touches it at the slope s0
 that the field has (lagged diffusivity: Vogel and Oman 1996, doi:10.1137/0917016). So about a
@@ -45,10 +45,6 @@ class Roughness:
         """That of `factor` times the weight."""
         return Roughness(self.grid, factor * self.stiffness)
 
-    def double(self) -> Roughness:
-        """The same in float64."""
-        return Roughness(self.grid, self.stiffness.double())
-
     def product(self, change: Tensor) -> Tensor:
         """R times `change` [..., z, y, x]."""
         return join_slopes([self.stiffness * s for s in slopes(change, self.grid)], self.grid)
@@ -67,9 +63,9 @@ class Roughness:
     def diagonal(self) -> Tensor:
         """The diagonal of R."""
         total = torch.zeros_like(self.stiffness)
-        for axis, held in zip(AXES, self.conductances(), strict=True):
-            total.narrow(axis, 0, held.shape[axis]).add_(held)
-            total.narrow(axis, 1, held.shape[axis]).add_(held)
+        for axis, each in zip(AXES, self.conductances(), strict=True):
+            total.narrow(axis, 0, each.shape[axis]).add_(each)
+            total.narrow(axis, 1, each.shape[axis]).add_(each)
         return total
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -133,14 +133,6 @@ class Schedule:
             text += f"; chi^2 per pixel is {chi_square:.3g}"
         return {"kind": kind, "text": text, "chi_square": chi_square}
 
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it."""
-        return asdict(self.progress)
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a `state`."""
-        self.progress = Progress(**state)
-
     @property
     def _part_ends(self) -> list[int]:
         """Where in the plan each part ends but the last."""
@@ -171,16 +163,16 @@ def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
     return fall
 
 
-def pick_views(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
+def pick_views(count: int, drawn: int, iteration: int, seed: int) -> list[int]:
     """The numbers of the views, of `count`, that `iteration` compares.
 
-    They are `wanted` views (0: all). Every view comes once before any comes again, in an order that
+    They are `drawn` views (0: all). Every view comes once before any comes again, in an order that
     `seed` decides.
     """
-    if not 0 < wanted < count:
+    if not 0 < drawn < count:
         return list(range(count))
     # Over a run, views are taken from shuffled passes over all of them, one after another.
-    places = range(iteration * wanted, (iteration + 1) * wanted)
+    places = range(iteration * drawn, (iteration + 1) * drawn)
     orders = {number: _shuffle(count, seed, number) for number in {i // count for i in places}}
     return [orders[place // count][place % count] for place in places]
 

@@ -18,8 +18,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
-from ddrecon.variables.default_rates import unit_of
-from ddrecon.variables.kinds import is_of_volume, kind_of
+from ddrecon.variables.kinds import is_of_volume, kind_of, unit_of
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 
@@ -54,8 +53,9 @@ class Problem:
         loss = choose_loss(settings, train)
         views = replace(scene, views=[*train.views, *test.views])
         noises = known_noises(views, settings, loss)
-        power = mean_power(targets_of(train, loss, noises))
-        support = start_support(train, settings)
+        powers = [target.power for target in targets_of(train, loss, noises).values()]
+        power = float(torch.stack(powers).mean())
+        support = find_support(train, settings)
         levels = factors(scene, settings.refine_at)
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 
@@ -121,7 +121,9 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
             "no training picture shows anything where its pixels count; masks are white there",
         )
     if _is_dark(train, settings):
-        raise SceneError("lights: none shines, and none is sought: give one a brightness above 0")
+        raise SceneError(
+            "lights: none shines, and none is optimized: give one a brightness above 0"
+        )
     known = variable_names(train)
     problems = [
         f"optimize.parameters.{name}: there is no training view of this name with an image"
@@ -137,7 +139,7 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
 
 
 def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
-    """Whether there is nothing to be seen: no light that shines or is sought, no background."""
+    """Whether there is nothing to be seen: no light that shines or is optimized, no background."""
     has_light = any(
         all(bool(value.any()) for name, value in vars(light).items() if name in BRIGHTNESS)
         for light in train.lights
@@ -158,23 +160,15 @@ def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
     encoded = [view.name for view in train.views if view.step]
     linear = [view.name for view in train.views if not view.step]
     if encoded and linear:
+        some, others = (
+            ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+            for names in (encoded, linear)
+        )
         raise SceneError(
-            f"optimize.loss: some training pictures are sRGB files ({_name_some(encoded)}), others"
-            f" linear ({_name_some(linear)}); say how to compare them, loss: display or loss: l2"
+            f"optimize.loss: some training pictures are sRGB files ({some}), others linear"
+            f" ({others}); say how to compare them, loss: display or loss: l2"
         )
     return "display" if encoded else "l2"
-
-
-def _name_some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-
-
-def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
-    """The noise of the picture of each view of `scene`, by name: given, or estimated from it."""
-    return {
-        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
-        for view in scene.views
-    }
 
 
 def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
@@ -186,10 +180,15 @@ def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
     """The noise of the picture of each view of `scene`, by name, where it is known, else nothing.
 
-    It is known where the scene gives that of every training view, or where `loss` compares by it.
+    It is known where the scene gives that of every training view, or where `loss` compares by it:
+    then it is estimated from pictures where it is not given.
     """
-    is_given = all(view.is_test or given_noise(view, settings) for view in scene.views)
-    return noises_of(scene, settings) if is_given or loss == "photon" else {}
+    if loss != "photon" and not all(v.is_test or given_noise(v, settings) for v in scene.views):
+        return {}
+    return {
+        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
+        for view in scene.views
+    }
 
 
 def noise_targets(level: Scene, scene: Scene, noises: Mapping[str, Noise]) -> dict[str, Target]:
@@ -215,11 +214,6 @@ def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str
     }
 
 
-def mean_power(targets: Mapping[str, Target]) -> float:
-    """The mean square of the `targets`, as they are compared."""
-    return float(torch.stack([target.power for target in targets.values()]).mean())
-
-
 def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter]:
     """The parameters that `settings` name, at the values from which `scene` starts them."""
     starts = {
@@ -228,24 +222,12 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
     }
     parameters, begun = [], with_values(scene, starts)
     for name, start in starts.items():
-        wanted = settings.parameters[name]
-        rate, unit = wanted.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
-        parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
+        chosen = settings.parameters[name]
+        rate, unit = chosen.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
+        parameters.append(Parameter(name, chosen, rate, start, scene.volume.grid, unit))
     # Lights wait for fields alone, and not for those whose level is moved with the lights (E43).
     has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
     if has_levels or not any(parameter.is_field for parameter in parameters):
         for parameter in parameters:
             parameter.release = 0.0
     return parameters
-
-
-def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
-    """Where density may be, by the views of `train`; None is anywhere.
-
-    Raises SceneError where that is nowhere.
-    """
-    density = settings.parameters.get("density")
-    support = None if density is None else find_support(train.views, density)
-    if support is not None:
-        support.on(train.volume.grid)
-    return support

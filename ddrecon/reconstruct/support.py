@@ -19,8 +19,9 @@ from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.pictures.noise import estimate_noise
 from ddrecon.reconstruct import tuning
-from ddrecon.scene import View
-from ddrecon.settings import AUTO, MASKS, ParameterSettings
+from ddrecon.reconstruct.objective import target_of
+from ddrecon.scene import Scene, View
+from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
 KEY = "optimize.parameters.density.support"
 
@@ -70,34 +71,35 @@ def support_text(support: dict[str, float]) -> str:
     return f"support: density in {part:.3g} % of the cells, where every view may show some"
 
 
-def find_support(views: Sequence[View], settings: ParameterSettings) -> Support | None:
-    """The support that `settings` of density ask for; None where medium may be anywhere.
+def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
+    """The support of density that `settings` ask for, by the views of `train`; None is anywhere.
 
-    `views` are the training views. Raises SceneError where a view shows nothing at all.
+    Raises SceneError where a view shows nothing at all, or no cell is left.
     """
-    wanted = settings.support
-    if wanted is None:
+    density = settings.parameters.get("density")
+    if density is None or density.support is None:
         return None
-    shown = [_shown(view, wanted) for view in views]
-    empty = [view.name for view, pixels in zip(views, shown, strict=True) if not pixels.any()]
+    shown = [_shown(view, density.support) for view in train.views]
+    empty = [view.name for view, pixels in zip(train.views, shown, strict=True) if not pixels.any()]
     if empty:
         known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
-        raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {known[wanted]}")
-    return Support(views, shown, settings.support_margin)
+        by = known[density.support]
+        raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
+    support = Support(train.views, shown, density.support_margin)
+    support.on(train.volume.grid)
+    return support
 
 
-def _shown(view: View, wanted: str) -> Tensor:
+def _shown(view: View, support: str) -> Tensor:
     """Which pixels of `view` show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
     with `auto`, where the brightest color is above black, or is not known.
     """
-    if wanted == MASKS and view.mask is not None:
+    if support == MASKS and view.mask is not None:
         return view.mask > 0
-    if view.image is None:
-        raise ValueError(f"view {view.name} has no image")
-    threshold = brightest_black(view.image, view.step) if wanted == AUTO else 0.0
-    shown = view.image.amax(0) > threshold
+    image = target_of(view)
+    shown = image.amax(0) > (brightest_black(image, view.step) if support == AUTO else 0.0)
     return shown if view.mask is None else shown | (view.mask == 0)
 
 

@@ -24,8 +24,6 @@ WARM_UP = 5
 full size, and would throw away what a coarser grid has found. With 10 the plume is less close."""
 FINAL_RATE = 0.2
 """Rates fall exponentially over a run, to this part of their value."""
-HALVED = 1 << 20
-"""Of fields of so many numbers, what a run goes back to has moments in half the bits: memory."""
 
 # How numbers move: damped Gauss-Newton steps (E43). Chosen on the capture at half size, and seen on
 # Fig. 10 and 14.
@@ -68,9 +66,3 @@ DARKEST = 0.1
 """So much of each picture, at least, is background."""
 DEVIATIONS = 4.0
 """Black is less than so many deviations of noise above it."""
-
-# How ranks share views (`shares`). Chosen by timing the plume.
-CELL_COST = 0.5
-"""What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
-COARSE = 16
-"""A view's rays are counted as if it had about so many pixels along its shorter side."""

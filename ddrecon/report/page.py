@@ -129,11 +129,6 @@ def picture(png: bytes, caption: str, width: int = 600) -> str:
     return _captioned(embed(png, caption, shown), caption)
 
 
-def movie(webp: bytes, caption: str) -> str:
-    """The moving picture `webp`, large and smooth, above `caption`."""
-    return _captioned(embed(webp, caption, 'class="turntable"'), caption)
-
-
 def pair(target: bytes, render: bytes, caption: str) -> str:
     """Two pictures of one view side by side, or one over the other where scripts run."""
     images = embed(target, f"{caption}, target") + embed(render, f"{caption}, render")

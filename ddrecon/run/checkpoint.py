@@ -1,7 +1,14 @@
-"""Checkpoints: files of tensors and plain values that hold the state of a run; two are kept."""
+"""Checkpoints: files of tensors and plain values that hold the state of a run; two are kept.
+
+Each has a description of what the run's result depends on, in plain values, so that only the same
+run goes on from it.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -11,8 +18,10 @@ from typing import Any
 import torch
 
 from ddrecon.errors import DataWarning, FormatError, UsageError
-from ddrecon.io.files.atomic import replace_file_durably
-from ddrecon.run.differences import differences
+from ddrecon.io.files.atomic import refusals, replace_file_durably
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.scene_file.dump import describe
+from ddrecon.scene_file.load import SceneFile, referenced_files
 
 FORMAT = 7
 """What a checkpoint holds; counts up when that changes."""
@@ -21,6 +30,9 @@ LAST, PREVIOUS = "last.pt", "previous.pt"
 ANEW = "start anew with --overwrite"
 UNUSABLE = f"not a usable checkpoint; {ANEW}"
 """What is wrong with a damaged checkpoint, and what to do."""
+LONGEST = 80
+"""Values of more characters are cut short where they are shown."""
+ABSENT = object()
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
@@ -65,6 +77,20 @@ def load_checkpoint(
         return state, previous
 
 
+def continue_from(loaded: Path) -> None:
+    """Makes the checkpoint `loaded` the last one: what was damaged after it goes."""
+    with refusals(loaded):
+        os.replace(loaded, loaded.with_name(LAST))
+
+
+def restore_run(run: Reconstruction, state: dict[str, Any], loaded: Path) -> None:
+    """Has `run` go on from the `state` in the file `loaded`; FormatError where it does not fit."""
+    try:
+        run.restore(state)
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise FormatError(loaded, UNUSABLE) from error
+
+
 def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
     """The state in the file at `path`.
 
@@ -95,3 +121,59 @@ def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
             ]
         )
     return dict(content["state"])
+
+
+def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
+    """The resolved scene, the contents of the files it names and the precision.
+
+    Less what a resumed run may change: the number of iterations, and learning rates.
+    """
+    scene = describe(scene_file)
+    scene["optimize"].pop("iterations", None)
+    for settings in scene["optimize"]["parameters"].values():
+        settings.pop("lr", None)
+    contents = {f"the content of {path}": _digest(path) for path in referenced_files(scene_file)}
+    return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
+
+
+def differences(old: Any, new: Any, path: str = "") -> list[str]:
+    """The differences between two trees of mappings, lists and plain values, a text for each.
+
+    A text reads `key.path is A there, B now`; both trees stand at `path`.
+    """
+    one, other = _children(old), _children(new)
+    if one is None or other is None:
+        return [f"{path} is {_shorten(old)} there, {_shorten(new)} now"] if old != new else []
+    pairs = {key: (one.get(key, ABSENT), other.get(key, ABSENT)) for key in [*one, *other]}
+    return [
+        text
+        for key, pair in pairs.items()
+        for text in differences(*pair, f"{path}.{key}" if path else str(key))
+    ]
+
+
+def _children(tree: Any) -> Mapping[Any, Any] | None:
+    """By name or number; None of a plain value, as which a list of numbers counts."""
+    if isinstance(tree, list) and any(isinstance(entry, Mapping) for entry in tree):
+        return dict(enumerate(tree))
+    return tree if isinstance(tree, Mapping) else None
+
+
+def _shorten(value: Any) -> str:
+    if value is ABSENT:
+        return "absent"
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _digest(path: Path) -> str:
+    """The SHA-256 of the file at `path`, or of those of all files in the folder `path`."""
+    if path.is_dir():
+        return hashlib.sha256(
+            "".join(_digest(entry) for entry in sorted(path.iterdir())).encode()
+        ).hexdigest()
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error

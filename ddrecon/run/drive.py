@@ -10,22 +10,18 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
+from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
-from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
-from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
-from ddrecon.run.differences import fingerprint
-from ddrecon.run.leftovers import remove_run
-from ddrecon.run.quality import describe_loss, loss_text, render_run
-from ddrecon.run.report_volume import turntable_images
-from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
+from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
+from ddrecon.run.quality import describe_loss, find_results, loss_text
+from ddrecon.run.run_folder import CHECKPOINTS, RunFolder, remove_run
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import SceneFile
@@ -76,10 +72,7 @@ def _begin(scene: Scene, scene_file: SceneFile) -> Reconstruction:
 def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     """Restores `run` from the run folder `path`; returns the file it took."""
     state, loaded = load_checkpoint(path / CHECKPOINTS, scene)
-    try:
-        run.restore(state)
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise FormatError(loaded, UNUSABLE) from error
+    restore_run(run, state, loaded)
     if run.iteration > run.schedule.most:
         raise UsageError(
             f"{path}: {run.iteration} iterations are made already; "
@@ -104,12 +97,11 @@ def follow_run(
         while not run.is_done:
             run.step()
             if cells_are_shared() and preview_every and run.iteration % preview_every == 0:
-                render_run(run)
+                find_results(run)
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
     if cells_are_shared():
-        scene, light_field, *_ = render_run(run)
-        turntable_images(scene, light_field)
+        find_results(run)
     return run
 
 
@@ -142,7 +134,11 @@ def drive_run(
                     folder.save_in_time(run)
                     row = run.step()
                     folder.log.add(row)
-                    bar.set_postfix_str(progress_text(run.total, row), refresh=False)
+                    known = run.total.test_psnr
+                    test = "" if known is None else f"/{known:.1f}"
+                    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
+                    told = f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
+                    bar.set_postfix_str(told, refresh=False)
                     bar.update()
                     if preview_every and row.iteration % preview_every == 0:
                         folder.preview(run)
@@ -164,13 +160,6 @@ def drive_run(
         leave_ranks()
     with alone():
         return folder.finish(run)
-
-
-def progress_text(total: Row, row: Row) -> str:
-    """The progress line: loss, PSNR of training and (last known) test views, solver iterations."""
-    test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
-    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
-    return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
 
 
 def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:

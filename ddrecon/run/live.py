@@ -15,17 +15,13 @@ from socket import create_server, socket
 from threading import Lock, Thread
 from time import monotonic
 
-import torch
-
 from ddrecon.errors import DdreconError, UsageError
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
-from ddrecon.run.checkpoint import load_checkpoint, newest_checkpoint
+from ddrecon.run.checkpoint import newest_checkpoint
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import Findings, given_fields, render_run
-from ddrecon.run.report import curves, view_section
-from ddrecon.run.report_volume import volume_section
-from ddrecon.run.run_folder import require_run
+from ddrecon.run.quality import find_results
+from ddrecon.run.report import curves, view_section, volume_section
+from ddrecon.run.run_folder import load_run, require_run
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import AUTO, Iterations
 
@@ -89,25 +85,15 @@ class LiveRun:
             self.maker.join()
 
     def _remake(self) -> None:
-        start = monotonic()
+        """Makes volume and views as the last checkpoint has them."""
+        start, path = monotonic(), self.folder / "scene.yaml"
         # What cannot be shown now may be with the next checkpoint.
         with suppress(DdreconError):
-            self.sections = self._make_sections()
+            run = load_run(self.folder, lambda dtype: load_scene(path, dtype=dtype))
+            self.iterations, found = run.problem.settings.iterations, find_results(run)
+            volume = section("Volume", volume_section(found, {}))
+            self.sections = [volume, section("Views", *view_section(found))]
         self.next_make = monotonic() + (monotonic() - start) * (1 / SHARE - 1)
-
-    def _make_sections(self) -> list[str]:
-        """Volume and views as the last checkpoint has them."""
-        state, _ = load_checkpoint(self.checkpoints)
-        dtype = next(iter(state["parameters"].values()))["value"].dtype
-        run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
-        run.restore(state)
-        self.iterations = run.problem.settings.iterations
-        with torch.no_grad():
-            scene, light_field, images, quality = render_run(run)
-        given = given_fields(run.problem.scene)
-        findings = Findings(scene, given, light_field, images, quality, [], {}, {}, "")
-        volume = section("Volume", volume_section(findings))
-        return [volume, section("Views", *view_section(findings))]
 
 
 def _written(file: Path | None) -> int:

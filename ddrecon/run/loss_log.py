@@ -25,10 +25,6 @@ class LossLog:
     def __init__(self, path: Path):
         self.path = path
 
-    def start(self) -> None:
-        """Begins anew."""
-        self._write([])
-
     def cut(self, iteration: int) -> None:
         """Removes the rows after `iteration`, where a resumed run goes on, and what is no row."""
         self._write(row for row in self.rows() if row.iteration <= iteration)
@@ -68,16 +64,13 @@ class LossLog:
 
 def _row(line: str) -> Row | None:
     """What `line` says; None where it is not whole, or no number stands where one should."""
-    cells = line.split(",")
+    read: dict[Any, Any] = {"int": int, "float": float}
+    read["float | None"] = lambda cell: float(cell) if cell else None
     try:
-        return Row(*(_read(f.type, cell) for f, cell in zip(fields(Row), cells, strict=True)))
+        cells = zip(fields(Row), line.split(","), strict=True)
+        return Row(*(read[column.type](cell) for column, cell in cells))
     except ValueError:
         return None
-
-
-def _read(kind: Any, cell: str) -> Any:
-    """What `cell` holds, by the type of its column."""
-    return int(cell) if kind == "int" else None if not cell and "None" in kind else float(cell)
 
 
 def _cells(row: Row) -> list[Any]:

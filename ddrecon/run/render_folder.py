@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
@@ -18,111 +19,69 @@ from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
-from ddrecon.ranks import (
-    cells_are_shared,
-    is_first,
-    own_rank,
-    rank_count,
-    sum_numbers,
-    sum_over_ranks,
-)
+from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.problems import suggestion
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
-from ddrecon.variables.tangents import render_tangent, variation
+from ddrecon.variables.tangents import variation, varied
 from ddrecon.variables.values import component_names, value_of, variable_names
 
-GRADIENT = "gradient"
+GRADIENT = ".gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
+PARTS = (".reduced", ".single", ".multiple")
 
 
 def render_to_folder(
-    scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress
-) -> dict[str, Any]:
-    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`.
-
-    The first rank alone writes.
-    """
-    memory, files, seconds, quality = SolveMemory(), {}, {}, {}
-    with torch.no_grad():
-        start = perf_counter()
-        light_field = solve_light(scene, memory)
-        light_seconds = perf_counter() - start
-        turns = _render_in_turns(light_field, scene, views, has_components, progress)
-        for view, images, taken in turns:
-            if not is_first():
-                continue
-            seconds[view.name] = taken
-            files[view.name] = [
-                path.name
-                for name, image in images.items()
-                for path in write_picture(folder / name, pixels(image))
-            ]
-            if view.image is not None:
-                loss = "display" if view.step else "l2"
-                target = Target.of(view.image, view.mask, loss)
-                quality[view.name] = float(target.psnr_of(images[view.name]))
-    return _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {
-        "psnr": quality
-    }
-
-
-def render_gradient_to_folder(
     scene: Scene,
     views: list[View],
     folder: Path,
     has_components: bool,
-    parameter: str,
     progress: Progress,
+    parameter: str | None = None,
 ) -> dict[str, Any]:
-    """As `render_to_folder`, with the images' derivatives with respect to `parameter`.
+    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`.
 
-    `require_variation` must allow it.
+    With a `parameter`, which `require_variation` must allow, also the images' derivatives by it.
+    The first rank alone writes.
     """
-    memory, scales = SolveMemory(), {}
-    seconds: dict[str, Any] = {}
-    taken = {view.name: 0.0 for view in views}
-    files: dict[str, list[str]] = {view.name: [] for view in views}
-
-    def images_of(world: Scene) -> dict[tuple[str, str], Tensor]:
-        start, images = perf_counter(), dict[tuple[str, str], Tensor]()
+    memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
+    files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
+    with torch.no_grad(), varied(scene, parameter) as world:
         light_field = solve_light(world, memory)
-        seconds["light"] = perf_counter() - start
-        own = views if cells_are_shared() else views[own_rank() :: rank_count()]
-        for view in progress([world.view(view.name) for view in own], "render"):
-            begun = perf_counter()
-            images |= {
-                (view.name, name): image
-                for name, image in _images(light_field, world, view, has_components).items()
-            }
-            taken[view.name] = perf_counter() - begun
-        return images
-
-    with torch.no_grad():
-        rendered = render_tangent(scene, parameter, images_of)
-    found = {name: image for (_, name), (image, _) in rendered.items()}
-    derived = {_derived(*key): derivative for key, (_, derivative) in rendered.items()}
-    if not cells_are_shared():
-        taken = dict(zip(taken, sum_numbers(list(taken.values())), strict=True))
-    for view in views:
-        names = _names(view, has_components)
-        images = _bring(view, found, names)
-        derivatives = _bring(view, derived, [_derived(view.name, name) for name in names])
-        if not is_first():
-            continue
-        for name in names:
-            written = write_picture(folder / name, pixels(images[name]))
-            name = _derived(view.name, name)
-            picture, scales[name] = diverging(derivatives[name])
-            written += write_picture(folder / name, pixels(derivatives[name]), picture)
-            files[view.name] += [path.name for path in written]
-    return _report(scene, memory, seconds | {"views": taken}, files) | {
-        "psnr": {},
-        "gradient": {"parameter": parameter, "full_scale": scales},
+        light_seconds = perf_counter() - start
+        names = _names(has_components, parameter is not None)
+        for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
+            if not is_first():
+                continue
+            seconds[view.name], files[view.name] = taken, []
+            for name, image in images.items():
+                called, picture = view.name + name, None
+                if name.startswith(GRADIENT):
+                    picture, scales[called] = diverging(image)
+                written = write_picture(folder / called, pixels(image), picture)
+                files[view.name] += [path.name for path in written]
+            if view.image is not None:
+                loss = "display" if view.step else "l2"
+                target = Target.of(view.image, view.mask, loss)
+                quality[view.name] = float(target.psnr_of(images[""]))
+    solves = [
+        {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
+        for r in memory.records
+    ]
+    report = {
+        "seconds": {"light": light_seconds, "views": seconds},
+        "solves": solves,
+        "physics": needed_terms(scene),
+        "files": files,
+        "preview": PREVIEW,
+        "psnr": quality,
     }
+    if parameter is not None:
+        report["gradient"] = {"parameter": parameter, "full_scale": scales}
+    return report
 
 
 def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
@@ -177,57 +136,43 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
     return [*lines, f"written to {folder}"]
 
 
-def _report(
-    scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]
-) -> dict[str, Any]:
-    solves = [
-        {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
-        for r in memory.records
-    ]
-    return {
-        "seconds": seconds,
-        "solves": solves,
-        "physics": needed_terms(scene),
-        "files": files,
-        "preview": PREVIEW,
-    }
-
-
-def _derived(view: str, name: str) -> str:
-    """What the derivative of the image of `view` called `name` is called."""
-    return f"{view}.{GRADIENT}{name.removeprefix(view)}"
-
-
-def _names(view: View, has_components: bool) -> list[str]:
-    """What the images of `view` are called, in their order."""
-    parts = ("reduced", "single", "multiple") if has_components else ()
-    return [view.name, *(f"{view.name}.{part}" for part in parts)]
+def _names(has_components: bool, has_derivatives: bool) -> list[str]:
+    """What the names of a view's images have after that of the view, in their order."""
+    names = ["", *(PARTS if has_components else ())]
+    return [part for n in names for part in ([n, GRADIENT + n] if has_derivatives else [n])]
 
 
 def _images(
-    light_field: LightField, scene: Scene, view: View, has_components: bool
+    light_field: LightField, scene: Scene, view: View, names: Sequence[str]
 ) -> dict[str, Tensor]:
+    """The images of `view` by these `names`."""
     picture = view_picture(light_field, scene, view)
-    if not has_components:
-        return {view.name: picture}
-    # As the camera exposes them; its offset, and what is behind, count as reduced.
-    parts = view_components(light_field, scene, view.camera)
-    gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
-    single, multiple = gain * parts.single, gain * parts.multiple
-    reduced = picture - single - multiple
-    named = {"reduced": reduced, "single": single, "multiple": multiple}
-    parts_of = {f"{view.name}.{name}": part for name, part in named.items()}
-    return {view.name: reduced + single + multiple, **parts_of}
+    found = {"": picture}
+    if PARTS[0] in names:
+        # As the camera exposes them; its offset, and what is behind, count as reduced.
+        parts = view_components(light_field, scene, view.camera)
+        gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
+        single, multiple = gain * parts.single, gain * parts.multiple
+        reduced = picture - single - multiple
+        images = reduced + single + multiple, reduced, single, multiple
+        found = dict(zip(("", *PARTS), images, strict=True))
+    pairs = {name: forward_ad.unpack_dual(image) for name, image in found.items()}
+    plain = {name: pair.primal for name, pair in pairs.items()}
+    derived = {
+        GRADIENT + name: torch.zeros_like(pair.primal) if pair.tangent is None else pair.tangent
+        for name, pair in pairs.items()
+    }
+    return {name: (plain | derived)[name] for name in names}
 
 
 def _render_in_turns(
     light_field: LightField,
     scene: Scene,
     views: list[View],
-    has_components: bool,
+    names: Sequence[str],
     progress: Progress,
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
-    """Each of `views`, its images, and the seconds that they took.
+    """Each of `views`, its images by these `names`, and the seconds that they took.
 
     With several ranks these are of a turn, in which each renders one view; where they share out
     cells, all render each view together.
@@ -235,17 +180,14 @@ def _render_in_turns(
     ranks, rank = (1, 0) if cells_are_shared() else (rank_count(), own_rank())
     for begin in progress(range(0, len(views), ranks), "render"):
         turn, start = views[begin : begin + ranks], perf_counter()
-        has_own = rank < len(turn)
-        images = _images(light_field, scene, turn[rank], has_components) if has_own else {}
+        images = dict[str, Tensor]()
+        if rank < len(turn):
+            images = _images(light_field, scene, scene.view(turn[rank].name), names)
         seconds = perf_counter() - start
-        for view in turn:
-            yield view, _bring(view, images, _names(view, has_components)), seconds
-
-
-def _bring(view: View, images: Mapping[str, Tensor], names: Sequence[str]) -> Mapping[str, Tensor]:
-    """The images of `view` called `names`, from the rank that has them as `images`."""
-    if rank_count() == 1 or cells_are_shared():
-        return images
-    nothing = view.camera.pose.new_zeros(3, *view.camera.size)
-    stack = torch.stack([images.get(name, nothing) for name in names])
-    return dict(zip(names, sum_over_ranks([stack])[0], strict=True))
+        for place, view in enumerate(turn):
+            if ranks > 1:
+                nothing = view.camera.pose.new_zeros(3, *view.camera.size)
+                parts = [images[name] if place == rank else nothing for name in names]
+                yield view, dict(zip(names, sum_over_ranks(parts), strict=True)), seconds
+            else:
+                yield view, images, seconds

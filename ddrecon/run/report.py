@@ -16,6 +16,7 @@ from torch import Tensor
 from ddrecon.engine import name_engines
 from ddrecon.io.images import srgb
 from ddrecon.io.images.movies import webp_of
+from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.shares import has_slabs
@@ -26,6 +27,7 @@ from ddrecon.report.page import (
     items,
     pair,
     paragraph,
+    picture,
     section,
     side_by_side,
     table,
@@ -34,11 +36,13 @@ from ddrecon.report.page import (
     warnings,
     write_page,
 )
-from ddrecon.report.pictures import find_white, pixels, shrink
+from ddrecon.report.pictures import find_white, pixels, projections, shrink, slices
+from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.quality import Findings
-from ddrecon.run.report_volume import turntable, volume_section
-from ddrecon.scene import View
+from ddrecon.scene import Scene, View
 from ddrecon.terms import engine_of_scene, needed_terms
+from ddrecon.turntable import upright_axis
+from ddrecon.variables.values import fields_of
 
 SHOWN = 24
 """Views whose pictures are on the page; all are in the folder."""
@@ -57,31 +61,37 @@ TIMING_HEAD = [
 """The columns of the table of timings."""
 
 
-def write_run_report(path: Path, findings: Findings) -> None:
-    """Writes the report of `findings` to `path`."""
+def write_run_report(
+    path: Path,
+    findings: Findings,
+    rows: Sequence[Row],
+    summary: Mapping[str, Any],
+    environment: Mapping[str, Any],
+) -> None:
+    """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
-    environment = {k: v for k, v in findings.environment.items() if k != "engines"}
-    diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
+    known = {key: value for key, value in environment.items() if key != "engines"}
+    settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
+    diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
-        section("Volume", volume_section(findings)),
-        section("Loss", side_by_side(*curves(findings.rows))),
+        section("Volume", volume_section(findings, summary)),
+        section("Loss", side_by_side(*curves(rows))),
         section("Views", *view_section(findings)),
-        section("Turntable", turntable(findings)),
-        section("Timings", _timings(findings.rows)),
+        section("Timings", _timings(rows)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
-        section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
-        section("Versions", versions(environment)),
+        section("Settings", fold("scene.yaml, all defaults filled in", settings)),
+        section("Versions", versions(known)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
-    write_page(path, title, _lead(findings), sections, is_alive=True)
+    write_page(path, title, _lead(scene, summary), sections, is_alive=True)
 
 
-def _lead(findings: Findings) -> str:
+def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
     """The sentence below the title."""
-    cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
-    summary, test = findings.summary, ""
+    cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
+    test = ""
     if summary["test_psnr"] is not None:
         test = (
             f", {summary['test_psnr']:.2f} dB (SSIM {summary['test_ssim']:.4f}) of views held out"
@@ -92,6 +102,50 @@ def _lead(findings: Findings) -> str:
         f"All of these compare {summary['compared']}; the loss is {summary['loss_function']}."
         f" It {summary['ended']['text']}."
     )
+
+
+def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
+    """Every field that was found, and beside it what the scene file has in its place.
+
+    And what of the volume the `summary` says was left out.
+    """
+    scene = findings.scene
+    named = fields_of(scene)
+    both = (*named.items(), *findings.given.items())
+    whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
+    z, y, x = scene.volume.grid.extent
+    fields = [
+        Shown(name, of, value, (x, y, z), whites[name])
+        for of, values in (("result", named), ("truth", findings.given))
+        for name, value in values.items()
+    ]
+    cameras = [view.camera for view in scene.views]
+    towards = cameras[0].pose[:, 3] - cameras[0].pose.new_tensor(scene.volume.grid.center_xyz)
+    eye = towards.tolist()
+    still = _stills(named)
+    viewer = volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
+    if "support" not in summary:
+        return viewer
+    left_out = 100 * (1 - summary["support"]["cells"])
+    return f"{viewer}\n{paragraph(f'Left out by the support: {left_out:.3g} % of the cells.')}"
+
+
+def _stills(fields: dict[str, Tensor]) -> str:
+    """Slices and projections of every field."""
+    parts = [
+        paragraph(
+            "Across z, x and y from left to right; y, or z, is up. The largest value is white;"
+            " where some are below 0, these are blue, 0 is white, and above is red."
+        )
+    ]
+    for name, value in fields.items():
+        largest = f"(the largest value of a cell is {float(value.max()):.4g})"
+        if bool((value < 0).any()):
+            largest = f"(values from {float(value.min()):.4g} to {float(value.max()):.4g})"
+        cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
+        means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
+        parts.append(side_by_side(cut, means))
+    return "\n".join(parts)
 
 
 def curves(rows: Sequence[Row]) -> list[str]:

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.settings import LENSES
-from ddrecon.variables.kinds import PAIRS, PHASE, is_of_volume, split_name
+from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, is_of_volume, split_name
 
 if TYPE_CHECKING:
     from ddrecon.scene import Scene
 
-LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
 
@@ -77,13 +76,22 @@ def describe_result(
     for view, section in zip(scene.views, described["views"], strict=True):
         height, width = view.camera.size
         camera = section["camera"] | {"resolution": [width, height]}
-        if f"views.{view.name}.camera" in values:
-            camera = _move_camera(camera, view.camera.pose.tolist())
-        camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
+        owner = f"views.{view.name}."
+        found = {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
+        if "camera" in found:
+            for key in ("origin", "target", "up"):
+                camera.pop(key, None)
+            camera["matrix"] = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
+        if "focal" in found:
+            camera["fov"] = 2 * math.degrees(math.atan(0.5 / found["focal"]))
+        if "principal_point" in found:
+            camera["principal_point"] = found["principal_point"]
+        if "distortion" in found:
+            model = camera["distortion"]["type"]
+            coefficients = zip(LENSES[model], found["distortion"], strict=True)
+            camera["distortion"] = {"type": model} | dict(coefficients)
         section["camera"] = camera
-        for key in ("exposure", "offset"):
-            if (value := values.get(f"views.{view.name}.{key}")) is not None:
-                section[key] = value
+        section.update({key: found[key] for key in RESPONSE if key in found})
     return described
 
 
@@ -112,23 +120,3 @@ def _put_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> None:
             # They count from chi_1 on, and replace those of a file.
             section[key] = [1.0, *number]
             section.pop("file", None)
-
-
-def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:
-    """The keys of the section `camera` that say what was found of its lens; None was not sought."""
-    found: dict[str, Any] = {}
-    if values["focal"] is not None:
-        found["fov"] = 2 * math.degrees(math.atan(0.5 / values["focal"]))
-    if values["principal_point"] is not None:
-        found["principal_point"] = values["principal_point"]
-    if values["distortion"] is not None:
-        model = camera["distortion"]["type"]
-        coefficients = zip(LENSES[model], values["distortion"], strict=True)
-        found["distortion"] = {"type": model} | dict(coefficients)
-    return found
-
-
-def _move_camera(camera: dict[str, Any], pose: list[list[float]]) -> dict[str, Any]:
-    """The section `camera`, standing where `pose` [3, 4] says."""
-    others = {key: camera[key] for key in camera if key not in ("origin", "target", "up")}
-    return others | {"matrix": [*pose, [0, 0, 0, 1]]}

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import SceneError, UsageError
+from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
@@ -19,16 +21,30 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.checkpoint import LAST, newest_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import (
+    continue_from,
+    load_checkpoint,
+    newest_checkpoint,
+    restore_run,
+    save_checkpoint,
+)
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import Findings, compared_by, given_fields, render_run, render_views, solve
+from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
-from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, is_of_volume, kind_of, split_name
+from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files
+from ddrecon.variables.kinds import (
+    EXTINCTION_AND_ALBEDO,
+    FIELDS,
+    PHASE,
+    RESPONSE,
+    is_of_volume,
+    kind_of,
+    split_name,
+)
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
@@ -37,6 +53,19 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
+
+
+def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
+    """The run in `folder` as it was saved last; `build` makes its scene, of a precision.
+
+    Raises UsageError where the folder holds no run, FormatError where it is damaged.
+    """
+    state, loaded = load_checkpoint(require_run(folder))
+    if "parameters" not in state:
+        raise UsageError(f"{folder}: holds no run; name the folder that `ddrecon optimize` wrote")
+    run = Reconstruction(build(next(iter(state["parameters"].values()))["value"].dtype))
+    restore_run(run, state, loaded)
+    return run
 
 
 def require_run(folder: Path) -> Path:
@@ -72,7 +101,7 @@ class RunFolder:
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run."""
-        self.log.start()
+        self.log.cut(0)
         self.save(run)
 
     def resume(self, run: Reconstruction, loaded: Path) -> None:
@@ -80,8 +109,7 @@ class RunFolder:
 
         The log is cut to end where it does, and a damaged checkpoint after it is replaced.
         """
-        with refusals(loaded):
-            os.replace(loaded, self.checkpoints / LAST)
+        continue_from(loaded)
         self.log.cut(run.iteration)
         self._note_saved(run, 0.0)
 
@@ -107,47 +135,37 @@ class RunFolder:
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
-        scene, _, images, _ = render_run(run)
-        self._pictures(scene, images, f".{run.iteration:06d}")
+        self._pictures(find_results(run), f".{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        scene = run.current_scene()
+        found = find_results(run)
+        scene = found.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
         values = {name: self._store(scene, name) for name in stored}
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
-        light_field = solve(scene)
-        images, quality = render_views(run, scene, light_field)
-        self._pictures(scene, images, "")
-        log, environment = self.log.rows(run.iteration), self.environment
-        diagnoses = diagnose(scene.views, images, quality, log)
-        summary = _summary(run) | {"views": quality, "diagnoses": diagnoses}
+        self._pictures(found, "")
+        rows = self.log.rows(run.iteration)
+        diagnoses = diagnose(scene.views, found.images, found.quality, rows)
+        summary = _summary(run) | {"views": found.quality, "diagnoses": diagnoses}
         write_json(self.path / "summary.json", summary)
-        settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        given = given_fields(run.problem.scene)
-        findings = Findings(
-            scene, given, light_field, images, quality, log, summary, environment, settings
-        )
-        write_run_report(self.path / "report.html", findings)
+        write_run_report(self.path / "report.html", found, rows, summary, self.environment)
         return summary
 
     def _store(self, scene: Scene, name: str) -> Any:
         """The value of a variable as plain numbers, or where its file is, which is written here."""
         value = value_of(scene, name)
         if value.ndim < 3:
-            return _plain(value)
-        if not kind_of(name).is_cellwise and value.ndim == 3:
-            return self._write_map(name, value)
-        array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+            return value.item() if value.numel() == 1 else value.tolist()
+        if not kind_of(name).is_cellwise:
+            return write_values(self.path / name, name, value, scene.volume.grid, is_map=True)
         medium, last = split_name(name)
-        called = last.removeprefix(PHASE)
-        stem = medium.removeprefix("media.") + called
-        file, box = Path("volumes", f"{stem}.npz"), np.array(scene.volume.grid.bounds_xyz)
-        write_field(self.path / file, called, array.float().cpu().numpy(), box)
-        return {"file": str(file)}
+        key = last.removeprefix(PHASE)
+        stem = self.path / "volumes" / (medium.removeprefix("media.") + key)
+        return {"file": f"volumes/{write_values(stem, key, value, scene.volume.grid)}"}
 
     def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
         """Everything of `scene` that is not a field, as plain values.
@@ -167,39 +185,98 @@ class RunFolder:
         for view in scene.views:
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
             parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
-            for key in ("exposure", "offset"):
-                if getattr(view, key) is not None:
-                    name = f"views.{view.name}.{key}"
-                    parameters[name] = value_of(scene, name).tolist()
+            for key in RESPONSE:
+                if (value := getattr(view, key)) is not None:
+                    parameters[f"views.{view.name}.{key}"] = value.tolist()
         return parameters
 
-    def _write_map(self, name: str, radiance: Tensor) -> str:
-        """Writes a map of radiance [C, h, w]; the name of its file."""
-        colors = radiance.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy()
-        write_linear(self.path / name, colors)
-        return f"{name}.npy"
-
-    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> None:
+    def _pictures(self, found: Findings, mark: str) -> None:
         """Writes pictures of views and fields."""
         folder = self.path / "previews"
-        for name, value in fields_of(scene).items():
+        for name, value in fields_of(found.scene).items():
             write_preview(folder / f"{name}.slices{mark}.png", slices(value))
-        for view in scene.views:
+        for view in found.scene.views:
             if view.image is not None:
-                shown = comparison(view.image, images[view.name])
+                shown = comparison(view.image, found.images[view.name])
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
-def _plain(value: Tensor) -> Any:
-    """`value` as nested lists; one number by itself."""
-    return value.item() if value.numel() == 1 else value.tolist()
+def write_values(stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool = False) -> str:
+    """The name of the file at `stem`, to which a field on `grid` is written under its `key`.
+
+    It is [z, y, x] or [C, z, y, x]; a map of radiance [C, h, w] becomes pixels.
+    """
+    if is_map:
+        write_linear(stem, value.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
+        return f"{stem.name}.npy"
+    file, box = stem.with_name(f"{stem.name}.npz"), np.array(grid.bounds_xyz)
+    array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+    write_field(file, key, array.float().cpu().numpy(), box)
+    return file.name
 
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
-    total = dict(vars(run.total))
-    summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
+    problem, total = run.problem, dict(vars(run.total))
+    summary = {"iterations": total.pop("iteration"), **total}
+    summary |= describe_loss(problem.settings, problem.train)
+    if problem.loss == "photon":
+        summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
     summary["ended"] = run.schedule.ending(run.iteration)
-    support = describe_support(run.problem.support, run.problem.scene.volume.grid)
-    if support is not None:
+    if (support := describe_support(problem.support, problem.scene.volume.grid)) is not None:
         summary["support"] = support
     return summary
+
+
+CHECKPOINT_FILES = ("checkpoints/last.pt", "checkpoints/previous.pt")
+SAMPLE_FILES = (
+    *("uncertainty.json", "report.html", *CHECKPOINT_FILES),
+    *(f"volumes/*_{kind}.*" for kind in ("std", "mean", "told")),
+    "samples/[0-9][0-9][0-9][0-9]/*",
+)
+"""What files of `ddrecon uncertainty` are called."""
+RUN_FILES = (
+    *("scene.yaml", "result.yaml", "environment.json", "parameters.json", "summary.json"),
+    *("loss.csv", "report.html", *CHECKPOINT_FILES),
+    *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
+    *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
+    *(f"uncertainty/{name}" for name in SAMPLE_FILES),
+)
+"""What files of `ddrecon optimize` are called, but for those named after media and views."""
+
+
+def remove_samples(folder: Path) -> None:
+    """Removes what `ddrecon uncertainty` has written to `folder`; raises FormatError."""
+    _remove(folder, SAMPLE_FILES, ())
+
+
+def remove_run(folder: Path, scene_file: SceneFile) -> None:
+    """Removes what `ddrecon optimize` has written to `folder`, but for what `scene_file` reads.
+
+    Raises FormatError where the system refuses.
+    """
+    kept = {path.resolve() for path in (scene_file.path, *referenced_files(scene_file))}
+    _remove(folder, [*RUN_FILES, *_names_by_scene(folder)], kept)
+
+
+def _names_by_scene(folder: Path) -> Iterator[str]:
+    """Files named after the media and the views of the scene that the run in `folder` had."""
+    try:
+        tree = read_scene(folder / "scene.yaml").tree
+    except SceneError:
+        return
+    for medium in ("", *(f"{name}." for name in getattr(tree.volume, "media", ()))):
+        yield from (f"volumes/{medium}{name.removeprefix(PHASE)}.npz" for name in FIELDS)
+    yield from (f"previews/{view.name}.png" for view in tree.views)
+
+
+def _remove(folder: Path, names: Iterable[str], kept: Iterable[Path]) -> None:
+    """Removes the files of these `names` in `folder`, and the folders within that this empties."""
+    with refusals(folder):
+        found = {path for name in names for path in folder.glob(name) if path.is_file()}
+        for path in found:
+            if path.resolve() not in kept:
+                path.unlink()
+    within = {parent for path in found for parent in path.parents if folder in parent.parents}
+    for parent in sorted(within, reverse=True):
+        with suppress(OSError):  # it holds something else
+            parent.rmdir()

@@ -44,8 +44,7 @@ from ddrecon.scene_file.schema import (
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
 from ddrecon.variables.kinds import PAIRS, PHASE, kind_of, split_name
-from ddrecon.variables.values import component_names, value_of, variable_names
-from ddrecon.variables.wildcards import name_each
+from ddrecon.variables.values import component_names, name_each, value_of, variable_names
 
 MORE_ROUNDS = 0.3, 0.6
 """A second moment of the phase function above one of these deserves a round more: by about so much

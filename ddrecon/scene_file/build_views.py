@@ -90,7 +90,7 @@ def _build_view(
     background = pictures.get("background")
     if background is None and isinstance(section.background, float | tuple):
         background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
-    lens, noise = camera.distortion, section.noise
+    lens = camera.distortion
     return View(
         section.name,
         replace(
@@ -106,7 +106,7 @@ def _build_view(
         color(section.offset, 0.0),
         background,
         step,
-        None if noise is None else Noise(noise.read, noise.shot, step),
+        None if section.noise is None else Noise(section.noise.read, section.noise.shot, step),
     )
 
 

@@ -25,62 +25,55 @@ from ddrecon.ranks import (
 )
 from ddrecon.slabs.slab import Slab
 
+Linear = Callable[[Tensor], Tensor]
+
+
+class _Exchange(torch.autograd.Function):
+    """`give(tensor)`, a linear exchange, whose transpose is `back`."""
+
+    @staticmethod
+    def forward(give: Linear, back: Linear, tensor: Tensor) -> Tensor:
+        return give(tensor)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.give, ctx.back = inputs[:2]
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, bar: Tensor) -> tuple[None, None, Tensor]:
+        return None, None, ctx.back(bar)
+
+    @staticmethod
+    def jvp(ctx: Any, _give: None, _back: None, change: Tensor) -> Any:
+        return ctx.give(change)
+
+
+def _exchange(give: Linear, back: Linear, tensor: Tensor) -> Tensor:
+    result: Tensor = _Exchange.apply(give, back, tensor)
+    return result
+
 
 def add_halo(own: Tensor, slab: Slab) -> Tensor:
     """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E40)."""
-    field: Tensor = _Exchange.apply(
-        lambda own: with_halo(own, slab), lambda field_bar: return_halo(field_bar, slab), own
-    )
-    return field
+    axis, (below, above) = slab.axis - 3, slab.halo
 
+    def give(own: Tensor) -> Tensor:
+        before, after = swap_ends(own, axis, slab.halo)
+        return torch.cat([part for part in (before, own, after) if part is not None], axis)
 
-def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
-    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E40).
+    def back(field_bar: Tensor) -> Tensor:
+        own_bar, (before, after) = (
+            slab.own(field_bar).clone(),
+            swap_ends(field_bar, axis, slab.halo),
+        )
+        if before is not None:
+            own_bar.narrow(axis, 0, below).add_(before)
+        if after is not None:
+            own_bar.narrow(axis, slab.size - above, above).add_(after)
+        return own_bar
 
-    `field` itself where `grid` is the whole.
-    """
-    if not isinstance(grid, Slab):
-        return field
-    return gather_own(grid.own(field), grid)
-
-
-def gather_own(own: Tensor, slab: Slab) -> Tensor:
-    """The same from the `own` layers of a slab, of any shape across its axis."""
-    return _gather(own, slab.axis - 3, slab.sizes, slab.rank)
-
-
-def gather_parts(part: Tensor) -> Tensor:
-    """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
-    return _gather(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
-
-
-def sum_slabs(part: Tensor) -> Tensor:
-    """The sum over ranks of `part`, any shape, differentiable (E40)."""
-    total: Tensor = _Exchange.apply(_sum, _sum, part)
-    return total
-
-
-def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
-    """The sum of `part` [K, R] over the ranks before this one, differentiable (E40).
-
-    Those are the ranks below where ray R `is_upwards`, else the ranks above.
-    """
-    total: Tensor = _Exchange.apply(
-        lambda part: _sum_before(part, is_upwards),
-        # Who are before one rank have it after them.
-        lambda total_bar: _sum_before(total_bar, ~is_upwards),
-        part,
-    )
-    return total
-
-
-def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
-    """What the ranks below and above have for this one, which has `below` and `above` for them.
-
-    All are of one shape; zero where no rank is. Differentiable (E40).
-    """
-    layers: tuple[Tensor, Tensor] = _Exchange.apply(_swap, _swap, below, above)
-    return layers
+    return _exchange(give, back, own)
 
 
 def renew_halo(field: Tensor, slab: Slab) -> Tensor:
@@ -88,81 +81,44 @@ def renew_halo(field: Tensor, slab: Slab) -> Tensor:
     return add_halo(slab.own(field), slab)
 
 
-def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
-    """All ranks' `own` parts one after the other along `axis` < 0, of `sizes`; no derivatives."""
-    most = max(sizes)
-    missing = most - own.shape[axis]
-    parts = gather_from_ranks(pad(own, (0, 0) * (-axis - 1) + (0, missing)))
-    return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
+def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
+    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E40).
+
+    `field` itself where `grid` is the whole.
+    """
+    return gather_own(grid.own(field), grid) if isinstance(grid, Slab) else field
 
 
-class _Exchange(torch.autograd.Function):
-    """`give(*tensors)`, one or several: a linear exchange, whose transpose is `back`."""
-
-    @staticmethod
-    def forward(give: Callable[..., Any], back: Callable[..., Any], *tensors: Tensor) -> Any:
-        return give(*tensors)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.give, ctx.back = inputs[:2]
-
-    @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        back = ctx.back(*bars)
-        return None, None, *(back if isinstance(back, tuple) else (back,))
-
-    @staticmethod
-    def jvp(ctx: Any, _give: None, _back: None, *changes: Tensor) -> Any:
-        return ctx.give(*changes)
+def gather_own(own: Tensor, slab: Slab) -> Tensor:
+    """The same from the `own` layers of a slab, of any shape across its axis."""
+    return _gather(own, slab.axis - 3, slab.sizes)
 
 
-def return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
-    """The transpose of `with_halo`: own cells' cotangents, with those that neighbors found."""
-    axis, (below, above), size = slab.axis - 3, slab.halo, slab.size
-    own_bar = slab.own(field_bar).clone()
-    lent = swap_with_neighbors(
-        field_bar.narrow(axis, 0, below) if below else None,
-        field_bar.narrow(axis, below + size, above) if above else None,
-    )
-    if lent[0] is not None:
-        own_bar.narrow(axis, 0, below).add_(lent[0])
-    if lent[1] is not None:
-        own_bar.narrow(axis, size - above, above).add_(lent[1])
-    return own_bar
+def gather_parts(part: Tensor) -> Tensor:
+    """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
+    return _gather(part[None], -part.ndim - 1, [1] * rank_count())
 
 
-def with_halo(own: Tensor, slab: Slab) -> Tensor:
-    """`own` cells [..., z, y, x] with those of neighbors, without derivatives."""
-    axis, (below, above) = slab.axis - 3, slab.halo
-    got = swap_with_neighbors(
-        own.narrow(axis, 0, below) if below else None,
-        own.narrow(axis, own.shape[axis] - above, above) if above else None,
-    )
-    return torch.cat([part for part in (got[0], own, got[1]) if part is not None], axis)
-
-
-def _gather(own: Tensor, axis: int, sizes: list[int], rank: int) -> Tensor:
-    """All ranks' `own` parts along `axis` < 0, of `sizes`; this is that of `rank`."""
-    begin, size = sum(sizes[:rank]), sizes[rank]
-    whole: Tensor = _Exchange.apply(
+def _gather(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
+    """All ranks' `own` parts along `axis` < 0, of `sizes`."""
+    begin, size = sum(sizes[: own_rank()]), sizes[own_rank()]
+    return _exchange(
         lambda own: join_parts(own, axis, sizes),
         lambda whole_bar: _sum(whole_bar).narrow(axis, begin, size),
         own,
     )
-    return whole
 
 
-def _sum(part: Tensor) -> Tensor:
-    """The sum over ranks, without derivatives; it is its own transpose."""
-    return sum_over_ranks([part])[0]
+def sum_slabs(part: Tensor) -> Tensor:
+    """The sum over ranks of `part`, any shape, differentiable (E40)."""
+    return _exchange(_sum, _sum, part)
 
 
-def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
-    """What `sum_before` returns, without derivatives.
+def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
+    """The sum of `part` [K, R] over the ranks before this one, differentiable (E40).
 
-    Each rank adds up some of the rays for all ranks: so bytes do not grow with their number.
+    Those are the ranks below where ray R `is_upwards`, else the ranks above. Each rank adds up some
+    of the rays for all ranks: so bytes do not grow with their number.
     """
     ranks, (fields, rays) = rank_count(), part.shape
     share = -(-rays // ranks)
@@ -170,18 +126,58 @@ def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
     def of_all(values: Tensor) -> Tensor:
         return pad(values, (0, share * ranks - rays)).unflatten(-1, (ranks, share))
 
-    parts = trade_with_ranks(of_all(part).transpose(0, 1))
-    nothing = torch.zeros_like(parts[:1])
-    up = torch.cat([nothing, parts[:-1]]).cumsum(0)
-    down = torch.cat([nothing, parts[1:].flip(0)]).cumsum(0).flip(0)
-    before = trade_with_ranks(torch.where(of_all(is_upwards)[own_rank()], up, down))
-    return before.transpose(0, 1).reshape(fields, -1)[:, :rays]
+    def add_up(part: Tensor, is_upwards: Tensor) -> Tensor:
+        parts = trade_with_ranks(of_all(part).transpose(0, 1))
+        nothing = torch.zeros_like(parts[:1])
+        up = torch.cat([nothing, parts[:-1]]).cumsum(0)
+        down = torch.cat([nothing, parts[1:].flip(0)]).cumsum(0).flip(0)
+        before = trade_with_ranks(torch.where(of_all(is_upwards)[own_rank()], up, down))
+        return before.transpose(0, 1).reshape(fields, -1)[:, :rays]
 
-
-def _swap(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
-    """What `swap_layers` returns, without derivatives; it is its own transpose."""
-    got = swap_with_neighbors(
-        below if own_rank() > 0 else None, above if own_rank() + 1 < rank_count() else None
+    # Who are before one rank have it after them.
+    return _exchange(
+        lambda part: add_up(part, is_upwards), lambda bar: add_up(bar, ~is_upwards), part
     )
-    from_below, from_above = (torch.zeros_like(below) if one is None else one for one in got)
+
+
+def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+    """What the ranks below and above have for this one, which has `below` and `above` for them.
+
+    All are of one shape; zero where no rank is. Differentiable (E40).
+    """
+
+    def swap(both: Tensor) -> Tensor:
+        below, above = both
+        got = swap_with_neighbors(
+            below if own_rank() > 0 else None, above if own_rank() + 1 < rank_count() else None
+        )
+        return torch.stack([torch.zeros_like(below) if one is None else one for one in got])
+
+    from_below, from_above = _exchange(swap, swap, torch.stack([below, above]))
     return from_below, from_above
+
+
+def swap_ends(
+    field: Tensor, axis: int, layers: tuple[int, int]
+) -> tuple[Tensor | None, Tensor | None]:
+    """What the ranks below and above have for this one, who get the ends of `field` along `axis`.
+
+    That are its first and its last `layers`, as many as those have for it; 0 where no rank is.
+    """
+    below, above = layers
+    return swap_with_neighbors(
+        field.narrow(axis, 0, below) if below else None,
+        field.narrow(axis, field.shape[axis] - above, above) if above else None,
+    )
+
+
+def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
+    """All ranks' `own` parts one after the other along `axis` < 0, of `sizes`; no derivatives."""
+    missing = max(sizes) - own.shape[axis]
+    parts = gather_from_ranks(pad(own, (0, 0) * (-axis - 1) + (0, missing)))
+    return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
+
+
+def _sum(part: Tensor) -> Tensor:
+    """The sum over ranks, without derivatives; it is its own transpose."""
+    return sum_over_ranks([part])[0]

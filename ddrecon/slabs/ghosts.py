@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from ddrecon.ranks import own_rank, sum_over_ranks, swap_with_neighbors
-from ddrecon.slabs.exchange import join_parts
+from ddrecon.ranks import own_rank, sum_over_ranks
+from ddrecon.slabs.exchange import join_parts, swap_ends
 from ddrecon.slabs.slab import Slab
 
 LAYERS = 2
@@ -55,10 +55,7 @@ class Ghosts:
     def fill(self, u: Tensor) -> Tensor:
         """`u`, whose ghosts are now what their owners have; changed in place."""
         (below, above), axis, end = self.layers, self.axis, u.shape[self.axis]
-        got = swap_with_neighbors(
-            u.narrow(axis, below, below) if below else None,
-            u.narrow(axis, end - 2 * above, above) if above else None,
-        )
+        got = swap_ends(self.own(u), axis, self.layers)
         if got[0] is not None:
             u.narrow(axis, 0, below).copy_(got[0])
         if got[1] is not None:

@@ -2,101 +2,61 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from ddrecon.io.files.json_file import write_json
-from ddrecon.io.images.table import write_linear
-from ddrecon.io.volumes.table import write_field
-from ddrecon.run.checkpoint import LAST, load_checkpoint, save_checkpoint
-from ddrecon.run.run_folder import CHECKPOINTS
-from ddrecon.uncertainty.next_view import Candidate, NextView
-from ddrecon.uncertainty.posterior import Sample
-from ddrecon.uncertainty.report import write_uncertainty_report
+from ddrecon.io.images.table import png_of
+from ddrecon.report.error_bar import draw_error_bar
+from ddrecon.report.page import paragraph, picture, section, table, write_page
+from ddrecon.report.pictures import slices
+from ddrecon.report.volumes import find_white_value
+from ddrecon.run.run_folder import write_values
 from ddrecon.uncertainty.samples import Uncertainty
+from ddrecon.variables.kinds import kind_of
 
 RECORD = "uncertainty.json"
 """What tells a folder of this kind."""
-SAMPLES = "samples"
-"""The folder of samples that are kept."""
 
 
-class UncertaintyFolder:
-    """The output folder `path` of samples, which depend on what is `described` in plain values.
-
-    With `has_samples` each is kept as volumes.
-    """
-
-    def __init__(self, path: Path, described: Mapping[str, Any], has_samples: bool):
-        self.path, self.described, self.has_samples = path, described, has_samples
-        self.checkpoints, self.began = path / CHECKPOINTS, perf_counter()
-        for name in ("volumes", CHECKPOINTS):
-            (path / name).mkdir(exist_ok=True)
-
-    def resume(self) -> dict[str, Any]:
-        """The state after the last sample; raises UsageError where it depends on something else."""
-        state, loaded = load_checkpoint(self.checkpoints, self.described)
-        os.replace(loaded, self.checkpoints / LAST)
-        self.began -= state["seconds"]
-        return state
-
-    def keep(self, sample: Sample, found: Uncertainty, ranking: NextView | None) -> None:
-        """Saves the state after `sample`, the last that was `found`."""
-        if self.has_samples:
-            _write_sample(found, sample.change, self.path / SAMPLES / f"{found.count - 1:04d}")
-        state = found.state() | {"seconds": perf_counter() - self.began}
-        if ranking is not None:
-            state["ranking"] = ranking.state()
-        save_checkpoint(self.checkpoints, state, self.described)
-
-    def finish(self, found: Uncertainty, ranked: Sequence[Candidate]) -> dict[str, Any]:
-        """What `uncertainty.json` says; writes it, volumes and report of what was `found`."""
-        stated = {"std": found.deviations, "mean": found.means, "told": found.told}
-        fields = dict[str, Any]()
-        for name in _written(found):
-            for kind, values in stated.items():
-                _write(found, self.path / "volumes", f"{name}_{kind}", values[name])
-            value, deviation = found.curvature.values[name], stated["std"][name]
-            fields[name] = {
-                "root_mean_square": float(value.square().mean().sqrt()),
-                "deviation": float(deviation.square().mean().sqrt()),
-                "told": float(stated["told"][name].mean()),
-            }
-        names, spread = found.number_names(), found.number_deviations().tolist()
-        numbers = {
-            name: {"value": value, "deviation": deviation}
-            for name, value, deviation in zip(
-                names, found.number_values().tolist(), spread, strict=True
-            )
-        }
-        record = {
-            "samples": found.count,
-            "seconds": perf_counter() - self.began,
-            "products": found.products,
-            "residual": found.residual,
-            "noise": found.errors.described(),
-            "fields": fields,
-            "numbers": numbers,
-            "correlations": found.correlations().tolist() if names else [],
-            "next_views": [candidate.described() for candidate in ranked],
-        }
-        write_json(self.path / RECORD, record)
-        write_uncertainty_report(self.path / "report.html", found, record)
-        return record
-
-
-def _write_sample(found: Uncertainty, change: Tensor, folder: Path) -> None:
-    """Writes the fields of a sample to `folder`."""
+def write_sample(found: Uncertainty, change: Tensor, path: Path) -> None:
+    """Writes the fields of the last sample, `change` from the optimum, to the folder `path`."""
+    folder = path / "samples" / f"{found.count - 1:04d}"
     folder.mkdir(parents=True, exist_ok=True)
     parts = found.curvature.split(change)
     for name in _written(found):
-        _write(found, folder, name, found.curvature.values[name] + parts[name])
+        _write(found, folder / name, name, found.curvature.values[name] + parts[name])
+
+
+def write_found(found: Uncertainty, path: Path, seconds: float) -> dict[str, Any]:
+    """What `uncertainty.json` says; writes it, volumes and report to the folder `path`."""
+    stated = {"std": found.deviations, "mean": found.means, "told": found.told}
+    fields = dict[str, Any]()
+    for name in _written(found):
+        for kind, values in stated.items():
+            _write(found, path / "volumes" / f"{name}_{kind}", name, values[name])
+        value, deviation = found.curvature.values[name], stated["std"][name]
+        fields[name] = {
+            "root_mean_square": float(value.square().mean().sqrt()),
+            "deviation": float(deviation.square().mean().sqrt()),
+            "told": float(stated["told"][name].mean()),
+        }
+    record = {
+        "samples": found.count,
+        "seconds": seconds,
+        "products": found.products,
+        "residual": found.residual,
+        "noise": found.errors.described(),
+        "fields": fields,
+        "numbers": found.described_numbers(),
+        "correlations": found.correlations().tolist() if found.tabled else [],
+    }
+    write_json(path / RECORD, record)
+    write_uncertainty_report(path / "report.html", stated, record)
+    return record
 
 
 def _written(found: Uncertainty) -> list[str]:
@@ -105,15 +65,9 @@ def _written(found: Uncertainty) -> list[str]:
     return [name for name in found.curvature.values if name not in tabled]
 
 
-def _write(found: Uncertainty, folder: Path, name: str, value: Tensor) -> None:
-    """Writes a field [z, y, x] or [C, z, y, x] to `folder`, or a map [C, h, w] of radiance."""
+def _write(found: Uncertainty, stem: Path, name: str, value: Tensor) -> None:
     grid = found.curvature.scene.volume.grid
-    if tuple(value.shape[-3:]) != grid.shape:
-        write_linear(folder / name, value.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
-        return
-    array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-    box = np.array(grid.bounds_xyz)
-    write_field(folder / f"{name}.npz", name, array.float().cpu().numpy(), box)
+    write_values(stem, stem.name, value, grid, is_map=not kind_of(name).is_cellwise)
 
 
 def volumes_in(folder: Path) -> list[Path]:
@@ -126,22 +80,122 @@ def volumes_in(folder: Path) -> list[Path]:
 def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
     """The `record` of a folder `path` as lines."""
     noise = record["noise"]
-    lines = [
+    return [
         f"{record['samples']} samples in {record['seconds']:.1f} s, {record['products']} products;"
-        f" pictures err by {noise['deviation']:.3g} (from {noise['from']})"
+        f" pictures err by {noise['deviation']:.3g} (from {noise['from']})",
+        *(
+            f"{name}: deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g}"
+            f" (root mean squares), {100 * field['told']:.0f} % told by pictures"
+            for name, field in record["fields"].items()
+        ),
+        *(
+            f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
+            for name, number in record["numbers"].items()
+        ),
+        f"deviations and report written to {path}",
     ]
-    lines += [
-        f"{name}: deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g}"
-        f" (root mean squares), {100 * field['told']:.0f} % told by pictures"
-        for name, field in record["fields"].items()
+
+
+STRONG = 0.5
+"""Correlations above this are told of."""
+
+
+def write_uncertainty_report(
+    path: Path, stated: Mapping[str, Mapping[str, Tensor]], record: Mapping[str, Any]
+) -> None:
+    """Writes the page about the fields `stated` by kind and name, and what `record` has of them."""
+    sections = [
+        section(
+            name.capitalize(),
+            *_field(name, {kind: values[name] for kind, values in stated.items()}, numbers),
+        )
+        for name, numbers in record["fields"].items()
     ]
-    lines += [
-        f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
+    if record["numbers"]:
+        sections.append(section("Numbers", *_numbers(record)))
+    sections.append(section("How", *_how(record)))
+    title = f"ddrecon: how sure {path.absolute().parent.name} is"
+    write_page(path, title, _lead(record), sections, is_alive=False)
+
+
+def _lead(record: Mapping[str, Any]) -> str:
+    noise = record["noise"]
+    source = "what the reconstruction leaves" if noise["told"] is not None else "the scene"
+    return (
+        f"{record['samples']} samples in {record['seconds']:.1f} s. "
+        f"Pictures err by {noise['deviation']:.3g} of radiance, by {source}."
+    )
+
+
+def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]) -> list[str]:
+    """Slices of a field."""
+    white, strongest = (find_white_value(stated[kind]) for kind in ("mean", "std"))
+    pictures = [
+        (stated["mean"], white, f"{name}, mean of the samples: white is {white:.3g}"),
+        (stated["std"], strongest, f"standard deviation: white is {strongest:.3g}"),
+        (stated["told"], 1.0, "told by pictures: black is nothing, white is all"),
+    ]
+    shown = "".join(
+        picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
+    )
+    return [
+        paragraph(
+            f"Deviation {numbers['deviation']:.3g} of {numbers['root_mean_square']:.3g} (root mean"
+            f" squares over all cells); {100 * numbers['told']:.0f} % told on average."
+            " Slices across z, x and y from left to right."
+        ),
+        f'<div class="views">{shown}</div>',
+    ]
+
+
+def _numbers(record: Mapping[str, Any]) -> list[str]:
+    """The table of numbers with their error bars, and of those that hang together."""
+    names = list(record["numbers"])
+    rows = [
+        (
+            name,
+            f"{number['value']:.5g} ± {number['deviation']:.2g}",
+            draw_error_bar(name, number["value"], number["deviation"]),
+        )
         for name, number in record["numbers"].items()
     ]
-    lines += [
-        f"{'next view: ' if place == 0 else '  then '}{view['name']}, whose picture takes at least "
-        f"{100 * view['gain']:.1f} % of the variance (+- {100 * view['error']:.1f})"
-        for place, view in enumerate(record["next_views"])
+    parts = [
+        table(["number", "value ± deviation", ""], rows),
+        paragraph("Thick: one deviation. Thin: two. The upright line is 0."),
     ]
-    return [*lines, f"deviations and report written to {path}"]
+    pairs = [
+        (names[i], names[j], f"{row[j]:+.2f}")
+        for i, row in enumerate(record["correlations"])
+        for j in range(i)
+        if abs(row[j]) > STRONG
+    ]
+    if pairs:
+        parts += [
+            paragraph(f"Numbers that hang together (correlation above {STRONG} by these samples):"),
+            table(["", "", "correlation"], pairs),
+        ]
+    return parts
+
+
+def _how(record: Mapping[str, Any]) -> list[str]:
+    """What stands behind the numbers."""
+    noise, error = record["noise"], 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
+    rows = [
+        ("deviation of a pixel, in radiance", f"{noise['deviation']:.3g}"),
+        ("known from", str(noise["from"])),
+        ("numbers in all pictures", str(noise["count"])),
+    ]
+    if noise["told"] is not None:
+        rows.append(("of these spent on telling the volume", f"{noise['told']:.0f}"))
+    return [
+        paragraph(
+            f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
+            " Told is the part of a cell's variance that pictures took away from what smoothing"
+            " alone leaves open, in the mean of the cells around."
+        ),
+        paragraph(
+            "All this is about the optimum that was found, for pictures that err by noise alone:"
+            " what the model of light lacks is not in it."
+        ),
+        table(["pictures", ""], rows),
+    ]

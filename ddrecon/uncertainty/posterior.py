@@ -7,16 +7,17 @@ whose data and prior were disturbed as much as they err.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ddrecon.numerics.around import mean_around
 from ddrecon.numerics.conjugate_gradients import Solved, conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.gauges import find_gauges
-from ddrecon.reconstruct.numbers import number_curvature, single_numbers
-from ddrecon.uncertainty.information import Information
+from ddrecon.reconstruct.numbers import find_gauges, number_curvature, single_numbers
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.uncertainty.prior import DIAGONAL, Prior, normal_like, rounding_of
 
 TOLERANCE = 0.5
@@ -28,7 +29,7 @@ TOLD = 0.4
 MOST = 40
 """Products with J^T W J that a sample may take."""
 ROUNDS = 10
-"""Times that cells are let go of or held at a bound."""
+"""Times that cells are let go of or fixed at a bound."""
 INNER = 6
 """Steps of each solve that conjugate gradients are preconditioned with,"""
 PRECONDITION = 0.1
@@ -36,7 +37,7 @@ PRECONDITION = 0.1
 PROBED = -1
 """The number of random vectors that belong to no sample, but to information."""
 GAUGE = 1e6
-"""How much more than by pictures a number is held by what no picture shows."""
+"""How much more than by pictures a number is constrained by what no picture shows."""
 BEGIN = 0.25
 """The part of the way from a draw of the prior to what pictures roughly leave of it (E39)."""
 
@@ -76,20 +77,35 @@ class Posterior:
         self.curvature, self.temperature = curvature, temperature
         self.seed, self.tolerance, self.most = seed, tolerance, MOST
         self.prior = Prior(curvature, temperature)
-        value = curvature.join(curvature.values)
-        self.low, self.high = (bound - value for bound in find_bounds(curvature))
+        value, parameters = curvature.join(curvature.values), curvature.parameters
+
+        def entries(number_of: Callable[[Parameter], float]) -> Tensor:
+            return curvature.join(
+                {p.name: torch.full_like(p.value, number_of(p)) for p in parameters}
+            )
+
+        self.low, self.high = entries(lambda p: p.low) - value, entries(lambda p: p.high) - value
         # What rounding leaves of a cell that no picture shows is at its bound.
-        near = {p.name: torch.full_like(p.value, rounding_of(p)) for p in curvature.parameters}
-        self.near = curvature.join(near)
-        self.is_kept = find_kept(curvature)
-        at_bound = self._is_held(torch.zeros_like(gradient), -gradient)
+        self.near = entries(rounding_of)
+        # Cells outside of a field's support stay as they are.
+        supports = [(p, p.support) for p in parameters if p.support is not None]
+        kept = {p.name: (support == 0).expand(p.value.shape).to(p.value) for p, support in supports}
+        self.is_kept = curvature.join(kept) > 0
+        at_bound = self._is_at_bound(torch.zeros_like(gradient), -gradient)
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
-        numbers = single_numbers(curvature.parameters)
-        self.numbers = {p.name: p.value.numel() for p in numbers}
+        numbers = single_numbers(parameters)
         self.is_number = curvature.join({p.name: torch.ones_like(p.value) for p in numbers}).bool()
-        self.between = number_curvature(curvature, numbers)
+        # Between them H is what pictures say, and how they are constrained without.
+        precisions = [
+            torch.atleast_1d(self.prior.precision[p.name].double().cpu()) for p in numbers
+        ]
+        blocks = [
+            block if block.ndim == 2 else block * torch.eye(p.value.numel())
+            for p, block in zip(numbers, precisions, strict=True)
+        ]
+        self.between = number_curvature(curvature, numbers) + torch.block_diag(*blocks).double()
         self.information = information or Information(curvature, generator_of(seed, PROBED))
 
     def sample(self, number: int) -> Sample:
@@ -97,18 +113,21 @@ class Posterior:
         generator = generator_of(self.seed, number)
         scale = self.temperature**0.5
         noise, level = (scale * part for part in self.prior.root_noise(generator))
-        prior = self._within(self.prior.without_levels(self._solve_prior(noise), self.is_kept))
+        draw = self._without_gauge(self.prior.solve(noise, self.is_kept))
+        prior = self._within(self.prior.without_levels(draw, self.is_kept))
         right = noise + level - self.gradient
-        begin = self._begin(prior, right)
-        # What is lacking there: both parts of the data in one adjoint.
+        # It begins at the draw, and a part of the way on to what pictures leave of it (E39).
+        is_fixed = self.is_kept | self._is_at_bound(prior, right)
+        begin = self._within(prior + BEGIN * (self._precondition(right, is_fixed) - prior))
+        # The residual there: both parts of the data in one adjoint.
         changes, disturbed = self.curvature.tangents(begin), self._disturbances(generator)
         weights = self.curvature.weights
-        lacking = right - self.prior.product(begin)
-        lacking += self.curvature.adjoint(
+        residual = right - self.prior.product(begin)
+        residual += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self.minimize(begin, lacking)
-        return Sample(change, prior, products, residual)
+        change, products, left = self.minimize(begin, residual)
+        return Sample(change, prior, products, left)
 
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
         """W^(1/2) times white noise, by the name of a view."""
@@ -129,22 +148,13 @@ class Posterior:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
-    def _begin(self, prior: Tensor, right: Tensor) -> Tensor:
-        """Where a sample begins: from the draw `prior` on towards what pictures leave of it (E39).
-
-        `right` is what it came of.
-        """
-        is_fixed = self.is_kept | self._is_held(prior, right)
-        left = self._precondition(right, is_fixed)
-        return self._within(prior + BEGIN * (left - prior))
-
-    def _is_held(self, change: Tensor, residual: Tensor) -> Tensor:
+    def _is_at_bound(self, change: Tensor, residual: Tensor) -> Tensor:
         """Which entries are at a bound that `residual` presses them against."""
         is_low, is_high = change - self.low <= self.near, self.high - change <= self.near
         return is_low & (residual < 0) | is_high & (residual > 0)
 
     def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
-        """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
+        """The least, within bounds, of a quadratic, from `change` with its `residual`.
 
         And how many products that took, and what is left. Which cells are at a bound is guessed,
         the others are solved for, and the guess is mended (active sets: Bertsekas 1982,
@@ -152,20 +162,20 @@ class Posterior:
         """
         products, left = 1, 1.0
         for _ in range(ROUNDS):
-            is_fixed = self.is_kept | self._is_held(change, residual)
-            ready = self._precondition(residual, is_fixed)
-            left = self.size(residual, is_fixed, ready)
+            is_fixed = self.is_kept | self._is_at_bound(change, residual)
+            guess = self._precondition(residual, is_fixed)
+            left = self.size(residual, is_fixed, guess)
             if left <= self.tolerance or products >= self.most:
                 break
             most, tolerance = self.most - products, self.tolerance / left
-            solved = self._correct(residual, is_fixed, most, tolerance, ready)
+            solved = self._correct(residual, is_fixed, most, tolerance, guess)
             products, residual = products + solved.products, solved.lacking
-            wanted = change + solved.value
-            change = self._within(wanted)
+            moved = change + solved.value
+            change = self._within(moved)
             # What was cut at bounds counts roughly first: where that does, no product is spent.
-            cut = change - wanted
+            cut = change - moved
             rough = residual - self._rough_product(cut)
-            left = self.size(rough, self.is_kept | self._is_held(change, rough))
+            left = self.size(rough, self.is_kept | self._is_at_bound(change, rough))
             if left <= self.tolerance:
                 break
             residual, products = residual - self.product(cut), products + 1
@@ -177,17 +187,17 @@ class Posterior:
         is_fixed: Tensor,
         most: int,
         tolerance: float = TOLERANCE,
-        ready: Tensor | None = None,
+        guess: Tensor | None = None,
     ) -> Solved:
         """The change of all that is not fixed that H takes to `right`.
 
-        `ready` is what the preconditioner makes of it, where that is known.
+        `guess` is what the preconditioner makes of it, where that is known.
         """
 
         def precondition(part: Tensor) -> Tensor:
             return self._precondition(part, is_fixed)
 
-        return conjugate_gradients(self.product, precondition, right, tolerance, most, ready)
+        return conjugate_gradients(self.product, precondition, right, tolerance, most, guess)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
         """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
@@ -202,39 +212,27 @@ class Posterior:
 
         free = self._without_gauge(vector.masked_fill(is_fixed, 0))
         fields = free.masked_fill(is_out, 0)
-        ready = conjugate_gradients(
+        guess = conjugate_gradients(
             self._rough_product, precondition, fields, PRECONDITION, INNER
         ).value.masked_fill(is_out, 0)
         at = self.is_number
-        if self.numbers:
+        if len(self.between):
             gauge = None if self.gauge is None else self.gauge[at]
-            held = self.between + self._held_numbers()
-            ready[at] = solve_numbers_within(held, free[at], is_fixed[at], gauge)
-        return self._without_gauge(ready)
-
-    def _held_numbers(self) -> Tensor:
-        """How single numbers are held but by pictures, [k, k]."""
-        parts = [(self.prior.held[name].double().cpu(), n) for name, n in self.numbers.items()]
-        return torch.block_diag(
-            *(held if held.ndim == 2 else held * torch.eye(n) for held, n in parts)
-        ).double()
+            guess[at] = solve_numbers_within(self.between, free[at], is_fixed[at], gauge)
+        return self._without_gauge(guess)
 
     def _rough_product(self, vector: Tensor) -> Tensor:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
 
-    def size(self, residual: Tensor, is_fixed: Tensor, ready: Tensor | None = None) -> float:
+    def size(self, residual: Tensor, is_fixed: Tensor, guess: Tensor | None = None) -> float:
         """How large `residual` is, about 1 being what a right side is on average.
 
-        `ready` is `residual` preconditioned, where that is known.
+        `guess` is `residual` preconditioned, where that is known.
         """
-        ready = self._precondition(residual, is_fixed) if ready is None else ready
+        guess = self._precondition(residual, is_fixed) if guess is None else guess
         free = int((~is_fixed).sum())
-        return (max(float(residual @ ready), 0.0) / (self.temperature * max(free, 1))) ** 0.5
-
-    def _solve_prior(self, right: Tensor) -> Tensor:
-        """The draw from the prior whose disturbance is `right`."""
-        return self._without_gauge(self.prior.solve(right, self.is_kept))
+        return (max(float(residual @ guess), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
     def _within(self, change: Tensor) -> Tensor:
         """`change`, cut where a bound is."""
@@ -249,24 +247,6 @@ class Posterior:
 def generator_of(seed: int, number: int) -> torch.Generator:
     """What draws the numbers of sample `number` >= 0, or those `PROBED`."""
     return torch.Generator().manual_seed((seed % 2**31) * 1_000_003 + number + 2)
-
-
-def find_bounds(curvature: Curvature) -> tuple[Tensor, Tensor]:
-    """The lowest and the highest value of every entry, [n] each."""
-    values, parameters = curvature.values, curvature.parameters
-    low = {p.name: torch.full_like(values[p.name], p.low) for p in parameters}
-    high = {p.name: torch.full_like(values[p.name], p.high) for p in parameters}
-    return curvature.join(low), curvature.join(high)
-
-
-def find_kept(curvature: Curvature) -> Tensor:
-    """Which entries stay as they are, [n]: cells outside of a field's support."""
-    kept = {
-        p.name: (p.support == 0).expand(p.value.shape).to(p.value)
-        for p in curvature.parameters
-        if p.support is not None
-    }
-    return curvature.join(kept) > 0
 
 
 def find_gauge(curvature: Curvature) -> Tensor | None:
@@ -302,12 +282,80 @@ def solve_numbers_within(
     `gauge` [k, j] has what no picture shows in its columns.
     """
     free = ~is_fixed.to(matrix.device)
-    bent, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
-    bent = bent * unit * unit[:, None]
+    scaled, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
+    scaled = scaled * unit * unit[:, None]
     if gauge is not None:
-        held = gauge.to(matrix)[free] * unit[:, None]
-        held = held / held.norm(dim=0).clamp(min=1e-300)
-        bent = bent + GAUGE * held @ held.T
+        constraint = gauge.to(matrix)[free] * unit[:, None]
+        constraint = constraint / constraint.norm(dim=0).clamp(min=1e-300)
+        scaled = scaled + GAUGE * constraint @ constraint.T
     solved = torch.zeros_like(right)
-    solved[free] = (unit * torch.linalg.solve(bent, unit * right.to(matrix)[free])).to(right)
+    solved[free] = (unit * torch.linalg.solve(scaled, unit * right.to(matrix)[free])).to(right)
     return solved
+
+
+PROBES = 3
+"""Random pictures that it is found by."""
+AXES = (-3, -2, -1)
+
+
+class Information:
+    """About J^T W J of `curvature`: its `diagonal` [n], and of each field a spectrum (E38).
+
+    Pictures tell sums along rays: smooth changes of a field far better than rough ones. How that
+    hangs together is nearly the same everywhere, but for its scale, and a few random pictures show
+    both. Products are cheap, so that equations can be solved with it.
+
+    `generator` draws the random pictures. `probe` [n] is what one of them gives, a random vector
+    whose covariance is J^T W J.
+    """
+
+    def __init__(self, curvature: Curvature, generator: torch.Generator):
+        self.curvature = curvature
+        found = [self._probe(generator) for _ in range(PROBES)]
+        probes, self.probe = [curvature.split(each) for each in found], found[0]
+        squares = {
+            name: torch.stack([probe[name].square() for probe in probes]).mean(0)
+            for name in curvature.values
+        }
+        fields = [parameter.name for parameter in curvature.parameters if parameter.is_field]
+        for name in fields:
+            squares[name] = mean_around(squares[name])
+        self.diagonal = curvature.join(squares)
+        self.roots = {name: squares[name].sqrt() for name in fields}
+        self.spectra = {
+            name: _find_spectrum([_over(probe[name], self.roots[name]) for probe in probes])
+            for name in fields
+        }
+
+    def product(self, vector: Tensor) -> Tensor:
+        """About J^T W J times `vector`: D^(1/2) F^-1 c F D^(1/2), D being the diagonal."""
+        parts = self.curvature.split(self.diagonal * vector)
+        changes = self.curvature.split(vector)
+        for name, root in self.roots.items():
+            waves = torch.fft.rfftn(root * changes[name], dim=AXES) * self.spectra[name]
+            parts[name] = root * torch.fft.irfftn(waves, root.shape[-3:], dim=AXES)
+        return self.curvature.join(parts)
+
+    def _probe(self, generator: torch.Generator) -> Tensor:
+        """J^T W^(1/2) times random signs."""
+        images = self.curvature.images
+        signs = {
+            name: weight.sqrt() * normal_like(images[name], generator).sign()
+            for name, weight in self.curvature.weights.items()
+        }
+        return self.curvature.adjoint(signs)
+
+
+def _find_spectrum(fields: list[Tensor]) -> Tensor:
+    """The mean power of `fields` [..., z, y, x] at each wave, and at those beside it."""
+    power = torch.stack([torch.fft.fftn(field, dim=AXES).abs().square() for field in fields])
+    power = power.mean(0)
+    for axis in AXES:
+        power = (power.roll(1, axis) + power + power.roll(-1, axis)) / 3
+    cells = power.shape[-3] * power.shape[-2] * power.shape[-1]
+    return power[..., : power.shape[-1] // 2 + 1] / cells
+
+
+def _over(field: Tensor, root: Tensor) -> Tensor:
+    """`field` over `root`; 0 where that is."""
+    return torch.where(root > 0, field / root.clamp(min=torch.finfo(root.dtype).tiny), 0)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.gauges import calibration_prior
+from ddrecon.reconstruct.numbers import calibration_prior
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import AXES, Roughness
 from ddrecon.scene import Scene
@@ -31,15 +31,15 @@ class Prior:
 
     def __init__(self, curvature: Curvature, temperature: float):
         self.curvature = curvature
-        self.held = {
-            p.name: temperature * _held(p, curvature.scene, p.name in curvature.roughness)
+        self.precision = {
+            p.name: temperature * _precision_of(p, curvature.scene, p.name in curvature.roughness)
             for p in curvature.parameters
         }
 
     def product(self, vector: Tensor) -> Tensor:
         """(R + T K) times `vector`."""
         parts = self.curvature.split(vector)
-        weak = {name: _times(held, parts[name]) for name, held in self.held.items()}
+        weak = {name: _times(precision, parts[name]) for name, precision in self.precision.items()}
         return self.curvature.penalty_product(vector) + self.curvature.join(weak)
 
     def root_noise(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -50,13 +50,13 @@ class Prior:
         parts, levels = dict[str, Tensor](), dict[str, Tensor]()
         fields = {parameter.name for parameter in self.curvature.parameters if parameter.is_field}
         for name, value in self.curvature.values.items():
-            held = self.held[name]
-            root = torch.linalg.cholesky(held) if held.ndim == 2 else held.sqrt()
+            precision = self.precision[name]
+            root = torch.linalg.cholesky(precision) if precision.ndim == 2 else precision.sqrt()
             weak = _times(root, normal_like(value, generator))
             if (roughness := self.curvature.roughness.get(name)) is not None:
                 noises = [normal_like(value, generator) for _ in AXES]
                 parts[name] = roughness.root_product(noises)
-            # What is held so weakly is far off in a draw: pictures alone say where it is.
+            # What is constrained so weakly is far off in a draw: pictures alone say where it is.
             has_draw = name in fields and roughness is None
             (parts if has_draw else levels)[name] = weak
         return self.curvature.join(parts), self.curvature.join(levels)
@@ -69,32 +69,26 @@ class Prior:
         tolerance: float = SOLVE,
     ) -> Tensor:
         """(R + T K + diag(`more`))^-1 times `right`, with 0 where `is_fixed`."""
-        rights = self.curvature.split(right)
-        # Levels of smoothed fields are held so weakly that a draw needs more digits than a step.
-        has_more_digits = more is None
-        nothing: dict[str, Tensor] = {}
-        fixed = nothing if is_fixed is None else self.curvature.split(is_fixed)
-        added = nothing if more is None else self.curvature.split(more)
+        fixed = torch.zeros_like(right).bool() if is_fixed is None else is_fixed
+        is_fixed_of = self.curvature.split(fixed)
+        added = self.curvature.split(torch.zeros_like(right) if more is None else more)
         parts = {}
-        for name, part in rights.items():
-            held, more_here, fixed_here = self.held[name], added.get(name), fixed.get(name)
-            roughness = self.curvature.roughness.get(name)
-            if fixed_here is not None:
-                part = part.masked_fill(fixed_here, 0)
-            if held.ndim == 2:
-                matrix = held if more_here is None else held + more_here.diag()
-                solved = torch.linalg.solve(matrix, part)
+        for name, part in self.curvature.split(right).items():
+            precision, roughness = self.precision[name], self.curvature.roughness.get(name)
+            part = part.masked_fill(is_fixed_of[name], 0)
+            if precision.ndim == 2:
+                solved = torch.linalg.solve(precision + added[name].diag(), part)
+            elif roughness is None:
+                solved = part / (precision + added[name])
             else:
-                diagonal = held if more_here is None else held + more_here
-                if roughness is None:
-                    solved = part / diagonal
-                else:
-                    if has_more_digits:
-                        roughness, diagonal = roughness.double(), diagonal.double()
-                    exact = part.to(roughness.stiffness)
-                    solved = _solve_field(roughness, diagonal, exact, fixed_here, tolerance)
-                    solved = solved.to(part)
-            parts[name] = solved if fixed_here is None else solved.masked_fill(fixed_here, 0)
+                diagonal = precision + added[name]
+                # Levels of smoothed fields are constrained so weakly that a draw needs more digits.
+                if more is None:
+                    stiffness = roughness.stiffness.double()
+                    roughness, diagonal = Roughness(roughness.grid, stiffness), diagonal.double()
+                exact = part.to(roughness.stiffness)
+                solved = _solve_field(roughness, diagonal, exact, is_fixed_of[name], tolerance)
+            parts[name] = solved.to(part).masked_fill(is_fixed_of[name], 0)
         return self.curvature.join(parts)
 
     def without_levels(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
@@ -114,7 +108,7 @@ def normal_like(value: Tensor, generator: torch.Generator) -> Tensor:
     return noise.to(value.device)
 
 
-def _held(parameter: Parameter, scene: Scene, is_smoothed: bool) -> Tensor:
+def _precision_of(parameter: Parameter, scene: Scene, is_smoothed: bool) -> Tensor:
     """K of `parameter`: a number for all its entries, or the matrix [6, 6] of a camera.
 
     A smoothed field may be brighter or darker, as a whole, by its root mean square; without
@@ -137,12 +131,12 @@ def rounding_of(parameter: Parameter) -> float:
     return torch.finfo(parameter.value.dtype).eps * parameter.largest_rate
 
 
-def _times(held: Tensor, part: Tensor) -> Tensor:
-    return held @ part if held.ndim == 2 else held * part
+def _times(precision: Tensor, part: Tensor) -> Tensor:
+    return precision @ part if precision.ndim == 2 else precision * part
 
 
 def _solve_field(
-    roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor | None, tolerance: float
+    roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor, tolerance: float
 ) -> Tensor:
     """(R + `diagonal`)^-1 `right` of a field, with 0 in cells that are fixed, by multigrid."""
     colors, size = right.reshape(-1, *right.shape[-3:]), float(right.abs().max())
@@ -151,16 +145,13 @@ def _solve_field(
     # In units where numbers are near 1: squares of residuals would leave float32.
     unit = float((roughness.diagonal() + diagonal).max())
     roughness, diagonal, colors = roughness.times(1 / unit), diagonal / unit, colors / size
-    # No level is held so weakly that it is lost in rounding.
+    # No level is constrained so weakly that it is lost in rounding.
     diagonal = diagonal.clamp(min=10 * torch.finfo(right.dtype).eps)
+    # Cells that are fixed lose so much that nothing is left in them.
+    strong = 1e4 * (roughness.diagonal().max() + diagonal.max())
+    loss = torch.where(is_fixed, strong, diagonal)
     # R has the form of the diffusion operator: stiffness is conductance between cells.
-    conductances = roughness.conductances()
-    loss = diagonal.expand(right.shape)
-    if is_fixed is not None:
-        # Cells that are fixed lose so much that nothing is left in them.
-        strong = 1e4 * (roughness.diagonal().max() + diagonal.max())
-        loss = torch.where(is_fixed, strong, loss)
-    z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in conductances)
+    z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in roughness.conductances())
     operator = Operator((z, y, x), loss.reshape(colors.shape).contiguous())
     solved = SOLVERS["multigrid"](operator, colors, None, tolerance).value.view(right.shape)
     return solved * (size / unit)

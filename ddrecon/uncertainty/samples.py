@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ddrecon.losses import Target
 from ddrecon.numerics.around import mean_around
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
@@ -16,17 +18,41 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
-from ddrecon.uncertainty.information import Information
-from ddrecon.uncertainty.picture_errors import PictureErrors, find_errors, know_errors
 from ddrecon.uncertainty.posterior import (
     NUMBERS,
     PROBED,
     TOLERANCE,
+    Information,
     Posterior,
     Sample,
     generator_of,
 )
 from ddrecon.variables.values import component_names
+
+SUMS = ("count", "products", "residual", "sums", "numbers")
+"""What samples leave in an `Uncertainty`."""
+LEAST_LEFT = 0.1
+"""At least this part of all numbers is taken for noise: a run that fits all else shows none."""
+
+
+@dataclass(frozen=True)
+class PictureErrors:
+    """How much pictures err. `temperature` is the objective's unit of it (E33).
+
+    `deviation` [radiance] is the root mean square error of a number of a picture, `count` how many
+    independent ones there are. `told` is how many numbers they tell, None where that was not needed
+    since the noise is `known`.
+    """
+
+    temperature: float
+    deviation: float
+    count: int
+    told: float | None
+    is_known: bool
+
+    def described(self) -> dict[str, Any]:
+        """As plain values."""
+        return {**vars(self), "from": "the scene" if self.is_known else "residuals"}
 
 
 class Uncertainty:
@@ -45,16 +71,25 @@ class Uncertainty:
         tolerance: float | None = None,
         errors: PictureErrors | None = None,
     ):
+        train, targets, power = run.level.train, run.level.targets, run.problem.power
         self.parameters = run.parameters
-        self.curvature = curvature_of(run)
-        gradient = gradient_of(run, self.curvature)
-        targets = run.level.targets
-        known = know_errors(self.curvature, targets, _noises(run, noise))
+        self.curvature = Curvature(train, run.parameters, targets, power, run.memory.last)
+        values = {parameter.name: parameter.value for parameter in run.parameters}
+        compared, memory = Comparison(train.views, targets), self.curvature.new_memory()
+        objective = differentiate(train, list(targets), values, compared, memory)
+        gradient = self.curvature.join(add_penalties(objective, run.parameters, power)[1])
+        said = {view.name: noise or given_noise(view, run.problem.settings) for view in train.views}
+        noises = {name: noise for name, noise in said.items() if noise is not None}
+        measured = measure_errors(self.curvature, targets, noises)
         information = Information(self.curvature, generator_of(seed, PROBED))
-        # What residuals said takes a solve to find: a run that goes on has it.
-        self.errors = (
-            known or errors or find_errors(self.curvature, targets, gradient, seed, information)
-        )
+        if errors is None and not measured.is_known:
+            # What pictures told takes a solve to find: a run that goes on has it.
+            rough, count = measured.temperature, measured.count
+            about = Posterior(self.curvature, gradient, rough, seed, information=information)
+            told = about.count_told()
+            left = max(count - told, LEAST_LEFT * count)
+            measured = replace(measured, temperature=rough * count / left, told=told)
+        self.errors = errors or measured
         if tolerance is None:
             tolerance = NUMBERS if self.tabled else TOLERANCE
         temperature = self.errors.temperature
@@ -109,21 +144,20 @@ class Uncertainty:
             for name, part in before.items()
         }
 
-    def number_names(self) -> list[str]:
-        """The names of the entries of all parameters that are no fields, in their order."""
-        names = []
+    def described_numbers(self) -> dict[str, dict[str, float]]:
+        """The value at the optimum and the deviation of each entry of what is `tabled`, by name."""
+        names = list[str]()
         for parameter in self.tabled:
-            value = parameter.value
-            parts = component_names(parameter.name, value) if value.ndim else ()
+            name, value = parameter.name, parameter.value
+            parts = component_names(name, value) if value.ndim else ()
             parts = parts or tuple(str(i) for i in range(value.numel()))
-            one = [parameter.name]
-            names += one if value.numel() == 1 else [f"{parameter.name}.{part}" for part in parts]
-        return names
-
-    def number_values(self) -> Tensor:
-        """Their values at the optimum."""
-        values = {name: value.cpu().double() for name, value in self.curvature.values.items()}
-        return self._numbers_in(self.curvature.join(values))
+            names += [name] if value.numel() == 1 else [f"{name}.{part}" for part in parts]
+        values = self._numbers_in(self.curvature.join(self.curvature.values)).double().tolist()
+        deviations = self._numbers_in(self._variance("post").sqrt()).tolist()
+        return {
+            name: {"value": value, "deviation": deviation}
+            for name, value, deviation in zip(names, values, deviations, strict=True)
+        }
 
     def correlations(self) -> Tensor:
         """The correlation [m, m] of each of them with each other."""
@@ -132,26 +166,14 @@ class Uncertainty:
         size = centered.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
         return (centered / size).T @ (centered / size)
 
-    def number_deviations(self) -> Tensor:
-        """Their standard deviations."""
-        return self._numbers_in(self._variance("post").sqrt())
-
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
-        return {
-            "count": self.count,
-            "products": self.products,
-            "residual": self.residual,
-            "sums": self.sums,
-            "numbers": self.numbers,
-            "errors": vars(self.errors),
-        }
+        return {name: getattr(self, name) for name in SUMS} | {"errors": vars(self.errors)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where `state` was."""
-        self.count, self.products = state["count"], state["products"]
-        self.residual, self.numbers = state["residual"], list(state["numbers"])
-        self.sums = dict(state["sums"])
+        for name in SUMS:
+            setattr(self, name, state[name])
 
     def _variance(self, key: str) -> Tensor:
         mean = self.sums[key] / max(self.count, 1)
@@ -169,24 +191,28 @@ class Uncertainty:
         return torch.cat(tabled) if tabled else vector[:0]
 
 
-def curvature_of(run: Reconstruction) -> Curvature:
-    """The curvature of the objective of `run` where it is."""
-    level, memory = run.level.train, run.memory
-    return Curvature(level, run.parameters, run.level.targets, run.problem.power, memory.last)
+def measure_errors(
+    curvature: Curvature, targets: Mapping[str, Target], noises: Mapping[str, Noise]
+) -> PictureErrors:
+    """How much the pictures `targets` of the views of `curvature` err, if they told nothing.
 
-
-def gradient_of(run: Reconstruction, curvature: Curvature) -> Tensor:
-    """The derivative of the objective of `run`, of all its training views, where it is."""
-    views = list(run.level.train.views)
-    compared = Comparison(views, run.level.targets)
-    names = [view.name for view in views]
-    values = {parameter.name: parameter.value for parameter in run.parameters}
-    objective = differentiate(run.level.train, names, values, compared, curvature.new_memory())
-    return curvature.join(add_penalties(objective, run.parameters, run.problem.power)[1])
-
-
-def _noises(run: Reconstruction, noise: Noise | None) -> dict[str, Noise]:
-    """The noise of training pictures by name, as `noise` or their scene says."""
-    settings, views = run.problem.settings, run.level.train.views
-    found = {view.name: noise or given_noise(view, settings) for view in views}
-    return {name: said for name, said in found.items() if said is not None}
+    By their `noises`, if all have them: the weights of `curvature` are then those of this noise.
+    Else by what is left at the optimum.
+    """
+    weights, is_known = curvature.weights, noises.keys() >= curvature.weights.keys()
+    off = {
+        name: noises[name].deviation(t.image) if is_known else curvature.images[name] - t.image
+        for name, t in targets.items()
+    }
+    squares = {name: error**2 for name, error in off.items()}
+    seen = {name: (w > 0).expand_as(squares[name]) for name, w in weights.items()}
+    # Independent numbers: gray has one color.
+    is_gray = {name: bool((t.image == t.image[:1]).all()) for name, t in targets.items()}
+    count = sum(int(each.sum()) // (3 if is_gray[name] else 1) for name, each in seen.items())
+    temperature = sum(float((w * squares[name]).sum()) for name, w in weights.items()) / count
+    if is_known:
+        # Each pixel counts by its own noise, all together as the objective has them.
+        for name, weight in weights.items():
+            weights[name] = (weight > 0).to(weight) * temperature / squares[name]
+    mean = torch.cat([squares[name][each] for name, each in seen.items()]).mean()
+    return PictureErrors(temperature, float(mean.sqrt()), count, None, is_known)

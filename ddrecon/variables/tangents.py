@@ -8,8 +8,8 @@ in every cell.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -47,27 +47,17 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
     raise UsageError(f"the scene has no number {name}")
 
 
-Key = TypeVar("Key")
+@contextmanager
+def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
+    """`scene` with `name`, as for `variation`, as a dual number, while the block lasts.
 
-
-def render_tangent(
-    scene: Scene, name: str, images_of: Callable[[Scene], dict[Key, Tensor]]
-) -> dict[Key, tuple[Tensor, Tensor]]:
-    """The images that `images_of` renders of `scene`, each with its derivative by `name`.
-
-    `name` is as for `variation`. Raises UsageError.
+    What is rendered of it has its derivative as a tangent. With None, `scene` itself. Raises
+    UsageError.
     """
+    if name is None:
+        yield scene
+        return
     variable, change = variation(scene, name)
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(value_of(scene, variable), change)
-        pairs = {
-            key: forward_ad.unpack_dual(image)
-            for key, image in images_of(with_values(scene, {variable: dual})).items()
-        }
-        return {
-            key: (
-                pair.primal.clone(),
-                torch.zeros_like(pair.primal) if pair.tangent is None else pair.tangent.clone(),
-            )
-            for key, pair in pairs.items()
-        }
+        yield with_values(scene, {variable: dual})

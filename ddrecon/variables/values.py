@@ -8,9 +8,10 @@ lead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,14 +27,17 @@ from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
+    RESPONSE,
+    STEEPEST_G,
+    XYZ,
     is_of_volume,
     kind_of,
     split_name,
 )
-from ddrecon.variables.legal import require_form, require_range
 
-RESPONSE = {"exposure": 1.0, "offset": 0.0}
-"""What a camera does to radiance, and what it is where a view has none (E28)."""
+EVERY = "views.*."
+"""How names for all training views at once begin: `views.*.exposure`."""
+Settings = TypeVar("Settings")
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -97,7 +101,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     if unknown:
         raise _unknown(scene, unknown[0])
     lights = [
-        _replace_light(light, f"lights.{index}", values, scene)
+        _replace_light(light, f"lights.{index}.", values, scene)
         for index, light in enumerate(scene.lights)
     ]
     views = [_replace_view(view, values, scene) for view in scene.views]
@@ -126,6 +130,75 @@ def require_legal(scene: Scene, *, waits: bool = False) -> None:
         require_form(name, value, value, density, cells)
         if waits or value.device.type == "cpu":
             require_range(name, value)
+
+
+def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict[str, Settings]:
+    """`parameters` with each name of all training views replaced by those of each of `views`.
+
+    These are the views to train on that have an image. What a view's own name says wins.
+    """
+    train = [view.name for view in views if view.image is not None and not view.is_test]
+    named: dict[str, Settings] = {}
+    for name, settings in parameters.items():
+        if not name.startswith(EVERY):
+            named[name] = settings
+            continue
+        key = name.removeprefix(EVERY)
+        for owner in (f"views.{view}.{key}" for view in train):
+            named[owner] = parameters.get(owner, settings)
+    return named
+
+
+def require_form(
+    name: str, value: Tensor, now: Tensor, like: Tensor, cells: tuple[int, ...]
+) -> None:
+    """Raises UsageError unless `value` can be the variable `name`, which is `now`, on `cells`.
+
+    Its precision and device are to be those of `like`. Nothing is read from a GPU.
+    """
+    if not isinstance(value, Tensor):
+        raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
+    if (value.dtype, value.device) != (like.dtype, like.device):
+        raise UsageError(
+            f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
+            f"{like.device}; convert it by .to(...)"
+        )
+    shapes = _shapes(name, tuple(now.shape), cells)
+    if tuple(value.shape) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        raise UsageError(f"{name}: has shape {list(value.shape)}; expected {expected}")
+
+
+def require_range(name: str, value: Tensor) -> None:
+    """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
+    kind = kind_of(name)
+    least, most = (float(end) for end in value.detach().aminmax())
+    found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
+    if not math.isfinite(least + most):
+        raise UsageError(f"{name}: must be finite, {found}")
+    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
+        # A scene may scatter further forward than a run makes it.
+        raise UsageError(f"{name}: must be above -1 and below 1, {found}")
+    if kind.low == 0 and not 0 <= least <= most <= kind.high:
+        bounds = "at least 0" if kind.high == math.inf else f"from 0 to {kind.high:g}"
+        raise UsageError(f"{name}: must be {bounds}, {found}")
+    if kind.is_direction and least == most == 0:
+        raise UsageError(f"{name}: must not be zero")
+
+
+def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Those that the variable `name` may have in place of the one it has `now`."""
+    kind, last = kind_of(name), split_name(name)[1]
+    if last == "density":
+        return [cells]
+    if last.startswith(PHASE):
+        return [now, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
+    if kind.is_color:
+        tails = [(), cells] if kind.is_cellwise else [now[1:]]
+        return [(color, *tail) for tail in tails for color in (1, 3)]
+    if kind.is_cellwise:
+        return [(), cells, (1, *cells)]
+    return [(3,)] if kind.components == XYZ else [now]
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
@@ -187,11 +260,7 @@ def _own_name(volume: Volume, name: str) -> str:
     medium, last = split_name(name)
     if last != f"{PHASE}g":
         return name
-    part = (
-        volume
-        if volume.media is None
-        else volume.media.get(medium.removeprefix("media.").strip("."), volume)
-    )
+    part = (volume.media or {}).get(medium.removeprefix("media.").strip("."), volume)
     return f"{medium}g" if isinstance(part.phase, HenyeyGreenstein) else name
 
 
@@ -215,7 +284,7 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if volume.media is not None:
         return mix_media(
             {
-                medium: _replace_volume(part, _values_of(f"media.{medium}.", values))
+                medium: _replace_volume(part, _within(f"media.{medium}.", values))
                 for medium, part in volume.media.items()
             }
         )
@@ -244,20 +313,15 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     return changed
 
 
-def _values_of(medium: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Those of `values` that are of one `medium`, by what they are called in it."""
-    return {
-        name.removeprefix(medium): value
-        for name, value in values.items()
-        if name.startswith(medium)
-    }
+def _within(owner: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those of `values` whose names begin with `owner`, by the rest of their names."""
+    return {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
 
 
-def _replace_light(light: Light, name: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
-    tensors = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+def _replace_light(light: Light, owner: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
+    tensors, volume = _within(owner, values), scene.volume
     for key, value in tensors.items():
-        volume = scene.volume
-        require_form(f"{name}.{key}", value, getattr(light, key), volume.density, volume.grid.shape)
+        require_form(owner + key, value, getattr(light, key), volume.density, volume.grid.shape)
     changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
     return changed
 
@@ -283,12 +347,13 @@ def _view_value(view: View, part: str) -> Tensor:
 
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
-    names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
-    given: dict[str, Any] = {p: values[name] for p, name in names.items() if name in values}
+    owner = f"views.{view.name}."
+    known = [part for part in _view_parts(view) if owner + part in values]
+    given: dict[str, Any] = {part: values[owner + part] for part in known}
     if not given:
         return view
     for part, value in given.items():
-        require_form(names[part], value, _view_value(view, part), view.camera.pose, (0, 0, 0))
+        require_form(owner + part, value, _view_value(view, part), view.camera.pose, (0, 0, 0))
     response = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:

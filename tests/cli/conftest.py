@@ -20,12 +20,11 @@ Run = Callable[..., Result]
 @pytest.fixture(autouse=True)
 def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What commands change in their process is put back; Ctrl-C works even where the tests run in
-    the background. A report's movie is short.
+    the background.
     """
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
-    monkeypatch.setattr("ddrecon.run.report_volume.FRAMES", 2)
     yield
     signal.signal(signal.SIGINT, handler)
     torch.set_num_threads(threads)

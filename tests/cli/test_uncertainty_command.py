@@ -13,8 +13,8 @@ from test_resume import press_ctrl_c_in
 
 from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field
-from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.live import LiveRun
+from ddrecon.run.run_folder import remove_samples
 from ddrecon.uncertainty.posterior import Posterior
 
 Run = Callable[..., Result]

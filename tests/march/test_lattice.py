@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, make_camera, make_scene, march_rays, random_values
+from media import box_grid, make_camera, make_scene, march_rays, random_values, render_tangent
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -20,7 +20,6 @@ from ddrecon.march.samplers import choose_way
 from ddrecon.renderer import _emission, render, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.variables.tangents import render_tangent
 from ddrecon.variables.values import value_of, with_values
 
 CAMERAS = {

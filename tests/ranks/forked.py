@@ -30,7 +30,6 @@ import ddrecon.cli.session
 import ddrecon.cli.uncertainty
 import ddrecon.ranks
 import ddrecon.run.render_folder
-import ddrecon.run.report_volume
 import ddrecon.scene_file.build
 import ddrecon.scene_file.doubts
 import ddrecon.uncertainty.drive
@@ -40,7 +39,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 
 PIL.Image.init()
 ddrecon.ranks.TOLD_SECONDS = 0.5
-ddrecon.run.report_volume.FRAMES = 2
 
 LOADED = set(sys.modules)
 

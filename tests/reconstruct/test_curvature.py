@@ -9,7 +9,6 @@ import torch
 from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.engine import use_engine
 from ddrecon.losses import LOSSES, Target, compress, total_variation
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
@@ -76,23 +75,6 @@ def test_a_product_is_that_with_the_matrix_of_differences() -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
 
 
-def test_pictures_change_in_other_light_as_they_are_bright_in_it() -> None:
-    scene = small_scene(torch.float64, rounds=0)
-    curvature = curvature_of(scene)
-    # What lights of the scene do counts for nothing where others are lit.
-    vector = random_values(curvature.size)
-    dark = curvature.split(vector.clone())
-    dark["lights.0.irradiance"].zero_()
-    plain = curvature.tangents(curvature.join(dark), scene.views)
-    ambient, sun = scene.lights[1], scene.lights[0]
-    bright = [
-        replace(sun, irradiance=2 * sun.irradiance),
-        replace(ambient, radiance=2 * ambient.radiance),
-    ]
-    for name, change in curvature.tangents(vector, scene.views, bright).items():
-        torch.testing.assert_close(change, 2 * plain[name])
-
-
 @pytest.mark.parametrize("loss", LOSSES)
 def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(
     loss: str,
@@ -145,18 +127,10 @@ def test_roughness_is_the_square_of_its_root_and_has_its_diagonal() -> None:
     torch.testing.assert_close(roughness.diagonal().flatten(), matrix.diagonal())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_products_are_those_of_a_symmetric_matrix_with_both_engines(dtype: torch.dtype) -> None:
-    found = []
-    for engine in ("torch", "warp"):
-        use_engine(engine)
-        curvature = curvature_of(small_scene(dtype))
-        one, other = random_values(2, curvature.size, dtype=dtype)
-        found.append([curvature.product(one), curvature.product(other)])
-        products = float(other @ found[-1][0]), float(one @ found[-1][1])
-        assert products[0] == pytest.approx(products[1], rel=3e-4 if dtype.itemsize == 4 else 1e-9)
-        assert float(one @ found[-1][0]) > 0
-    for a, b in zip(*found, strict=True):
-        scale = float(a.abs().max())
-        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * scale)
+def test_products_are_those_of_a_symmetric_matrix() -> None:
+    """Also with a transport round."""
+    curvature = curvature_of(small_scene(torch.float64))
+    one, other = random_values(2, curvature.size)
+    products = curvature.data_product(one), curvature.data_product(other)
+    assert float(other @ products[0]) == pytest.approx(float(one @ products[1]), rel=1e-9)
+    assert float(one @ products[0]) > 0

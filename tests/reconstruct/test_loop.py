@@ -7,16 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from media import box_grid, random_values
 
-from ddrecon.errors import FormatError, SceneError, SolveError, UsageError
+from ddrecon.errors import FormatError, SceneError, SolveError
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction, optimize
-from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint, save_checkpoint
 from ddrecon.scene import Scene
-from ddrecon.settings import ParameterSettings
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -99,18 +95,6 @@ def test_resuming_gives_the_same_bits_as_not_stopping(ball_scene: Scene, tmp_pat
         assert torch.equal(again.current_scene().volume.density, found)
 
 
-def test_a_checkpoint_of_another_scene_is_refused(ball_scene: Scene, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path, Reconstruction(ball_scene).state(), {"volume": {"g": 0.1}})
-    with pytest.raises(UsageError, match=r"volume\.g is 0\.1 there, 0\.2 now"):
-        load_checkpoint(tmp_path, {"volume": {"g": 0.2}})
-
-
-def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 not really")
-    with pytest.raises(FormatError, match="not a usable checkpoint"):
-        load_checkpoint(tmp_path, {})
-
-
 def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
     torch.save({"format": 1, "scene": {}, "state": {}}, tmp_path / "last.pt")
     with pytest.raises(FormatError, match=f"of format 1; this version reads {FORMAT}"):
@@ -141,17 +125,3 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
         )
     with pytest.raises(SceneError, match="missing section"):
         Reconstruction(replace(ball_scene, optimize=None))
-
-
-def test_a_backup_is_the_state_with_rounded_moments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tuning, "HALVED", 1)
-    grid, start = box_grid((3, 4, 5)), random_values(3, 4, 5, dtype=torch.float32)
-    one, other = (Parameter("density", ParameterSettings(), 0.1, start, grid) for _ in range(2))
-    one.step(random_values(3, 4, 5, seed=1, dtype=torch.float32) - 0.5, 1.0)
-    backup = one.backup()
-    assert all(moment.dtype is torch.bfloat16 for moment in backup["moments"])
-    other.restore(backup)
-    assert torch.equal(other.value, one.value) and other.steps == one.steps
-    for found, known in zip(other.moments, one.moments, strict=True):
-        # To nearest: of eight bits, half of the last.
-        torch.testing.assert_close(found, known, rtol=2**-8, atol=0)

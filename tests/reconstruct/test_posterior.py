@@ -79,15 +79,15 @@ def test_a_sample_is_what_the_exact_covariance_says(curvature: Curvature, jacobi
     inverse = exact(curvature, posterior, jacobian)
     covariance = TEMPERATURE * torch.linalg.inv(inverse)
     # Deviations of some cells: each is a solve for a unit vector.
-    for cell in (0, 43, 100, 215):
+    for cell in (43, 215):
         unit = torch.zeros(CELLS, dtype=torch.float64)
         unit[cell] = TEMPERATURE
         variance = float(posterior._correct(unit, nothing > 0, 200, 1e-6).value[cell])
         assert variance**0.5 == pytest.approx(float(covariance[cell, cell]) ** 0.5, rel=0.02)
     # Whitened, samples are independent standard normal numbers, in every direction at once.
-    samples = torch.stack([posterior.sample(number).change for number in range(12)])
+    samples = torch.stack([posterior.sample(number).change for number in range(8)])
     squares = (samples @ (inverse / TEMPERATURE) * samples).sum(1)
-    assert float(squares.mean()) / CELLS == pytest.approx(1, abs=4 * (2 / (12 * CELLS)) ** 0.5)
+    assert float(squares.mean()) / CELLS == pytest.approx(1, abs=4 * (2 / (8 * CELLS)) ** 0.5)
 
 
 def test_within_bounds_a_sample_is_the_least_of_its_quadratic(

@@ -4,7 +4,6 @@ sees.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -52,16 +51,7 @@ def test_a_medium_moves_as_it_would_alone() -> None:
         )
 
 
-def test_all_views_where_no_number_is_asked_for() -> None:
-    assert (
-        pick_views(5, 0, 3, 0)
-        == pick_views(5, 5, 3, 0)
-        == pick_views(5, 9, 3, 0)
-        == [0, 1, 2, 3, 4]
-    )
-
-
-@pytest.mark.parametrize(("count", "wanted"), [(10, 3), (7, 1), (4, 3), (6, 2)])
+@pytest.mark.parametrize(("count", "wanted"), [(10, 3), (7, 1), (6, 2)])
 def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int) -> None:
     seen = [
         index for iteration in range(count) for index in pick_views(count, wanted, iteration, 0)
@@ -69,7 +59,7 @@ def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int)
     assert len(seen) == count * wanted
     for start in range(0, len(seen), count):
         assert sorted(seen[start : start + count]) == list(range(count))
-    assert Counter(seen) == dict.fromkeys(range(count), wanted)
+    assert pick_views(count, 0, 3, 0) == pick_views(count, 99, 3, 0) == list(range(count))
 
 
 def test_the_order_differs_from_round_to_round_and_follows_the_seed() -> None:

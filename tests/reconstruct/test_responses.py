@@ -5,8 +5,8 @@ import torch
 from media import box_grid, make_camera
 
 from ddrecon.losses import Target
+from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.responses import fit_held_out
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.levels import scene_at_level, stage_of
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction, optimize
-from ddrecon.reconstruct.schedule import Schedule, rate_at
+from ddrecon.reconstruct.schedule import Progress, Schedule, rate_at
 from ddrecon.reconstruct.tuning import FALL, FINAL_RATE, MOST, PLANNED, WINDOW
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
@@ -106,9 +106,9 @@ def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
         for schedule in (whole, parts):
             schedule.note(made, {"front": loss}, {}, 0.0)
         if made % 9 == 0:
-            state = json.loads(json.dumps(parts.state()))
+            state = json.loads(json.dumps(asdict(parts.progress)))
             parts = schedule_of()
-            parts.restore(state)
+            parts.progress = Progress(**state)
         made += 1
     assert parts.is_over(made) and parts.progress == whole.progress
 
@@ -164,16 +164,3 @@ def test_noise_that_is_said_to_be_less_does_not_end_it(noisy_scene: Scene, ended
     for _ in ended.rows:
         row = run.step()
     assert not run.is_done and row.chi_square == pytest.approx(4, rel=0.1)
-
-
-def test_a_run_that_ends_by_itself_resumes_to_the_same_bits(
-    noisy_scene: Scene, ended: Result
-) -> None:
-    run = Reconstruction(noisy_scene)
-    while not run.is_done:
-        run.step()
-        if run.iteration % 13 == 0:
-            state, run = run.state(), Reconstruction(noisy_scene)
-            run.restore(state)
-    assert run.iteration == len(ended.rows)
-    assert torch.equal(run.current_scene().volume.density, ended.scene.volume.density)

@@ -5,18 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import half_empty, make_scene
-from torch import Tensor
 
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.setup import choose_loss, start_parameters
+from ddrecon.reconstruct.setup import choose_loss
 from ddrecon.scene import Scene
-from ddrecon.settings import OptimizeSettings, ParameterSettings
+from ddrecon.settings import ParameterSettings
 
 
 def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: Scene) -> None:
@@ -64,26 +59,3 @@ def test_pictures_of_both_kinds_need_a_loss(ball_scene: Scene) -> None:
     with pytest.raises(SceneError, match="say how to compare them"):
         choose_loss(ball_scene.optimize, mixed)
     assert choose_loss(replace(ball_scene.optimize, loss="photon"), mixed) == "photon"
-
-
-@pytest.mark.parametrize("name", ["density", "media.smoke.density"])
-def test_penalties_do_not_depend_on_the_units_of_density_and_length(
-    name: str,
-) -> None:
-    def penalty(density: float, length: float) -> tuple[Tensor, Tensor]:
-        field, grid = density * half_empty(3, 4, 5), Grid((3, 4, 5), (0, 0, 0), (length,) * 3)
-        sigma_a, sigma_s = (
-            field.new_tensor(sigma) / density / length for sigma in ([0.5], [8.0, 6.0, 4.0])
-        )
-        scene = make_scene(field, sigma_a=sigma_a, sigma_s=sigma_s, grid=grid)
-        if name != "density":
-            other = Volume(grid, field, sigma_a, 7 * sigma_s, g=field.new_tensor(0.5))
-            scene = replace(scene, volume=mix_media({"smoke": scene.volume, "dust": other}))
-        settings = OptimizeSettings({name: ParameterSettings(tv=1.0)})
-        (parameter,) = start_parameters(scene, settings)
-        value = parameter.penalty()
-        (slope,) = torch.autograd.grad(value, parameter.value)
-        return value, density * slope
-
-    for one, other in zip(penalty(1.0, 1.0), penalty(0.1, 7.0), strict=True):
-        torch.testing.assert_close(one, other)

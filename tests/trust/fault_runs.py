@@ -26,9 +26,8 @@ import torch
 from tiny_scene import write_scene
 
 from ddrecon.cli.commands import main
-from ddrecon.run import report_volume, run_folder
+from ddrecon.run import run_folder
 
-report_volume.FRAMES = 2
 SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
 """What click says of an interrupt before the command has begun."""
@@ -90,22 +89,13 @@ def result_of(out: Path) -> dict[str, object]:
     rows = [line.split(",") for line in (out / "loss.csv").read_text().splitlines()]
     seconds = rows[0].index("seconds")
     log = [row[:seconds] + row[seconds + 1 :] for row in rows]
-    files = {
-        str(path.relative_to(out)): path.read_bytes().hex()
-        for path in sorted(out.glob("previews/*"))
-    }
-    state = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]
-    moments = {
-        name: [moment.tolist() for moment in entry["moments"]]
-        for name, entry in state["parameters"].items()
-    }
-    values = {name: entry["value"].tolist() for name, entry in state["parameters"].items()}
+    files = [*sorted(out.glob("previews/*")), out / "parameters.json"]
+    state = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]["parameters"]
+    tensors = {name: [entry["value"], *entry["moments"]] for name, entry in state.items()}
     return {
         "log": log,
-        "files": files,
-        "moments": moments,
-        "values": values,
-        "parameters": (out / "parameters.json").read_text(),
+        "files": {path.name: path.read_bytes() for path in files},
+        "tensors": {name: [each.tolist() for each in found] for name, found in tensors.items()},
     }
 
 

@@ -19,7 +19,13 @@ from ddrecon.errors import DataWarning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
-from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import (
+    LAST,
+    PREVIOUS,
+    differences,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +65,7 @@ def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) ->
     for state in states:
         save_checkpoint(tmp_path, state, {"g": 0.1})
     whole, chance, fallbacks = (tmp_path / LAST).read_bytes(), random.Random(0), 0
-    for _ in range(150):
+    for _ in range(60):
         data = bytearray(whole)
         data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
         (tmp_path / LAST).write_bytes(data)
@@ -69,7 +75,7 @@ def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) ->
         assert list(flattened(found)) == list(flattened(states[0 if path.name == PREVIOUS else 1]))
         assert sum(warning.category is DataWarning for warning in told) == (path.name == PREVIOUS)
         fallbacks += path.name == PREVIOUS
-    assert fallbacks > 50
+    assert fallbacks > 20
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before_it(
@@ -96,19 +102,17 @@ def test_the_log_ends_where_the_checkpoint_does(run: Run) -> None:
     assert log.read_text() == whole
 
 
-@pytest.mark.parametrize(
-    "damaged", ["", "1", "1x", "1,0.5,nonsense,0.1,30,,3,4,120,0.1,0,,,", "1,\0", "70000"]
-)
-def test_a_log_with_lost_rows_is_told(run: Run, damaged: str) -> None:
+def test_a_log_with_lost_rows_is_told(run: Run) -> None:
     """Whatever stands there instead of one, the rest is kept."""
-    run(*OPTIMIZE, "--iterations", "3")
+    run(*OPTIMIZE, "--iterations", "4")
     log = Path("out/loss.csv")
     header, _, *rows = log.read_text().splitlines()
-    log.write_text("\n".join([header, damaged, *rows, ""]))
-    assert run(*RESUME, "--iterations", "4").stderr == (
-        "warning: out/loss.csv: has 3 of the 4 iterations made\n"
-    )
-    assert iterations() == [2, 3, 4]
+    for damaged in ("", "1", "1x", "1,0.5,nonsense,0.1,30,,3,4,120,0.1,0,,,", "1,\0", "70000"):
+        log.write_text("\n".join([header, damaged, *rows, ""]))
+        assert run(*RESUME, "--iterations", "4").stderr == (
+            "warning: out/loss.csv: has 3 of the 4 iterations made\n"
+        )
+        assert iterations() == [2, 3, 4]
 
 
 def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,36 +140,28 @@ def test_the_seed_belongs_to_the_state(run: Run) -> None:
     assert not np.array_equal(density(), resumed)
 
 
-@pytest.mark.parametrize(
-    ("change", "difference"),
-    [
-        (["-D", "views.1.camera.fov=31"], "views.1.camera.fov is 30.0 there, 31.0 now"),
-        (
-            ["-D", "optimize.parameters.g.min=0"],
-            "optimize.parameters.g.min is absent there, 0.0 now",
-        ),
-        (
-            ["-D", "views.0.camera.up=[1, 1, 0]"],
-            "views.0.camera.up is [0.0, 1.0, 0.0] there, [1.0, 1.0, 0.0] now",
-        ),
-        (["--dtype", "float64"], '--dtype is "float32" there, "float64" now'),
-    ],
-)
-def test_what_has_changed_is_named(run: Run, change: list[str], difference: str) -> None:
-    run(*OPTIMIZE, "--iterations", "1")
-    result = run(*RESUME, *change)
-    line = (
-        f"out/checkpoints/last.pt: belongs to another scene: {difference}; use another output "
-        "folder\n"
-    )
-    assert (result.exit_code, result.stderr) == (2, line)
+CHANGES = {
+    "views.1.camera.fov=31": "views.1.camera.fov is 30.0 there, 31.0 now",
+    "optimize.parameters.g.min=0": "optimize.parameters.g.min is absent there, 0.0 now",
+    "views.0.camera.up=[1,1,0]": "views.0.camera.up is [0.0, 1.0, 0.0] there, [1.0, 1.0, 0.0] now",
+    "--dtype": '--dtype is "float32" there, "float64" now',
+}
 
 
-def test_a_changed_picture_is_named(run: Run, folder: Path) -> None:
+def test_what_has_changed_is_named(run: Run, folder: Path) -> None:
     run(*OPTIMIZE, "--iterations", "1")
+    for change, difference in CHANGES.items():
+        options = [change, "float64"] if change.startswith("-") else ["-D", change]
+        result = run(*RESUME, *options)
+        line = f"out/checkpoints/last.pt: belongs to another scene: {difference}; use another"
+        assert (result.exit_code, result.stderr) == (2, f"{line} output folder\n")
     np.save("side.npy", 2 * np.load("side.npy"))
     result = run(*RESUME)
     assert result.exit_code == 2 and f"the content of {folder / 'side.npy'} is" in result.stderr
+
+
+def test_an_empty_section_is_a_difference() -> None:
+    assert differences({"a": {}}, {"a": {}, "g": {}}) == ["g is absent there, {} now"]
 
 
 def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:

@@ -35,7 +35,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def cloud(
-    path: Path, dtype: torch.dtype = torch.float32, cells: str = "[16, 12, 14]", **settings: str
+    path: Path, dtype: torch.dtype = torch.float32, cells: str = "[12, 10, 9]", **settings: str
 ) -> Scene:
     """The tiny scene, not so tiny, with a lumpy density."""
     overrides = [
@@ -109,17 +109,12 @@ def test_same_seed_same_bits(path: Path) -> None:
 
 
 def test_the_number_of_threads_changes_nothing_much(path: Path) -> None:
-    scene = cloud(path, cells="[48, 40, 40]")
+    scene = cloud(path, cells="[24, 20, 20]")
     with threads(1):
         one = found(scene)
     with threads(2):
         two = found(scene)
     assert distance(two, one) < EQUAL
-
-
-def test_the_order_of_views_changes_nothing_much(path: Path) -> None:
-    scene = cloud(path)
-    assert distance(found(replace(scene, views=scene.views[::-1])), found(scene)) < EQUAL
 
 
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
@@ -141,19 +136,16 @@ def test_the_size_of_chunks_changes_nothing_much(
 ) -> None:
     scene = cloud(path)
     whole = found(scene)
-    monkeypatch.setattr(march, "CHUNK_NODES", 300)
+    monkeypatch.setattr(march, "CHUNK_NODES", 100)
     assert distance(found(scene), whole) < EQUAL
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"model": "flux_limited", "transport_rounds": "0"}, {"transport_rounds": "0"}, {}],
-    ids=str,
-)
-def test_single_precision_is_close_to_double(path: Path, settings: dict[str, str]) -> None:
-    diffusion = {f"diffusion.{key}": value for key, value in settings.items()}
+@pytest.mark.parametrize("model", ["flux_limited", "p1"])
+def test_single_precision_is_close_to_double(path: Path, model: str) -> None:
+    settings = {"diffusion.model": model}
+    settings |= {"diffusion.transport_rounds": "0"} if model == "flux_limited" else {}
     single, double = (
-        found(cloud(path, dtype, cells="[7, 6, 5]", **diffusion))
+        found(cloud(path, dtype, cells="[7, 6, 5]", **settings))
         for dtype in (torch.float32, torch.float64)
     )
     assert distance(single, double) < SINGLE

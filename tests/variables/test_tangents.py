@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from media import make_scene, random_values
+from media import make_scene, random_values, render_tangent
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene
-from ddrecon.variables.tangents import render_tangent, variation
+from ddrecon.variables.tangents import variation
 from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.slow

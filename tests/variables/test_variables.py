@@ -8,10 +8,17 @@ import pytest
 import torch
 from media import make_scene, random_values
 
+from ddrecon.cameras import Camera, look_at
 from ddrecon.errors import UsageError
 from ddrecon.renderer import render
-from ddrecon.scene import Scene
-from ddrecon.variables.values import component_names, value_of, variable_names, with_values
+from ddrecon.scene import Scene, View
+from ddrecon.variables.values import (
+    component_names,
+    name_each,
+    value_of,
+    variable_names,
+    with_values,
+)
 
 SHAPE = (4, 3, 5)
 
@@ -125,3 +132,24 @@ def test_a_twist_belongs_to_its_view_alone(scene: Scene) -> None:
     changed = with_values(two, {"views.other.camera": torch.full((6,), 0.1, dtype=torch.float64)})
     assert changed.views[0] is two.views[0]
     assert not torch.allclose(changed.views[1].camera.pose, two.views[1].camera.pose)
+
+
+def view(name: str, is_test: bool = False, has_image: bool = True) -> View:
+    pose = look_at(*torch.tensor([[0.0, 0, 5], [0, 0, 0], [0, 1, 0]]))
+    image = torch.zeros(3, 2, 2) if has_image else None
+    return View(name, Camera(pose, (2, 2), 0.3), image, is_test=is_test)
+
+
+def test_a_star_is_every_training_view_with_an_image() -> None:
+    views = [view("a"), view("b.c"), view("held", is_test=True), view("d", has_image=False)]
+    named = name_each({"density": 1, "views.*.exposure": 2}, views)
+    assert named == {"density": 1, "views.a.exposure": 2, "views.b.c.exposure": 2}
+
+
+def test_the_settings_of_a_view_itself_win() -> None:
+    views = [view("a"), view("b")]
+    for parameters in (
+        {"views.*.camera": 1, "views.b.camera": 2},
+        {"views.b.camera": 2, "views.*.camera": 1},
+    ):
+        assert name_each(parameters, views) == {"views.a.camera": 1, "views.b.camera": 2}

@@ -17,8 +17,6 @@ from ddrecon.io.images import srgb
 
 SECONDS = 4.0
 """How long a movie takes from its first frame back to it."""
-QUALITY = 82
-"""Of moving WebP, which is looked at in passing."""
 
 
 def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
@@ -41,19 +39,11 @@ def webp_of(image: np.ndarray) -> bytes:
     return encode(image, ".webp", lossless=True, quality=90, method=4)
 
 
-def moving_webp_of(frames: np.ndarray) -> bytes:
-    """`frames` as moving WebP that goes on for ever: far smaller than PNG."""
-    return encode(frames, ".webp", quality=QUALITY, **_timing(frames))
-
-
 def write_animation(path: Path, frames: np.ndarray) -> None:
     """Writes `frames` as an animated PNG that goes on for ever to `path`."""
     with replace_file(path) as temporary:
-        temporary.write_bytes(encode(frames, ".png", **_timing(frames)))
-
-
-def _timing(frames: np.ndarray) -> dict[str, Any]:
-    return {"duration": 1000 * SECONDS / len(frames), "loop": 0}
+        timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}
+        temporary.write_bytes(encode(frames, ".png", **timing))
 
 
 def require_mp4() -> None:

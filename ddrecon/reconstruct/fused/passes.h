@@ -17,10 +17,10 @@ template <class F> struct Step {
             const F square = second[i] + forget_second * (g * g - second[i]);
             const F onward = g + ahead * (mean - g), least = smallest[IS_EACH ? i : 0];
             const F moved = value[i] - rate * onward / (root(square) * scale + least);
-            const F held = moved < low ? low : moved;
+            const F raised = moved < low ? low : moved;
             new_first[i] = mean;
             new_second[i] = square;
-            new_value[i] = held > high ? high : held;
+            new_value[i] = raised > high ? high : raised;
         }
     }
 };

@@ -12,6 +12,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.text import BLOCK, TextKernel, cut
 from ddrecon.losses import ROUNDING
 from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.reconstruct import tuning
 
 LENGTH = 4096
 """Numbers that an item of a launch steps on a processor."""
@@ -23,19 +24,18 @@ def step_adam(
     value: Tensor,
     gradient: Tensor,
     moments: tuple[Tensor, Tensor],
-    betas: tuple[float, float],
     steps: int,
     rate: float,
     smallest: Tensor,
-    ahead: float,
     bounds: tuple[float, float],
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """The new value, within its bounds, and the new moments, after `steps` with this one.
 
     `smallest`, a number or one for each, is added to the size of derivatives. The value moves along
-    the part `ahead` of the mean derivative, and for the rest along the newest (E46).
+    a mixture of the mean derivative and the newest (E46).
     """
     new = [value.new_empty(value.shape) for _ in range(3)]
+    betas = tuning.BETAS
     weights = [1 - beta**steps for beta in betas]
     items, length = cut(value.numel(), LENGTH, value)
     given = {
@@ -48,7 +48,7 @@ def step_adam(
         "forget_first": 1 - betas[0],
         "forget_second": 1 - betas[1],
         "scale": weights[1] ** -0.5,
-        "ahead": ahead,
+        "ahead": betas[0],
         "smallest": smallest,
         "rate": rate / weights[0],
         "low": bounds[0],
