@@ -96,8 +96,8 @@ def render(
     has_mp4: bool,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
-    from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing

@@ -12,8 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.errors import UsageError
-from ddrecon.io.files.atomic import refusals, remove_temporaries
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import refusals, remove_temporaries, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
 from ddrecon.run.checkpoint import LAST, load_checkpoint, save_checkpoint

@@ -113,9 +113,9 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
     for sources, words in (
         (
             ["density.npz", "other.npz"],
-            "other.npz: has 7 x 5 x 4 cells (x, y, z), the first field 6 x 5 x 4",
+            "other.npz: has 7 x 5 x 4 cells (x, y, z) in the box",
         ),
-        (["density.npz", "moved.npz"], "moved.npz: lies in the box [[-1.0"),
+        (["density.npz", "moved.npz"], "cells (x, y, z) in the box [[-1.0"),
         (["density.npz", "density.npz"], "has a field 'density', and so has a file before it"),
         (["nowhere.npz"], "says no box"),
         (["none.npz"], "has no fields"),

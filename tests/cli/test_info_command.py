@@ -74,5 +74,5 @@ def test_refusals(refuse: Refuse) -> None:
     Path("notes.txt").write_text("hello")
     Path("bad.npz").write_text("hello")
     assert "unknown image format '.txt'" in refuse(3, "info", "notes.txt")[-1]
-    assert "not a complete .npz" in refuse(3, "info", "bad.npz")[-1]
+    assert "is damaged: File is not a zip file" in refuse(3, "info", "bad.npz")[-1]
     assert "cannot be read" in refuse(3, "info", "nothing.vol")[-1]
