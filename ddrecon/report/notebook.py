@@ -24,9 +24,10 @@ def html_of(shown: Scene | Volume) -> str:
 
     A scene is seen from its first camera. The frame's scripts reach nothing of the notebook.
     """
-    volume, cameras, lights = shown, [], ""
+    volume = shown.volume if isinstance(shown, Scene) else shown
+    cameras = [view.camera for view in shown.views] if isinstance(shown, Scene) else []
+    lights = ""
     if isinstance(shown, Scene):
-        volume, cameras = shown.volume, [view.camera for view in shown.views]
         lights = f"; {len(shown.lights)} lights, {len(cameras)} views"
     cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
     words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"

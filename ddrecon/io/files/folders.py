@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -46,7 +46,7 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
             lock.unlink(missing_ok=True)
 
 
-def _acquire(path: Path) -> FileLock:
+def _acquire(path: Path) -> AbstractContextManager[object]:
     """The lock on the file at `path`, until its block ends."""
     try:
         # No soft locks: what they leave behind would have to be judged stale or not.

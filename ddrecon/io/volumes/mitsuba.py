@@ -44,7 +44,8 @@ def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     `bounds` [2, 3] are the corners (x, y, z) [u]. The format knows no names.
     """
     values = as_float32(require_only_field(path, fields))
-    z, y, x, colors = *values.shape, *(1,) * (4 - values.ndim)
+    colors = values.shape[3] if values.ndim == 4 else 1
+    z, y, x = values.shape[:3]
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *bounds.ravel())
     with replace_file(path) as temporary:
         temporary.write_bytes(header + values.astype("<f4", copy=False).tobytes())
