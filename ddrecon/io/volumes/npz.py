@@ -46,4 +46,4 @@ def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """
     arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()}
     with replace_file(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, **(arrays | {BOUNDS: bounds}))  # type: ignore[arg-type]
+        np.savez_compressed(stream, **(arrays | {BOUNDS: bounds}))
