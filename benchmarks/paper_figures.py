@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.io.images import srgb
+from ddrecon.pictures import srgb
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

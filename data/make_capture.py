@@ -27,10 +27,10 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, look_at, subpixel_offsets, twist
 from ddrecon.grid import Grid
-from ddrecon.io.images.srgb import encode
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.pictures.srgb import encode
 from ddrecon.reference.trace import Tracer, open_tracer
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings

@@ -138,7 +138,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "file": (
                 ".csv or .txt with a header: `angle` (degrees) or `cosine`, then one column of "
-                "values or one a color; or .npz with these as arrays, the values called `value`."
+                "values or one a color."
             ),
         },
     ),

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 import ddrecon
-from ddrecon.io.images import srgb
 from ddrecon.io.volumes.table import read_field
+from ddrecon.pictures import srgb
 from ddrecon.report.pictures import pixels
 
 ROOT = Path(__file__).parents[1]

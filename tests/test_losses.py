@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from ddrecon.grid import Grid
-from ddrecon.io.images import srgb
 from ddrecon.losses import (
     HUBER,
     LOSSES,
@@ -16,6 +15,7 @@ from ddrecon.losses import (
     psnr,
     total_variation,
 )
+from ddrecon.pictures import srgb
 from ddrecon.pictures.noise import Noise
 
 

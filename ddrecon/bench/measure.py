@@ -17,13 +17,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.bench.report import Row, with_best
-from ddrecon.bench.variants import QUICK, Sweep, Variant, exact_scene, model_of, variants_of
+from ddrecon.bench.variants import QUICK, Sweep, exact_scene, model_of, variants_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.progress import Progress
 from ddrecon.reference.trace import Traced, Tracer
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
 
 TURNS = 2
@@ -79,7 +80,13 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
     variants = variants_of(scene, QUICK if is_quick else Sweep())
-    exact = exact_shots(variants, double, progress)
+    exact = dict[str, Shot]()  # alike models are solved once
+    solved = dict[tuple[object, ...], Shot]()
+    for variant in progress(variants, "exact solutions"):
+        changed = variant.change(double)
+        if (model := model_of(changed)) not in solved:
+            solved[model] = shoot(exact_scene(changed))
+        exact[variant.name] = solved[model]
     contestants: dict[str, Callable[[], Shot]] = {
         variant.name: functools.partial(shoot, variant.change(scene)) for variant in variants
     }
@@ -116,25 +123,15 @@ def measure(
     return {name: each for name, each in shots.items() if each}
 
 
-def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -> dict[str, Shot]:
-    """The exact solution of each variant of `scene`, which is in double precision, by name.
-
-    Alike models are solved once.
-    """
-    known = dict[tuple[object, ...], Shot]()
-    for variant in progress(variants, "exact solutions"):
-        changed = variant.change(scene)
-        if model_of(changed) not in known:
-            known[model_of(changed)] = shoot(exact_scene(changed))
-    return {variant.name: known[model_of(variant.change(scene))] for variant in variants}
-
-
 def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced | None) -> Row:
     """The row of what took these `shots`; times are medians."""
     shot = shots[0]
-    seconds = [(each.image_seconds, each.image_seconds + each.gradient_seconds) for each in shots]
-    image_seconds, both_seconds = map(median, zip(*seconds, strict=True))
-    row = Row(name, image_seconds, both_seconds, shot.iterations)
+    row = Row(
+        name,
+        median(each.image_seconds for each in shots),
+        median(each.image_seconds + each.gradient_seconds for each in shots),
+        shot.iterations,
+    )
     if exact is not None and exact.gradient is not None and shot.gradient is not None:
         row = replace(
             row,
@@ -145,13 +142,6 @@ def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced |
         error = truth.error(shot.image.numpy())
         row = replace(row, image_error=error, image_noise=truth.noise)
     return row
-
-
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Relative RMS error."""
-    tiny = torch.finfo(torch.float64).tiny
-    away = (found.double() - expected.double()).norm()
-    return float(away / expected.double().norm().clamp(min=tiny))
 
 
 def _now(like: Tensor) -> float:

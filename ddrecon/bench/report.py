@@ -1,4 +1,4 @@
-"""The table, the plot and the page of a bench: one row per variant, error beside time."""
+"""The table and the plot of a bench: one row per variant, error beside time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ddrecon.errors import MissingExtraError
 from ddrecon.extras import load_extra
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import write_json
 from ddrecon.reference.trace import error_text, least_error
-from ddrecon.report import page
-from ddrecon.report.page import paragraph, picture, section, versions, write_page
 from ddrecon.scene import Scene
 
 FLOOR = 1e-8
@@ -41,77 +38,61 @@ class Row:
     image_noise: float = 0.0
     is_best: bool = False
 
+    @property
+    def error(self) -> float:
+        """The error against path tracing, or else against the exact solution; or else infinity.
+
+        What path tracing cannot tell from none counts as the least that it can.
+        """
+        if self.image_error is not None:
+            return max(self.image_error, least_error(self.image_noise))
+        return math.inf if self.image_numerical is None else self.image_numerical
+
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
     """The same rows, those marked that no other beats in both time of an image and error."""
-
-    def is_beaten(row: Row) -> bool:
-        return any(
-            other.image_seconds < row.image_seconds and error_of(other) <= error_of(row)
-            for other in rows
-        )
-
-    return [replace(row, is_best=not is_beaten(row)) for row in rows]
-
-
-def error_of(row: Row) -> float:
-    """The error against path tracing, or else against the exact solution; or else infinity.
-
-    What path tracing cannot tell from none counts as the least that it can.
-    """
-    if row.image_error is not None:
-        return max(row.image_error, least_error(row.image_noise))
-    return math.inf if row.image_numerical is None else row.image_numerical
-
-
-HEAD = [
-    "variant",
-    "image s",
-    "+ gradient s",
-    "times base",
-    "iterations",
-    "image num. error",
-    "gradient num. error",
-    "image error",
-    "",
-]
-"""The columns of the table."""
-
-
-def cells(rows: Sequence[Row]) -> list[list[str]]:
-    """The rows as text under `HEAD`; times also as multiples of the first row's."""
     return [
-        [
-            row.name,
-            f"{row.image_seconds:.3f}",
-            f"{row.both_seconds:.3f}",
-            f"{row.both_seconds / rows[0].both_seconds:.2f}",
-            str(row.iterations),
-            "" if row.image_numerical is None else f"{row.image_numerical:.1e}",
-            "" if row.gradient_numerical is None else f"{row.gradient_numerical:.1e}",
-            "" if row.image_error is None else error_text(row.image_error, row.image_noise),
-            "best" if row.is_best else "",
-        ]
+        replace(
+            row,
+            is_best=not any(
+                other.image_seconds < row.image_seconds and other.error <= row.error
+                for other in rows
+            ),
+        )
         for row in rows
     ]
 
 
+HEAD = (
+    "| variant | image s | + gradient s | times base | iterations | image num. error "
+    "| gradient num. error | image error |  |"
+)
+
+
 def bench_lines(rows: Sequence[Row]) -> list[str]:
-    """The rows as a Markdown table, and what they are compared with."""
-    lines = [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
-    return [*lines, *_remarks(rows)]
-
-
-def _remarks(rows: Sequence[Row]) -> list[str]:
-    """How path tracing compares; nothing without it."""
+    """The rows as a Markdown table, with times as multiples of the first's, and Mitsuba's time."""
     base, last = rows[0], rows[-1]
-    if last.image_error is None:
-        return []
-    ratio = last.image_seconds / base.image_seconds
-    return [
-        f"image error is against path tracing, whose noise, {last.image_noise:.2g}, is subtracted; "
-        f"{last.name} take {ratio:.3g} times as long as base"
-    ]
+    lines = [HEAD, "|" + " --- |" * (HEAD.count("|") - 1)]
+    for row in rows:
+        numerical = (row.image_numerical, row.gradient_numerical)
+        cells = [
+            row.name,
+            f"{row.image_seconds:.3f}",
+            f"{row.both_seconds:.3f}",
+            f"{row.both_seconds / base.both_seconds:.2f}",
+            str(row.iterations),
+            *("" if error is None else f"{error:.1e}" for error in numerical),
+            "" if row.image_error is None else error_text(row.image_error, row.image_noise),
+            "best" if row.is_best else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    if last.image_error is not None:
+        lines.append(
+            f"image error is against path tracing, whose noise, {last.image_noise:.2g}, is "
+            f"subtracted; {last.name} take {last.image_seconds / base.image_seconds:.3g} times as "
+            "long as base"
+        )
+    return lines
 
 
 def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
@@ -126,34 +107,19 @@ def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> 
     }
 
 
-def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> str:
-    """Where bench.json, report.html and, with matplotlib, bench.png were written, in words.
+def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> None:
+    """Writes `report`, which `describe` gives of the `rows`, to bench.json, and draws bench.png.
 
-    `report` is what `describe` gives of the `rows`.
+    Raises MissingExtraError where matplotlib is not installed.
     """
     write_json(folder / "bench.json", report)
-    plot, notice, drawn = folder / "bench.png", f"written to {folder}", []
-    try:
-        draw(rows, plot)
-        caption = "numbers are those of the table's rows; the line joins the best"
-        drawn = [section("Error against time", picture(plot.read_bytes(), caption, 1080))]
-    except MissingExtraError as error:
-        notice = f"{notice}, without a plot: {error}"
-    sections = [
-        *drawn,
-        section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, _remarks(rows))),
-        section("Versions", versions(report["environment"])),
-    ]
-    lead = "Speed against error: medians of whole renders, in one run."
-    write_page(folder / "report.html", "ddrecon bench", lead, sections)
-    return notice
+    draw(rows, folder / "bench.png")
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Writes a PNG of times against errors: of the image, and of image and gradient.
 
-    Dots have the numbers of their rows, and a color for each kind of variant. Raises
-    MissingExtraError where matplotlib is not installed.
+    Dots have the numbers of their rows, and a color for each kind of variant.
     """
     load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt
@@ -162,13 +128,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     kinds = list(dict.fromkeys(row.name.split(" ")[0] for row in rows))
     for number, row in enumerate(rows, 1):
         color, label = f"C{kinds.index(row.name.split(' ')[0]) % 10}", f"{number}  {row.name}"
-        dots = (row.image_seconds, error_of(row)), (row.both_seconds, row.gradient_numerical)
+        dots = (row.image_seconds, row.error), (row.both_seconds, row.gradient_numerical)
         for axis, (seconds, error) in zip(axes, dots, strict=True):
             if error is not None:
                 place = seconds, max(error, FLOOR)
                 axis.plot(*place, "o", color=color, label=label)
                 axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
-    front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
+    front = sorted((row.image_seconds, max(row.error, FLOOR)) for row in rows if row.is_best)
     axes[0].step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
     for axis, what in zip(axes, ("an image", "an image and its gradient"), strict=True):
         axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")

@@ -58,7 +58,7 @@ def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
     """The base, and every variant of `sweep` that differs from it."""
     return [
         Variant("base", "", lambda scene: scene),
-        *(item for item in _variants(sweep) if not _is_same(item.change(scene), scene)),
+        *(item for item in _variants(sweep) if _settings(item.change(scene)) != _settings(scene)),
     ]
 
 
@@ -77,7 +77,8 @@ def exact_scene(scene: Scene) -> Scene:
 
 def model_of(scene: Scene) -> tuple[object, ...]:
     """What two scenes must share for their exact images to be the same."""
-    return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
+    shape, _, diffusion = _settings(replace(scene, diffusion=replace(scene.diffusion, **EXACT)))
+    return shape, diffusion
 
 
 def _variants(sweep: Sweep) -> Iterator[Variant]:
@@ -112,15 +113,9 @@ def _coarsen(factor: int, scene: Scene) -> Scene:
     return replace(scene_at_level(scene, factor), views=scene.views)
 
 
-def _is_same(changed: Scene, scene: Scene) -> bool:
-    is_same_grid = changed.volume.grid.shape == scene.volume.grid.shape
-    return (
-        is_same_grid
-        and changed.render == scene.render
-        and _effective(changed.diffusion) == _effective(scene.diffusion)
-    )
-
-
-def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
-    """Without the degree where there are no rounds that it could matter to."""
-    return diffusion if diffusion.rounds else replace(diffusion, degree=DiffusionSettings.degree)
+def _settings(scene: Scene) -> tuple[object, ...]:
+    """What is varied; without the degree where there are no rounds that it could matter to."""
+    diffusion = scene.diffusion
+    if not diffusion.rounds:
+        diffusion = replace(diffusion, degree=DiffusionSettings.degree)
+    return scene.volume.grid.shape, scene.render, diffusion

@@ -90,8 +90,8 @@ def render(
     if lights:
         session = session.with_overrides(f"lights=[{', '.join(lights)}]")
     scene_file = session.read(scene)
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
-    from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT

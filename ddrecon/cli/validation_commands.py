@@ -82,12 +82,9 @@ def reference(
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
     loaded = session.load(scene)
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
-    from ddrecon.reference.compare import (
-        compare_to_folder,
-        reference_lines,
-        write_reference_report,
-    )
+    from ddrecon.reference.compare import compare_to_folder, reference_lines
     from ddrecon.reference.trace import open_tracer
 
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
@@ -95,8 +92,9 @@ def reference(
     with claim_folder(output, may_exist=overwrite):
         shown = None if is_only_traced else loaded
         settings = output, samples, session.seed, session.progress
-        compared = compare_to_folder(tracer, shown, views, *settings)
-        report = write_reference_report(output, compared, session.environment())
+        report = compare_to_folder(tracer, shown, views, *settings)
+        report["environment"] = session.environment() | {"mitsuba": tracer.module.__version__}
+        write_json(output / "reference.json", report)
     session.show(report, reference_lines(report, output))
 
 
@@ -115,7 +113,7 @@ def reference(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Folder for the results: bench.json, bench.png and report.html, or hard.json.",
+    help="Folder for the results: bench.json and bench.png, or hard.json.",
 )
 @OVERWRITE
 @REPORT
@@ -164,13 +162,19 @@ def _bench_speed(
         click.echo(f"without path tracing: {error}", err=True)
     rows = run_bench(scene, double, tracer, is_quick, session.progress)
     measured = describe(rows, scene, session.environment())
-    written = [] if output is None else [write_bench(output, rows, measured)]
+    written = []
+    if output is not None:
+        written = [f"written to {output}"]
+        try:
+            write_bench(output, rows, measured)
+        except MissingExtraError as error:
+            written = [f"{written[0]}, without a plot: {error}"]
     session.show(measured, [*bench_lines(rows), *written])
 
 
 def _bench_hard(session: Session, output: Path | None) -> None:
     """Runs the hard cases, writes their table where asked for, and exits with 1 if any fails."""
-    from ddrecon.io.files.json_file import write_json
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.validate.hard import describe, run_cases, table
 
     results = run_cases(session.start(), session.progress)

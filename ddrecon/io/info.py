@@ -8,32 +8,33 @@ from typing import Any
 
 import numpy as np
 
+from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images.oiio import is_stack
 from ddrecon.io.images.table import READERS, read_image
 from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import FORMATS, field_names, read_field
-from ddrecon.io.volumes.tiff_stack import is_stack
 
 
 def describe(path: Path) -> dict[str, Any]:
     """The contents of the volume or image at `path`, for `lines` or JSON.
 
-    Raises FormatError when it is neither, or damaged.
+    Raises FormatError when it is neither, or damaged. A .tif of several pages is a volume.
     """
-    return _describe_volume(path) if _is_volume(path) else _describe_image(path)
-
-
-def _is_volume(path: Path) -> bool:
-    """Whether the suffix of `path` says so; a .tif is a volume where it has several pages."""
-    suffix = path.suffix.lower()
-    return suffix in FORMATS and (suffix not in READERS or (path.is_file() and is_stack(path)))
-
-
-def _describe_volume(path: Path) -> dict[str, Any]:
-    fields, bounds = {}, None
-    for name in field_names(path):
-        field = read_field(path, name)
-        fields[name], bounds = field.values, field.bounds
-    return describe_medium(fields, {}, bounds)
+    with guard_reading(path):
+        suffix = path.suffix.lower()
+        is_image = suffix not in FORMATS or (suffix in READERS and not is_stack(path))
+    if not is_image:
+        fields = {name: read_field(path, name) for name in field_names(path)}
+        bounds = next((field.bounds for field in fields.values()), None)
+        return describe_medium({name: each.values for name, each in fields.items()}, {}, bounds)
+    image = read_image(path)
+    height, width = image.size
+    is_gray = bool((image.pixels == image.pixels[..., :1]).all())
+    return {
+        "pixels": [width, height],
+        "has_alpha": image.coverage is not None,
+        **_summarize(image.pixels, is_gray),
+    }
 
 
 def describe_medium(fields: Fields, constants: Fields, bounds: np.ndarray | None) -> dict[str, Any]:
@@ -41,35 +42,21 @@ def describe_medium(fields: Fields, constants: Fields, bounds: np.ndarray | None
 
     `constants`, of one number or three, are the same in every cell.
     """
-    first = next(iter(fields.values()), None)
-    report: dict[str, Any] = {
-        "resolution": None if first is None else list(first.shape[2::-1]),
+    shapes = [values.shape for values in fields.values()]
+    report = {
+        "resolution": list(shapes[0][2::-1]) if shapes else None,
         "bounds": None if bounds is None else bounds.tolist(),
-        "fields": {
-            name: {"colors": 1 if values.ndim == 3 else 3, **_summarize(values)}
-            for name, values in fields.items()
-        },
+        "fields": {name: _summarize(values, values.ndim == 3) for name, values in fields.items()},
     }
     everywhere = {name: value.tolist() for name, value in constants.items()}
     return report | ({"constants": everywhere} if everywhere else {})
 
 
-def _describe_image(path: Path) -> dict[str, Any]:
-    image = read_image(path)
-    height, width = image.size
-    is_gray = bool((image.pixels == image.pixels[..., :1]).all())
-    return {
-        "pixels": [width, height],
-        "colors": 1 if is_gray else 3,
-        "has_alpha": image.coverage is not None,
-        **_summarize(image.pixels),
-    }
-
-
-def _summarize(values: np.ndarray) -> dict[str, float]:
+def _summarize(values: np.ndarray, is_gray: bool) -> dict[str, float]:
     """Extremes and mean of `values`, and the part of cells or pixels that is `filled`: not 0."""
     places = values if values.ndim != 4 else values.any(-1)
     return {
+        "colors": 1 if is_gray else 3,
         "min": float(values.min()),
         "max": float(values.max()),
         "mean": float(values.mean(dtype=np.float64)),
@@ -80,33 +67,25 @@ def _summarize(values: np.ndarray) -> dict[str, float]:
 def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     if "pixels" in report:
-        alpha = ", with alpha" if report["has_alpha"] else ""
+        colors = _colors(report) + (", with alpha" if report["has_alpha"] else "")
         return [
-            f"image: {_sizes(report['pixels'])} pixels, {_colors(report)}{alpha}, "
-            f"linear radiance {_values(report)}"
+            f"image: {_sizes(report['pixels'])} pixels, {colors}, linear radiance {_values(report)}"
         ]
     if not report["fields"]:
         return ["no fields"]
-    cells = f"cells: {_sizes(report['resolution'])} (x, y, z)"
+    box = ", no box: the scene's volume.bounds will be taken"
+    if report["bounds"] is not None:
+        low, high = report["bounds"]
+        sides = (np.subtract(high, low) / report["resolution"]).tolist()
+        box = f" of {_sizes(sides)} u, from {low} to {high}"
     return [
-        cells + _box(report),
-        *(
-            f"{name}: {_colors(field)}, {_values(field)}"
-            for name, field in report["fields"].items()
-        ),
+        f"cells: {_sizes(report['resolution'])} (x, y, z){box}",
+        *(f"{name}: {_colors(each)}, {_values(each)}" for name, each in report["fields"].items()),
         *(
             f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
             for name, value in report.get("constants", {}).items()
         ),
     ]
-
-
-def _box(report: dict[str, Any]) -> str:
-    if report["bounds"] is None:
-        return ", no box: the scene's volume.bounds will be taken"
-    low, high = report["bounds"]
-    sides = [(b - a) / count for a, b, count in zip(low, high, report["resolution"], strict=True)]
-    return f" of {_sizes(sides)} u, from {low} to {high}"
 
 
 def _colors(report: dict[str, Any]) -> str:

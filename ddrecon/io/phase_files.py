@@ -1,7 +1,7 @@
 """Phase functions from files: values over the angle.
 
 Text files (.csv, .txt) have numbers in columns, separated by commas or spaces, under a header that
-names the columns; `#` begins a comment. Archives (.npz) have arrays of these names.
+names the columns; `#` begins a comment.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.volumes.npz import read_arrays
 
-SUFFIXES = (".csv", ".txt", ".npz")
+SUFFIXES = (".csv", ".txt")
 MAX_BYTES = 1 << 26
-ABSCISSAS = ("angle", "cosine")
-"""The first column: scattering angles in degrees, or their cosines."""
 ENDS = 1e-3
 """How far [rad] a table may begin from 0 and end from pi."""
 
@@ -25,10 +22,13 @@ ENDS = 1e-3
 def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Angles [n] [rad], increasing from 0 to pi, and values [C, n] >= 0 of the table at `path`.
 
-    C is 1, or 3 where there is a column a color. Raises FormatError.
+    The first column are scattering angles in degrees, or their cosines. C is 1, or 3 where there is
+    a column a color. Raises FormatError.
     """
-    name, (first, *others) = _read_columns(path)
-    if name not in ABSCISSAS:
+    with guard_reading(path):
+        name, (first, *others) = _read_columns(path)
+    values = np.array(others)
+    if name not in ("angle", "cosine"):
         raise FormatError(path, f"its first column is {name!r}; call it angle (degrees) or cosine")
     if len(first) < 4:
         raise FormatError(path, f"has {len(first)} angles; a table needs at least 4")
@@ -36,16 +36,16 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FormatError(
             path, f"has {len(others)} columns of values; expected 1, or 3 for r, g, b"
         )
-    values = np.array(others)
+    if not (np.isfinite(first).all() and np.isfinite(values).all()):
+        raise FormatError(path, "holds numbers that are not finite")
     if name == "cosine" and np.abs(first).max() > 1 + 1e-6:
         raise FormatError(path, "has cosines beyond -1 and 1; are they degrees? call them angle")
     angles = np.arccos(first.clip(-1, 1)) if name == "cosine" else np.radians(first)
     order = np.argsort(angles)
     angles, values = angles[order], values[:, order]
-    if (np.diff(angles) <= 0).any():
-        row = int(np.argmax(np.diff(angles) <= 0))
-        raise FormatError(path, f"has the angle {np.degrees(angles[row]):g} degrees twice")
-    if angles[0] < 0 or abs(angles[0]) > ENDS or abs(angles[-1] - np.pi) > ENDS:
+    if (twice := np.flatnonzero(np.diff(angles) <= 0)).size:
+        raise FormatError(path, f"has the angle {np.degrees(angles[twice[0]]):g} degrees twice")
+    if angles[0] < 0 or angles[0] > ENDS or abs(angles[-1] - np.pi) > ENDS:
         low, high = np.degrees(angles[[0, -1]])
         raise FormatError(path, f"goes from {low:g} to {high:g} degrees; it must go from 0 to 180")
     if values.min() < 0 or (values.max(1) <= 0).any():
@@ -55,35 +55,9 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_columns(path: Path) -> tuple[str, np.ndarray]:
-    """The name of the first column, "" without a header, and columns [k, n] of finite numbers."""
-    with guard_reading(path):
-        if path.suffix.lower() not in SUFFIXES:
-            raise FormatError(path, f"is no table; expected {', '.join(SUFFIXES)}")
-        is_archive = path.suffix.lower() == ".npz"
-        name, columns = _read_archive(path) if is_archive else _read_text(path)
-    if not np.isfinite(columns).all():
-        raise FormatError(path, "holds numbers that are not finite")
-    return name, columns
-
-
-def _read_archive(path: Path) -> tuple[str, np.ndarray]:
-    """Arrays called angle or cosine, then `value` [n] or [n, 3]."""
-    arrays = read_arrays(path)
-    if "value" not in arrays or arrays["value"].ndim not in (1, 2):
-        raise FormatError(path, "has no array 'value' [n] or [n, 3]")
-    values = np.atleast_2d(arrays["value"].T).astype(np.float64)
-    name = next((name for name in ABSCISSAS if name in arrays), "")
-    if not name:
-        return name, values
-    if arrays[name].shape != values.shape[1:]:
-        raise FormatError(path, f"{name} and value have different lengths")
-    return name, np.vstack([arrays[name], values])
-
-
-def _read_text(path: Path) -> tuple[str, np.ndarray]:
     """The name of the first column, and columns of numbers below a line of names, if any."""
-    if path.stat().st_size > MAX_BYTES:
-        raise FormatError(path, f"is larger than {MAX_BYTES >> 20} MiB; it is no table")
+    if path.suffix.lower() not in SUFFIXES or path.stat().st_size > MAX_BYTES:
+        raise FormatError(path, f"is no table of text ({', '.join(SUFFIXES)})")
     name, rows = "", list[list[float]]()
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
         entries = line.split("#")[0].replace(",", " ").replace(";", " ").split()
@@ -95,8 +69,8 @@ def _read_text(path: Path) -> tuple[str, np.ndarray]:
             name, row = entries[0].strip("\"'").lower(), []
         rows += [row] if row else []
         if row and len(row) != len(rows[0]):
-            told = f"line {number} has {len(row)} numbers, those before {len(rows[0])}"
-            raise FormatError(path, told)
+            counts = f"{len(row)} numbers, those before {len(rows[0])}"
+            raise FormatError(path, f"line {number} has {counts}")
     if not rows:
         raise FormatError(path, "holds no numbers")
     return name, np.array(rows).T

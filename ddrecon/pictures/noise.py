@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
-from ddrecon.pictures.display import display_slope
+from ddrecon.pictures.srgb import display_slope
 
 LEAST = 1e-3
 """A picture errs by at least this part of its root mean square: nothing is known better."""
@@ -75,12 +75,13 @@ def estimate_noise(image: Tensor, step: float) -> Noise:
 def _fit_line(places: Tensor, values: Tensor) -> tuple[float, float]:
     """The line value + slope x place through `values` >= 0, neither below 0, by least squares."""
     middle, mean = places.mean(), values.mean()
-    spread = (places - middle).square().sum().clamp(min=torch.finfo(places.dtype).tiny)
-    slope = float(((places - middle) * (values - mean)).sum() / spread)
+    tiny = torch.finfo(places.dtype).tiny
+    away = places - middle
+    slope = float((away * (values - mean)).sum() / away.square().sum().clamp(min=tiny))
     start = float(mean - slope * middle)
     if slope < 0:
         return float(mean), 0.0
     if start < 0:
-        square = places.square().sum().clamp(min=torch.finfo(places.dtype).tiny)
-        return 0.0, max(0.0, float((places * values).sum() / square))
+        through_zero = float((places * values).sum() / places.square().sum().clamp(min=tiny))
+        return 0.0, max(0.0, through_zero)
     return start, slope

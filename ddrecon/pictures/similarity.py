@@ -17,11 +17,17 @@ def structural_similarity(image: Tensor, other: Tensor, peak: Tensor) -> Tensor:
 
     Wang et al. 2004, doi:10.1109/TIP.2003.819861, with their window; at an edge it is cut off.
     """
-    window = _window(image)
-    weight = _blur(torch.ones_like(image[:1]), window)
+    place = torch.arange(-RADIUS, RADIUS + 1).to(image)
+    window = torch.exp(-0.5 * (place / DEVIATION) ** 2)
+
+    def blur(values: Tensor) -> Tensor:
+        padded = pad(values[:, None], (RADIUS,) * 4)
+        return conv2d(conv2d(padded, window.view(1, 1, -1, 1)), window.view(1, 1, 1, -1))[:, 0]
+
+    weight = blur(torch.ones_like(image[:1]))
 
     def mean(values: Tensor) -> Tensor:
-        return _blur(values, window) / weight
+        return blur(values) / weight
 
     first, second = mean(image), mean(other)
     contrast = mean(image * image) - first**2 + mean(other * other) - second**2
@@ -30,17 +36,3 @@ def structural_similarity(image: Tensor, other: Tensor, peak: Tensor) -> Tensor:
     return ((2 * first * second + low) * (2 * structure + high)) / (
         (first**2 + second**2 + low) * (contrast + high)
     )
-
-
-def _window(like: Tensor) -> Tensor:
-    """The weights [11] along a row or column."""
-    place = torch.arange(-RADIUS, RADIUS + 1, dtype=like.dtype, device=like.device)
-    weights = torch.exp(-0.5 * (place / DEVIATION) ** 2)
-    return weights / weights.sum()
-
-
-def _blur(values: Tensor, window: Tensor) -> Tensor:
-    """`values` [c, h, w] weighed by the `window` around each, with 0 outside."""
-    padded = pad(values[:, None], (RADIUS,) * 4)
-    rows = conv2d(padded, window.view(1, 1, -1, 1))
-    return conv2d(rows, window.view(1, 1, 1, -1))[:, 0]

@@ -11,7 +11,6 @@ from dataclasses import fields, replace
 
 from torch import Tensor
 
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.scene import Scene
@@ -22,13 +21,20 @@ def pick_color(scene: Scene, color: int) -> Scene:
 
     Views keep their cameras only.
     """
+    volume = scene.volume
     volume = replace(
-        scene.volume,
-        sigma_a=_pick(scene.volume.sigma_a, color),
-        sigma_s=_pick(scene.volume.sigma_s, color),
-        phase=_pick_phase(scene.volume.phase, color),
+        volume,
+        sigma_a=_pick(volume.sigma_a, color),
+        sigma_s=_pick(volume.sigma_s, color),
+        phase=_pick_phase(volume.phase, color),
     )
-    lights = [_pick_light(light, color) for light in scene.lights]
+    names = ("irradiance", "radiance", "intensity")
+    lights = [
+        replace(light, **{name: _pick(getattr(light, name), color)})  # type: ignore[arg-type]
+        for light in scene.lights
+        for name in names
+        if hasattr(light, name)
+    ]
     return replace(scene, volume=volume, lights=lights)
 
 
@@ -46,16 +52,6 @@ def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
 def _pick_number(number: Tensor, color: int) -> Tensor:
     """Of a `number` by color [3] or [3, z, y, x] that one's; else the number as it is."""
     return number if number.ndim in (0, 3) else _pick(number, color)
-
-
-def _pick_light(light: Light, color: int) -> Light:
-    if isinstance(light, DirectionalLight):
-        return replace(light, irradiance=_pick(light.irradiance, color))
-    if isinstance(light, AmbientLight):
-        return replace(light, radiance=_pick(light.radiance, color))
-    if isinstance(light, EnvironmentLight):
-        return replace(light, radiance=_pick(light.radiance, color))
-    return replace(light, intensity=_pick(light.intensity, color))
 
 
 def _pick(value: Tensor, color: int) -> Tensor:

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_picture, write_preview
 from ddrecon.losses import psnr
 from ddrecon.progress import Progress
@@ -44,7 +43,8 @@ def compare_to_folder(
     of these views, and each is traced with `samples` >= 2 paths a pixel; `progress` is told of the
     passes of each view.
     """
-    passes, samples_per_pass = _split(samples)
+    passes = min(PASSES, samples)
+    samples_per_pass = -(-samples // passes)
     settings = {
         "samples_per_pixel": passes * samples_per_pass,
         "passes": passes,
@@ -62,54 +62,27 @@ def compare_to_folder(
             light_field = solve_light(scene, SolveMemory())
         report["seconds"] = {"light": perf_counter() - start}
     for index, view in enumerate(views):
-        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
-        measured: dict[str, Any] = {"noise": traced.noise, "seconds": {"reference": seconds}}
+        start = perf_counter()
+        images = [
+            tracer.trace(index, (seed * passes + number) % SEEDS, samples_per_pass)
+            for number in progress(range(passes), view.name)
+        ]
+        traced = Traced.of(images)
+        seconds = {"reference": perf_counter() - start}
+        measured: dict[str, Any] = {"noise": traced.noise, "seconds": seconds}
         if scene is None:
             written = write_picture(folder / view.name, traced.image)
         else:
             start = perf_counter()
             with torch.no_grad():
                 ours = view_image(light_field, scene, view.camera).cpu()
-            measured["seconds"]["ours"] = perf_counter() - start
+            seconds["ours"] = perf_counter() - start
             theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
             measured |= _measure(traced, ours, theirs)
             written = _write(folder / view.name, ours, theirs)
         report["views"][view.name] = measured
         report["files"][view.name] = [path.name for path in written]
     return report
-
-
-def write_reference_report(
-    folder: Path, report: dict[str, Any], environment: dict[str, Any]
-) -> dict[str, Any]:
-    """Writes `report` and the `environment` it was made in to `reference.json` in `folder`.
-
-    Returns both together.
-    """
-    import mitsuba
-
-    whole = report | {"environment": environment | {"mitsuba": mitsuba.__version__}}
-    write_json(folder / "reference.json", whole)
-    return whole
-
-
-def _split(samples: int) -> tuple[int, int]:
-    """How many passes `samples` are traced in, and how many each has, rounded up."""
-    passes = min(PASSES, samples)
-    return passes, -(-samples // passes)
-
-
-def _trace(
-    tracer: Tracer, index: int, name: str, samples: int, seed: int, progress: Progress
-) -> tuple[Traced, float]:
-    """The traced image of view number `index`, and the seconds it took."""
-    start = perf_counter()
-    passes, samples_per_pass = _split(samples)
-    images = [
-        tracer.trace(index, (seed * passes + number) % SEEDS, samples_per_pass)
-        for number in progress(range(passes), name)
-    ]
-    return Traced.of(images), perf_counter() - start
 
 
 def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:

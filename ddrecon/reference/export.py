@@ -18,28 +18,21 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.scene import Scene
 
-KINDS = {
-    "volpath": "integrator",
-    "volpathmis": "integrator",
-    "perspective": "sensor",
-    "orthographic": "sensor",
-    "hdrfilm": "film",
-    "box": "rfilter",
-    "independent": "sampler",
-    "heterogeneous": "medium",
-    "gridvolume": "volume",
-    "hg": "phase",
-    "blendphase": "phase",
-    "rayleigh": "phase",
-    "tabphase": "phase",
-    "cube": "shape",
-    "null": "bsdf",
-    "directional": "emitter",
-    "point": "emitter",
-    "constant": "emitter",
-    "envmap": "emitter",
+PLUGINS = {
+    "integrator": ("volpath", "volpathmis"),
+    "sensor": ("perspective", "orthographic"),
+    "film": ("hdrfilm",),
+    "rfilter": ("box",),
+    "sampler": ("independent",),
+    "medium": ("heterogeneous",),
+    "volume": ("gridvolume",),
+    "phase": ("hg", "blendphase", "rayleigh", "tabphase"),
+    "shape": ("cube",),
+    "bsdf": ("null",),
+    "emitter": ("directional", "point", "constant", "envmap"),
 }
-"""What Mitsuba's plugins are, which XML says and a dictionary does not."""
+"""Mitsuba's plugins by what they are, which XML says and a dictionary does not."""
+KINDS = {plugin: kind for kind, plugins in PLUGINS.items() for plugin in plugins}
 VECTORS = {"position": "point", "direction": "vector"}
 NUMBERS: dict[type, str] = {bool: "boolean", int: "integer", float: "float", str: "string"}
 Arrays = dict[Path, np.ndarray]
@@ -76,29 +69,20 @@ def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> 
 
     What belongs in a file of its own is added to `arrays`.
     """
-    if isinstance(value, dict):
-        return _plugin(name, value, naming, path, arrays)
-    if isinstance(value, tuple):
-        return ElementTree.Element("rgb", name=name, value=_numbers(value))
-    if isinstance(value, list):
-        return ElementTree.Element(VECTORS[name], name=name, value=_numbers(value))
+    make = ElementTree.Element
     if isinstance(value, np.ndarray):
-        transform = ElementTree.Element("transform", name=name)
-        ElementTree.SubElement(transform, "matrix", value=_numbers(value.ravel().tolist()))
+        transform = make("transform", name=name)
+        transform.append(make("matrix", value=_numbers(value.ravel())))
         return transform
-    return ElementTree.Element(
-        NUMBERS[type(value)],
-        name=name,
-        value=str(value).lower() if isinstance(value, bool) else str(value),
-    )
-
-
-def _plugin(
-    name: str, value: dict[str, Any], naming: str, path: Path, arrays: Arrays
-) -> ElementTree.Element:
+    if isinstance(value, tuple | list):
+        kind = "rgb" if isinstance(value, tuple) else VECTORS[name]
+        return make(kind, name=name, value=_numbers(value))
+    if not isinstance(value, dict):
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return make(NUMBERS[type(value)], name=name, value=text)
     if value["type"] == "ref":
-        return ElementTree.Element("ref", name=name, id=value["id"])
-    element = ElementTree.Element(KINDS[value["type"]], {"type": value["type"], naming: name})
+        return make("ref", name=name, id=value["id"])
+    element = make(KINDS[value["type"]], {"type": value["type"], naming: name})
     for key, entry in value.items():
         if isinstance(entry, np.ndarray) and entry.ndim > 2:
             file = path.with_name(f"{path.stem}.{name}{'.vol' if entry.ndim == 4 else '.exr'}")

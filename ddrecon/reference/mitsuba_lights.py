@@ -18,48 +18,41 @@ from ddrecon.errors import SceneError
 from ddrecon.light.environment import rotate_directions
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
-Color = tuple[float, float, float]
-
 
 def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
     """`lights` as Mitsuba's emitters, by names of their own.
 
     Raises SceneError for more than one environment map.
     """
-    near = {
-        f"light_{index}": _light(light)
-        for index, light in enumerate(lights)
-        if isinstance(light, DirectionalLight | PointLight)
-    }
-    maps = [light for light in lights if isinstance(light, EnvironmentLight)]
+    emitters: dict[str, dict[str, Any]] = {}
+    ambient, maps = np.zeros(3), list[EnvironmentLight]()
+    for index, light in enumerate(lights):
+        if isinstance(light, DirectionalLight):
+            emitters[f"light_{index}"] = {
+                "type": "directional",
+                "direction": light.direction.tolist(),
+                "irradiance": _color(light.irradiance),
+            }
+        elif isinstance(light, PointLight):
+            emitters[f"light_{index}"] = {
+                "type": "point",
+                "position": light.position.tolist(),
+                "intensity": _color(light.intensity),
+            }
+        elif isinstance(light, AmbientLight):
+            ambient = ambient + _color(light.radiance)
+        else:
+            maps.append(light)
     if len(maps) > 1:
         raise SceneError(
             f"the scene has {len(maps)} environment maps, and Mitsuba takes one; "
             "give it the one they sum to"
         )
-    ambient = np.sum(
-        [_color(light.radiance) for light in lights if isinstance(light, AmbientLight)]
-        or [(0.0, 0.0, 0.0)],
-        axis=0,
-    )
-    around = (
-        _environment(maps[0], ambient)
-        if maps
-        else {"type": "constant", "radiance": tuple(ambient.tolist())}
-    )
-    return near | ({"around": around} if maps or ambient.any() else {})
-
-
-def _light(light: DirectionalLight | PointLight) -> dict[str, Any]:
-    if isinstance(light, DirectionalLight):
-        irradiance = _color(light.irradiance)
-        return {
-            "type": "directional",
-            "direction": light.direction.tolist(),
-            "irradiance": irradiance,
-        }
-    intensity = _color(light.intensity)
-    return {"type": "point", "position": light.position.tolist(), "intensity": intensity}
+    if maps:
+        emitters["around"] = _environment(maps[0], ambient)
+    elif ambient.any():
+        emitters["around"] = {"type": "constant", "radiance": tuple(ambient.tolist())}
+    return emitters
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:
@@ -72,6 +65,5 @@ def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]
     return {"type": "envmap", "bitmap": np.ascontiguousarray(pixels, np.float32), "to_world": turn}
 
 
-def _color(value: Tensor) -> Color:
-    red, green, blue = value.detach().cpu().expand(3).tolist()
-    return red, green, blue
+def _color(value: Tensor) -> tuple[float, ...]:
+    return tuple(value.detach().cpu().expand(3).tolist())

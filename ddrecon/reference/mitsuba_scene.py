@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ddrecon.cameras import Camera, cast_rays
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
@@ -56,6 +56,7 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
     by color or a g that does so by cell, pixels that are not square, and views of whose rays only
     some start inside the volume.
     """
+    grid = scene.volume.grid
     return {
         "type": "scene",
         "integrator": {
@@ -65,8 +66,14 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
             "hide_emitters": not scene.render.background,
         },
         MEDIUM: _medium(scene.volume),
-        **{sensor_id(index): _sensor(view, scene.volume.grid) for index, view in enumerate(views)},
-        "box": _box(scene.volume.grid),
+        **{sensor_id(index): _sensor(view, grid) for index, view in enumerate(views)},
+        # The box's faces do nothing but contain the medium; Mitsuba's cube runs from -1 to 1.
+        "box": {
+            "type": "cube",
+            "to_world": _place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
+            "bsdf": {"type": "null"},
+            "interior": {"type": "ref", "id": MEDIUM},
+        },
         **mitsuba_lights(scene.lights),
     }
 
@@ -83,7 +90,11 @@ def is_gray(volume: Volume) -> bool:
 
 
 def _medium(volume: Volume) -> dict[str, Any]:
-    volume = _to_double(volume)
+    # In double precision on the CPU; cross sections are [C, z, y, x] or [C, 1, 1, 1].
+    density, sigma_a, sigma_s = (
+        value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)
+    )
+    volume = Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
     sigma_t = volume.sigma_a + volume.sigma_s
     if is_gray(volume):
         sigma_t = sigma_t.mean(0, keepdim=True)
@@ -98,17 +109,6 @@ def _medium(volume: Volume) -> dict[str, Any]:
         "albedo": _albedo(volume),
         "phase": _phase(volume.phase, volume.grid),
     }
-
-
-def _to_double(volume: Volume) -> Volume:
-    """`volume` in double precision on the CPU, without derivatives.
-
-    Cross sections are [C, z, y, x] or [C, 1, 1, 1].
-    """
-    density, sigma_a, sigma_s = (
-        value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)
-    )
-    return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
 
 
 def _fields(sigma: Tensor) -> Tensor:
@@ -129,9 +129,7 @@ def _albedo(volume: Volume) -> Any:
             interpolate(field[None], scale_factor=times, mode="trilinear")[0] for field in fields
         )
     extinction = absorbing + scattering
-    albedo = torch.where(
-        extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0
-    ).clamp(max=1)
+    albedo = (scattering / torch.where(extinction > 0, extinction, 1)).clamp(max=1)
     if albedo[0].numel() > 1:
         return _grid_volume(albedo, volume.grid)
     return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
@@ -145,12 +143,12 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
     """
     if phase.colors > 1:
         raise SceneError("volume.phase: differs by color, and Mitsuba's phase functions have none")
-    if isinstance(phase, HenyeyGreenstein) and phase.cells is not None:
-        raise SceneError(
-            "volume.g: differs from cell to cell, and Mitsuba's hg has one g;"
-            " it knows two_lobe with a weight per cell"
-        )
     if isinstance(phase, HenyeyGreenstein):
+        if phase.cells is not None:
+            raise SceneError(
+                "volume.g: differs from cell to cell, and Mitsuba's hg has one g;"
+                " it knows two_lobe with a weight per cell"
+            )
         return {"type": "hg", "g": phase.g.item()}
     if isinstance(phase, Rayleigh):
         return {"type": "rayleigh"}
@@ -183,16 +181,6 @@ def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _box(grid: Grid) -> dict[str, Any]:
-    """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
-    return {
-        "type": "cube",
-        "to_world": _place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
-        "bsdf": {"type": "null"},
-        "interior": {"type": "ref", "id": MEDIUM},
-    }
-
-
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     """The camera of `view`, whose film keeps the mean of each pixel.
 
@@ -216,7 +204,15 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
         "near_clip": NEAR * diagonal,
         "far_clip": 2 * (diagonal + math.dist(origin, grid.center_xyz)),
     }
-    if _starts_inside(view.name, camera, grid):
+    start = cast_rays(camera).origin.detach()
+    lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    is_inside = ((start > lower) & (start < upper)).all(1)
+    if bool(is_inside.any()):  # Mitsuba is told so once for all rays
+        if not bool(is_inside.all()):
+            raise SceneError(
+                f"view {view.name!r}: Mitsuba cannot show rays of which only some start inside the "
+                "volume; move the camera back"
+            )
         sensor[MEDIUM] = {"type": "ref", "id": MEDIUM}
     if camera.is_perspective:
         if not math.isclose(camera.pixel_aspect, 1, rel_tol=SQUARE):
@@ -229,32 +225,16 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
                 f"view {view.name!r}: Mitsuba's cameras have no lens distortion; leave the view"
                 " out, or undistort its picture and give it a camera without"
             )
-        fov = 2 * math.degrees(math.atan(camera.half_width))
-        offsets = {
-            f"principal_point_offset_{axis}": 0.5 - float(place)
-            for axis, place in zip("xy", camera.principal_point, strict=True)
-        }
+        x, y = map(float, camera.principal_point)
         return {
             "type": "perspective",
-            "fov": fov,
+            "fov": 2 * math.degrees(math.atan(camera.half_width)),
             "fov_axis": "x",
-            **offsets,
+            "principal_point_offset_x": 0.5 - x,
+            "principal_point_offset_y": 0.5 - y,
             "to_world": matrix,
             **sensor,
         }
     half_width = float(camera.half_width)
     scale = np.diag([half_width, half_width * camera.pixel_aspect, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
-
-
-def _starts_inside(name: str, camera: Camera, grid: Grid) -> bool:
-    """Whether view rays start inside the box of `grid`; Mitsuba is told so once for all of them."""
-    start = cast_rays(camera).origin.detach()
-    lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    is_inside = ((start > lower) & (start < upper)).all(1)
-    if bool(is_inside.any()) and not bool(is_inside.all()):
-        raise SceneError(
-            f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; "
-            "move the camera back"
-        )
-    return bool(is_inside.any())

@@ -32,17 +32,13 @@ class Tracer:
 
         Each `seed` >= 0 has paths of its own.
         """
-        images = [
-            self._render(scene, view, len(self.scenes) * seed + index, samples)
-            for index, scene in enumerate(self.scenes)
-        ]
+        images = []
+        for index, scene in enumerate(self.scenes):
+            (sensor,) = (each for each in scene.sensors() if each.id() == sensor_id(view))
+            own = len(self.scenes) * seed + index
+            image = self.module.render(scene, sensor=sensor, seed=own, spp=samples)
+            images.append(np.array(image, np.float64))
         return images[0] if len(images) == 1 else np.stack([image.mean(-1) for image in images], -1)
-
-    def _render(self, scene: Any, view: int, seed: int, samples: int) -> np.ndarray:
-        (sensor,) = (sensor for sensor in scene.sensors() if sensor.id() == sensor_id(view))
-        return np.array(
-            self.module.render(scene, sensor=sensor, seed=seed, spp=samples), np.float64
-        )
 
 
 def open_tracer(
@@ -57,13 +53,8 @@ def open_tracer(
     module = load_mitsuba(threads)
     is_shared = is_gray(scene.volume) and scene.volume.phase.colors == 1
     scenes = [scene] if is_shared else [pick_color(scene, color) for color in range(3)]
-    return Tracer(
-        module,
-        tuple(
-            module.load_dict(make_mitsuba_objects(module, mitsuba_scene(one, views, depth)))
-            for one in scenes
-        ),
-    )
+    described = (make_mitsuba_objects(module, mitsuba_scene(each, views, depth)) for each in scenes)
+    return Tracer(module, tuple(map(module.load_dict, described)))
 
 
 def load_mitsuba(threads: int | None = None) -> ModuleType:

@@ -28,21 +28,21 @@ def draw_curve(
     that are not finite are left out.
     """
     # What is drawn: thinned, and by its logarithm where asked for.
-    drawn = {name: _thin(_drawable(points, is_logarithmic)) for name, points in series.items()}
+    drawn = {name: _drawable(points, is_logarithmic) for name, points in series.items()}
     drawn = {name: points for name, points in drawn.items() if points}
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
     ys = [y for points in drawn.values() for _, y in points] or [0.0]
     horizontal = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT)
     vertical = _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
-    parts = [_text(LEFT, 16, title, "start", bold=True)]
+    parts = [_text(LEFT, 16, title, "start")]
     # A line across for every round value of y, a number below for every one of x.
     for value in (logarithmic_ticks if is_logarithmic else ticks)(vertical.low, vertical.high):
         y, label = vertical.place(value), f"{10**value if is_logarithmic else value:.4g}"
-        parts.append(_line(LEFT, y, WIDTH - RIGHT, y, 0.2))
+        parts.append(_line(y, 0.2))
         parts.append(_text(LEFT - 6, y + 4, label, "end"))
     for value in ticks(horizontal.low, horizontal.high):
         parts.append(_text(horizontal.place(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
-    parts.append(_line(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, 0.7))
+    parts.append(_line(HEIGHT - BOTTOM, 0.7))
     parts.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
     # The curves, and their names in the legend.
     for index, (name, points) in enumerate(drawn.items()):
@@ -59,9 +59,8 @@ class _Axis:
 
     def __init__(self, low: float, high: float, first: float, last: float):
         # A range of one value is widened, so that it has a middle and ticks.
-        middle = (low + high) / 2
-        half = max((high - low) / 2, 1e-9 * max(abs(low), abs(high), 1e-3))
-        self.low, self.high, self.first, self.last = middle - half, middle + half, first, last
+        more = max(0.0, 1e-9 * max(abs(low), abs(high), 1e-3) - (high - low) / 2)
+        self.low, self.high, self.first, self.last = low - more, high + more, first, last
 
     def place(self, value: float) -> float:
         return self.first + (value - self.low) / (self.high - self.low) * (self.last - self.first)
@@ -91,15 +90,14 @@ def logarithmic_ticks(low: float, high: float) -> list[float]:
 
 
 def _drawable(points: Sequence[Point], is_logarithmic: bool) -> list[Point]:
-    """Those of `points` that are finite, and if `is_logarithmic` log10 of their y > 0."""
-    finite = [(x, y) for x, y in points if math.isfinite(y)]
-    return [(x, math.log10(y)) for x, y in finite if y > 0] if is_logarithmic else finite
+    """Those of `points` that are finite, and if `is_logarithmic` log10 of their y > 0.
 
-
-def _thin(points: Sequence[Point]) -> list[Point]:
-    """Every so many of `points` and the last, at most about `MOST`."""
-    every = max(1, len(points) // MOST)
-    return [*points[: len(points) - 1 : every], *points[-1:]]
+    Of more than `MOST` every so many, and the last.
+    """
+    kept = [(x, y) for x, y in points if math.isfinite(y)]
+    if is_logarithmic:
+        kept = [(x, math.log10(y)) for x, y in kept if y > 0]
+    return [*kept[: len(kept) - 1 : max(1, len(kept) // MOST)], *kept[-1:]]
 
 
 def _path(places: Sequence[Point], color: str) -> str:
@@ -110,14 +108,12 @@ def _path(places: Sequence[Point], color: str) -> str:
     return f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="1.8"/>'
 
 
-def _line(x1: float, y1: float, x2: float, y2: float, opacity: float) -> str:
-    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+def _line(y: float, opacity: float) -> str:
+    """A line across the plot."""
+    ends = f'x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"'
     return f'<line {ends} stroke="currentColor" stroke-opacity="{opacity}"/>'
 
 
-def _text(
-    x: float, y: float, text: str, anchor: str, color: str = "currentColor", bold: bool = False
-) -> str:
-    weight = ' font-weight="600"' if bold else ""
-    style = f'font-size="12.5" text-anchor="{anchor}" fill="{color}"{weight}'
+def _text(x: float, y: float, text: str, anchor: str, color: str = "currentColor") -> str:
+    style = f'font-size="12.5" text-anchor="{anchor}" fill="{color}"'
     return f'<text x="{x:.1f}" y="{y:.1f}" {style}>{escape(text)}</text>'

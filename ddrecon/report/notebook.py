@@ -20,40 +20,31 @@ FIELDS = ("density", "sigma_a", "sigma_s")
 
 
 def html_of(shown: Scene | Volume) -> str:
-    """A frame with the fields of a volume, or of a scene's, to turn and to cut."""
-    if isinstance(shown, Volume):
-        return _frame(shown, _describe(shown), 1, SIDEWAYS)
-    return _scene_html(shown)
+    """A frame with the fields of a volume, or of a scene's, to turn and to cut.
 
-
-def _scene_html(scene: Scene) -> str:
-    """A frame with the volume of `scene`, seen from its first camera, and a line about it."""
-    words = f"{_describe(scene.volume)}; {len(scene.lights)} lights, {len(scene.views)} views"
-    if not scene.views:
-        return _frame(scene.volume, words, 1, SIDEWAYS)
-    cameras = [view.camera for view in scene.views]
-    pose = cameras[0].pose.detach()
-    x, y, z = (pose[:, 3] - pose.new_tensor(scene.volume.grid.center_xyz)).tolist()
-    return _frame(scene.volume, words, upright_axis(cameras), (x, y, z))
-
-
-def _describe(volume: Volume) -> str:
+    A scene is seen from its first camera. The frame's scripts reach nothing of the notebook.
+    """
+    volume = shown.volume if isinstance(shown, Scene) else shown
+    cameras = [view.camera for view in shown.views] if isinstance(shown, Scene) else []
+    lights = ""
+    if isinstance(shown, Scene):
+        lights = f"; {len(shown.lights)} lights, {len(cameras)} views"
     cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
-    return f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}"
-
-
-def _frame(volume: Volume, words: str, up: int, towards_eye: tuple[float, float, float]) -> str:
-    """The page in a frame whose scripts reach nothing of the notebook."""
+    words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"
+    up, (x, y, z) = 1, SIDEWAYS
+    if cameras:
+        pose, up = cameras[0].pose.detach(), upright_axis(cameras)
+        x, y, z = (pose[:, 3] - pose.new_tensor(volume.grid.center_xyz)).tolist()
     fields = {name: getattr(volume, name).detach() for name in FIELDS}
     fields = {name: value for name, value in fields.items() if value.ndim >= 3}
-    z, y, x = volume.grid.extent
-    shown = [
-        Shown(name, "result", value, (x, y, z), find_white_value(value))
+    depth, height, width = volume.grid.extent
+    viewed = [
+        Shown(name, "result", value, (width, height, depth), find_white_value(value))
         for name, value in fields.items()
     ]
     still = "".join(picture(png_of(slices(value)), name) for name, value in fields.items())
-    viewer = volume_viewer(shown, still, up, towards_eye)
-    page = page_text("ddrecon", words, [viewer], is_alive=True, is_small=True)
+    viewer = volume_viewer(viewed, still, up, (x, y, z))
+    page = page_text("ddrecon", words, [viewer], is_alive=True, state='class="small"')
     return (
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '
         f'style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'

@@ -39,34 +39,25 @@ def write_page(
 
 
 def page_text(
-    title: str,
-    lead: str,
-    sections: Sequence[str],
-    *,
-    is_alive: bool = False,
-    is_live: bool = False,
-    is_small: bool = False,
+    title: str, lead: str, sections: Sequence[str], *, is_alive: bool = False, state: str = ""
 ) -> str:
     """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures.
 
-    With `is_live`, these ask for it again and again, and take up what is new. With `is_small`, it
-    is laid out for a frame within another page.
+    `state` are attributes of its body. With `data-live`, scripts ask for the page again and again,
+    and take up what is new; with `class="small"`, it is laid out for a frame within another page.
     """
-    scripts = ""
-    if is_alive:
-        scripts = "".join(f"<script>{_asset(name)}</script>\n" for name in SCRIPTS)
+    style, *scripts = (
+        (ASSETS / name).read_text(encoding="utf-8")
+        for name in ("page.css", *(SCRIPTS if is_alive else ()))
+    )
     return PAGE.format(
-        state=" data-live" * is_live + ' class="small"' * is_small,
+        state=f" {state}" if state else "",
         title=escape(title),
-        style=_asset("page.css"),
+        style=style,
         lead=escape(lead),
         sections="\n".join(sections),
-        scripts=scripts,
+        scripts="".join(f"<script>{script}</script>\n" for script in scripts),
     )
-
-
-def _asset(name: str) -> str:
-    return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def section(heading: str, *parts: str) -> str:
@@ -96,37 +87,23 @@ def side_by_side(*parts: str) -> str:
     return f'<div class="row">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
 
 
-class Drawing(str):
-    """An element that is put into a table as it is."""
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table of `rows` under `head`; it scrolls by itself where it is too wide.
-
-    Cells are text, but for a `Drawing`.
-    """
+    """A table of `rows` under `head`; it scrolls by itself where it is too wide."""
     above = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = [
-        "".join(f"<td>{c if isinstance(c, Drawing) else escape(str(c))}</td>" for c in row)
-        for row in rows
-    ]
+    lines = ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
     text = "".join(f"<tr>{line}</tr>" for line in (above, *lines))
     return f'<div class="scroll"><table>{text}</table></div>'
 
 
 def versions(environment: Mapping[str, Any]) -> str:
     """A table of what took part."""
-    told = {k: " ".join(map(str, v)) if isinstance(v, list) else v for k, v in environment.items()}
-    return table(["", ""], list(told.items()))
+    lists = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
+    return table(["", ""], [(name, " ".join(map(str, values))) for name, values in lists])
 
 
-def picture(png: bytes, caption: str, width: int = 600) -> str:
-    """The picture `png`, `width` pixels wide where there is room, above `caption`.
-
-    Its pixels are shown as squares.
-    """
-    shown = f'class="pixels" style="width: {width}px"'
-    return _captioned(embed(png, caption, shown), caption)
+def picture(png: bytes, caption: str) -> str:
+    """The picture `png`, whose pixels are shown as squares, above `caption`."""
+    return _captioned(embed(png, caption, 'class="pixels" style="width: 600px"'), caption)
 
 
 def pair(target: bytes, render: bytes, caption: str) -> str:

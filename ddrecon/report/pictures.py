@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ddrecon.io.images.srgb import decode
+from ddrecon.pictures.srgb import decode
 
 ENLARGED = 4
 """Differences are shown this many times enlarged, around mid-gray."""
@@ -25,17 +25,14 @@ def pixels(image: Tensor) -> np.ndarray:
     return array
 
 
-def find_white(image: np.ndarray) -> float:
-    """The radiance that is shown as white in `image` [h, w, 3].
-
-    It is that of the brightest pixels, but for one in a thousand.
-    """
-    return find_high(image.max(-1))
-
-
 def find_high(values: np.ndarray) -> float:
     """What all but one of a thousand `values` are below; always above 0."""
     return max(float(np.quantile(values, 0.999)), 1e-6)
+
+
+def find_white(image: np.ndarray) -> float:
+    """The radiance that is shown as white in `image` [h, w, 3]: `find_high` of its pixels."""
+    return find_high(image.max(-1))
 
 
 def comparison(target: Tensor, image: Tensor) -> np.ndarray:
@@ -82,9 +79,7 @@ def _show(values: np.ndarray, white: float) -> np.ndarray:
 def _cells_of(field: Tensor) -> np.ndarray:
     """`field` as float32 [z, y, x, 3]."""
     colors = field if field.ndim == 4 else field[None]
-    cells = colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0)
-    array: np.ndarray = cells.float().cpu().numpy()
-    return array
+    return colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0).float().cpu().numpy()
 
 
 def _three_sides(sides: list[np.ndarray]) -> np.ndarray:
@@ -124,10 +119,9 @@ def diverge(parts: np.ndarray) -> np.ndarray:
 
 def place_beside(pictures: list[np.ndarray]) -> np.ndarray:
     """`pictures` in a row, top-aligned, on gray."""
-    height = max(picture.shape[0] for picture in pictures)
-    row = []
-    for picture in pictures:
-        frame = np.full((height, picture.shape[1] + GAP, 3), 0.2, np.float32)
-        frame[: picture.shape[0], : picture.shape[1]] = picture
-        row.append(frame)
-    return np.concatenate(row, axis=1)[:, :-GAP]
+    height = max(len(picture) for picture in pictures)
+    row = [
+        np.pad(picture, ((0, height - len(picture)), (0, GAP), (0, 0)), constant_values=0.2)
+        for picture in pictures
+    ]
+    return np.concatenate(row, axis=1)[:, :-GAP].astype(np.float32)

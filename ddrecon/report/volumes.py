@@ -5,14 +5,14 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from ddrecon.io.images import srgb
+from ddrecon.pictures import srgb
 from ddrecon.report.pictures import diverge, find_high
 
 MOST_CELLS = 1_000_000
@@ -23,8 +23,11 @@ CONTROLS = (
     ("high", "to", 0.05, 1, 0.01),
 )
 """Sliders of the transfer function: names, labels, ends and steps."""
-HINT = "Drag or arrow keys turn; wheel, two fingers, + and - zoom."
-PALETTES = ("lit smoke", "values")
+CHOICES = (
+    '<label>field <select id="field"></select></label><label>shown as <select id="palette">'
+    '<option value="0">lit smoke</option><option value="1">values</option></select></label>'
+)
+HINT = "<small>Drag or arrow keys turn; wheel, two fingers, + and - zoom.</small>"
 
 
 @dataclass(frozen=True)
@@ -58,29 +61,21 @@ def volume_viewer(
     stands.
     """
     eye = " ".join(f"{part:.4g}" for part in towards_eye)
-    room = f'<div id="viewers" data-up="{up}" data-eye="{eye}"></div>'
+    sliders = "".join(
+        f'<label>{label} <input type="range" id="{name}" min="{low}" max="{high}" step="{step}">'
+        "</label>"
+        for name, label, low, high, step in CONTROLS
+    )
     slices = "".join(_slice(axis, label) for axis, label in enumerate("xyz"))
     return "\n".join(
         [
             f'<div class="still">{still}</div>',
-            f'<div class="lively">{room}<small>{HINT}</small></div>',
-            f'<div class="controls lively">{_controls()}</div>',
+            f'<div class="lively"><div id="viewers" data-up="{up}" data-eye="{eye}"></div>',
+            f"{HINT}</div>",
+            f'<div class="controls lively">{CHOICES}{sliders}</div>',
             f'<div class="slices lively">{slices}</div>',
             *map(_data, fields),
         ]
-    )
-
-
-def _controls() -> str:
-    sliders = [
-        f'<label>{label} <input type="range" id="{name}" min="{low}" max="{high}" step="{step}">'
-        "</label>"
-        for name, label, low, high, step in CONTROLS
-    ]
-    colors = "".join(f'<option value="{i}">{text}</option>' for i, text in enumerate(PALETTES))
-    return (
-        '<label>field <select id="field"></select></label>'
-        f'<label>shown as <select id="palette">{colors}</select></label>' + "".join(sliders)
     )
 
 
@@ -122,11 +117,5 @@ def _data(field: Shown) -> str:
 
 def _coarsen(values: Tensor) -> Tensor:
     """`values` [C, z, y, x] with at most about `MOST_CELLS` cells, means of blocks of them."""
-    cells = values[0].numel()
-    factor = 1
-    while cells / factor**3 > MOST_CELLS:
-        factor += 1
-    if factor == 1:
-        return values
-    with torch.no_grad():
-        return avg_pool3d(values.float(), factor, ceil_mode=True, count_include_pad=False)
+    factor = math.ceil((values[0].numel() / MOST_CELLS) ** (1 / 3))
+    return avg_pool3d(values.float(), factor, ceil_mode=True, count_include_pad=False)

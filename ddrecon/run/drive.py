@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import claim_folder
-from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction

@@ -64,7 +64,7 @@ class LiveRun:
         loss = section("Loss", side_by_side(*curves(rows))) if rows else ""
         sections = [volume, loss, views]
         title = f"ddrecon: {self.folder.absolute().name}"
-        return page_text(title, lead, sections, is_alive=True, is_live=True)
+        return page_text(title, lead, sections, is_alive=True, state="data-live")
 
     def _is_finished(self) -> bool:
         """Whether the report was written after the run last began, or saved its state."""

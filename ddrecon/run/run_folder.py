@@ -14,8 +14,7 @@ from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import refusals, remove_temporaries
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import refusals, remove_temporaries, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ddrecon.errors import FormatError, SceneError
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
-from ddrecon.io.files.json_file import write_json
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.problems import Problems

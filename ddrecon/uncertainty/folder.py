@@ -8,9 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from ddrecon.io.files.json_file import write_json
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import png_of
-from ddrecon.report.error_bar import draw_error_bar
 from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
@@ -149,20 +148,13 @@ def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]
 
 
 def _numbers(record: Mapping[str, Any]) -> list[str]:
-    """The table of numbers with their error bars, and of those that hang together."""
+    """The table of numbers with their deviations, and of those that hang together."""
     names = list(record["numbers"])
     rows = [
-        (
-            name,
-            f"{number['value']:.5g} ± {number['deviation']:.2g}",
-            draw_error_bar(name, number["value"], number["deviation"]),
-        )
+        (name, f"{number['value']:.5g} ± {number['deviation']:.2g}")
         for name, number in record["numbers"].items()
     ]
-    parts = [
-        table(["number", "value ± deviation", ""], rows),
-        paragraph("Thick: one deviation. Thin: two. The upright line is 0."),
-    ]
+    parts = [table(["number", "value ± deviation"], rows)]
     pairs = [
         (names[i], names[j], f"{row[j]:+.2f}")
         for i, row in enumerate(record["correlations"])

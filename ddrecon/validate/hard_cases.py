@@ -20,7 +20,6 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.values import cross_sections
 
 Shape = tuple[int, int, int]
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
@@ -83,16 +82,15 @@ class HardCase:
         def tensor(values: float | Triple | list[float]) -> Tensor:
             return torch.tensor(values, dtype=torch.float64).to(device, dtype)
 
-        grid = self._grid()
-        sigma = cross_sections(
-            *(
-                torch.tensor([value], dtype=torch.float64)
-                for value in (self.depth / min(grid.spacing), self.albedo)
-            )
-        )
-        sigma_a, sigma_s = (value.to(device, dtype) for value in sigma)
+        z, y, x = (side / 2 for side in self.sides)
+        grid = Grid(self.shape, (-z, -y, -x), (z, y, x))
+        sigma_t = self.depth / min(grid.spacing)
         volume = Volume(
-            grid, self.density(self.shape).to(device, dtype), sigma_a, sigma_s, tensor(self.g)
+            grid,
+            self.density(self.shape).to(device, dtype),
+            tensor([sigma_t * (1 - self.albedo)]),
+            tensor([sigma_t * self.albedo]),
+            tensor(self.g),
         )
         lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([IRRADIANCE]))]
         if self.ambient:
@@ -102,10 +100,6 @@ class HardCase:
         return Scene(
             volume, lights, views, RenderSettings(), DiffusionSettings(tolerance=TOLERANCE[dtype])
         )
-
-    def _grid(self) -> Grid:
-        z, y, x = self.sides
-        return Grid(self.shape, (-z / 2, -y / 2, -x / 2), (z / 2, y / 2, x / 2))
 
 
 SLAB = 1 / 24

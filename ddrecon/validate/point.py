@@ -87,14 +87,6 @@ def loss_at(
     return loss
 
 
-def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
-    """The steps of finite differences for the parameter `name` at `value`."""
-    largest = float(value.abs().max())
-    return tuple(
-        step * (largest if largest > 0 else 1.0) for step in kind_of(name).difference_steps
-    )
-
-
 def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
     """Flat indices of `samples` random entries, of density half of them empty where enough are."""
     order = torch.randperm(value.numel(), generator=generator)

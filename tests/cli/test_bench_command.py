@@ -61,11 +61,7 @@ def test_a_scene_is_measured_by_every_variant(run: Run, monkeypatch: pytest.Monk
     report = json.loads(Path("report.json").read_text())
     assert report == json.loads(Path("out/bench.json").read_text())
     rows = {row["name"]: row for row in report["rows"]}
-    page = Path("out/report.html").read_text()
-    assert (
-        all(f"<td>{name}</td>" in page for name in rows)
-        and page.count("<img ") == Path("out/bench.png").is_file()
-    )
+    assert Path("out/bench.png").is_file() or "without a plot" in result.stdout
     assert [
         line.split("|")[1].strip() for line in result.stdout.splitlines()[2 : 2 + len(rows)]
     ] == list(rows)

@@ -87,8 +87,8 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
     np.savez("none.npz", bounds=box)
     np.savez("two.npz", density=np.ones((2, 2, 2)), albedo=np.ones((2, 2, 2)), bounds=box)
     for command, words in {
-        "density.npz other.npz -o all.npz": "other.npz: has 7 x 5 x 4 cells (x, y, z), the first",
-        "density.npz moved.npz -o all.npz": "moved.npz: lies in the box [[-1.0",
+        "density.npz other.npz -o all.npz": "other.npz: has 7 x 5 x 4 cells (x, y, z) in the box",
+        "density.npz moved.npz -o all.npz": "cells (x, y, z) in the box [[-1.0",
         "density.npz density.npz -o all.npz": "has a field 'density', and so has a file before it",
         "nowhere.npz -o all.npz": "says no box",
         "none.npz -o all.npz": "has no fields",

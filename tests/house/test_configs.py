@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import re
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import get_args
@@ -11,9 +10,11 @@ from typing import get_args
 import pytest
 import torch
 
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.renderer import render
+from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.schema import PhaseSection
 from ddrecon.settings import DiffusionSettings
@@ -31,16 +32,12 @@ tests/validate.
 KINDS = sorted((ROOT / "configs" / "kinds").glob("*.yaml"))
 
 
-def small(config: Path) -> list[str]:
-    """Overrides that leave the config about 8 cells along its shortest side."""
-    (sizes,) = re.findall(
-        r"^  resolution: \[(\d+), (\d+), (\d+)\]", config.read_text(), re.MULTILINE
+def small(config: Path) -> Scene:
+    """The scene about 8 cells along its shortest side, and as much coarser in its pictures."""
+    scene = load_scene(config, overrides=["optimize.iterations=2", "optimize.refine_at=[]"])
+    return scene_at_level(
+        replace(scene, views=[scene.views[0], scene.views[-1]]), min(scene.volume.grid.shape) // 8
     )
-    cells = [int(size) for size in sizes]
-    return [
-        f"volume.resolution={[size * 8 // min(cells) for size in cells]}",
-        "optimize.iterations=2",
-    ]
 
 
 def test_there_are_configs() -> None:
@@ -69,8 +66,7 @@ def test_every_phase_function_and_model_has_a_config() -> None:
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:
         pytest.skip("its images need OpenImageIO")
-    scene = load_scene(config, overrides=small(config))
-    scene.views = [scene.views[0], scene.views[-1]]
+    scene = small(config)
     known = variable_names(select_views(scene, is_test=False))
     parameters = {name: given for name, given in scene.optimize.parameters.items() if name in known}
     scene.optimize = replace(scene.optimize, parameters=parameters)

@@ -14,8 +14,6 @@ PAGES = [
     for pattern in ("*.md", "docs/**/*.md", "benchmarks/**/*.md", "data/**/*.md")
     for path in sorted(ROOT.glob(pattern))
 ]
-LATER = {ROOT / "CONTRIBUTING.md"}
-"""Pages whose sentences are not held to a line each yet; their links are."""
 ABBREVIATIONS = ("e.g", "i.e", "et al", "Fig", "Figs", "Eq", "Eqs", "cf", "vs", "resp", "approx")
 """What a full stop may follow within a sentence."""
 LONGEST = 40
@@ -89,60 +87,21 @@ def named(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("One. Two.", True),
-        ("- One (of two.) Two.", True),
-        ("Is it? It is.", True),
-        ("**Label.** Then more.", False),
-        ("- **Label.** Then more. And more.", True),
-        ("It is 0.5 in `a. b` of scene.yaml, e.g. Fig. 7 of Cen et al. 2023.", False),
-        ("1. A step.", False),
-        ("And so on ... to the end.", False),
-    ],
-)
-def test_the_end_of_a_sentence_is_known(line: str, expected: bool) -> None:
-    assert ends_early(line) == expected
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
-def test_a_line_holds_one_sentence(page: Path) -> None:
-    paragraphs = list(split_into_blocks(page.read_text(encoding="utf-8")))
-    assert [line for lines in paragraphs for line in lines if ends_early(line)] == []
-    assert [line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line)] == [], (
-        "broken sentences"
-    )
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
-def test_sentences_are_not_too_long(page: Path) -> None:
-    lines = [
-        line for lines in split_into_blocks(page.read_text(encoding="utf-8")) for line in lines
-    ]
-    assert [line for line in lines if len(strip_markup(line).split()) > LONGEST] == []
-
-
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_links_lead_somewhere(page: Path) -> None:
-    text = re.sub(
-        r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
-    )
-    for target in LINK.findall(text):
-        if "://" in target or target.startswith("mailto:"):
-            continue
+def test_a_page_has_one_short_sentence_a_line_and_names_what_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    paragraphs = list(split_into_blocks(text))
+    lines = [line for paragraph in paragraphs for line in paragraph]
+    broken = (line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line))
+    assert [line for line in lines if ends_early(line)] == [] == list(broken)
+    assert [line for line in lines if len(strip_markup(line).split()) > LONGEST] == []
+    assert [file for file in FILE.findall(text) if not (ROOT / file).exists()] == []
+    for target in LINK.findall(re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)):
         path, _, anchor = target.partition("#")
-        there = (page.parent / path).resolve() if path else page
-        assert there.exists(), f"{target}: there is no {there}"
-        assert not anchor or anchor in find_anchors(there), (
-            f"{target}: no such heading; there are {sorted(find_anchors(there))}"
-        )
-
-
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
-def test_files_that_a_page_names_exist(page: Path) -> None:
-    files = FILE.findall(page.read_text(encoding="utf-8"))
-    assert [file for file in files if not (ROOT / file).exists()] == []
+        if "://" not in target and not target.startswith("mailto:"):
+            there = (page.parent / path).resolve() if path else page
+            assert there.exists(), f"{target}: there is no {there}"
+            assert not anchor or anchor in find_anchors(there), f"{target}: no such heading"
 
 
 def test_every_page_is_in_the_menu() -> None:

@@ -62,14 +62,6 @@ def test_a_command_is_understood(line: str) -> None:
     assert (ROOT / parsed(line).params["scene"]).is_file()
 
 
-@pytest.mark.parametrize(
-    "line", ["ddrecon paint a.yaml", "ddrecon check a.yaml --colour", "ddrecon render a.yaml"]
-)
-def test_a_wrong_command_is_not(line: str) -> None:
-    with pytest.raises(click.UsageError):
-        parsed(line)
-
-
 @pytest.mark.parametrize("text", scenes())
 def test_a_scene_on_a_page_is_legal(tmp_path: Path, text: str) -> None:
     path = tmp_path / "scene.yaml"

@@ -39,7 +39,7 @@ from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_fie
 BOUNDS = np.array([[-1.0, -2.0, 8.0], [1.5, 2.5, 11.0]])
 VALUES = np.random.default_rng(0).random((4, 5, 6), np.float32)
 PICTURE = np.random.default_rng(1).random((6, 8, 3), np.float32)
-PACKAGES = {".tif": "tifffile", ".tiff": "tifffile", ".nc": "netCDF4"}
+PACKAGES = {".tif": "OpenImageIO", ".tiff": "OpenImageIO", ".nc": "netCDF4"}
 FORMS = [
     *((suffix, True) for suffix in FORMATS if suffix != ".vti"),
     *((suffix, False) for suffix in READERS),
@@ -53,7 +53,7 @@ EVERY = pytest.mark.parametrize(
 FEW = settings(
     derandomize=True,
     database=None,
-    max_examples=70,
+    max_examples=50,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
@@ -141,19 +141,15 @@ def test_fields_come_back_in_their_place(
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-@FEW
-@given(size=st.tuples(st.integers(1, 7), st.integers(1, 9)), seed=st.integers(0))
-def test_float_images_come_back(
-    tmp_path: Path, suffix: str, size: tuple[int, int], seed: int
-) -> None:
+def test_float_images_come_back(tmp_path: Path, suffix: str) -> None:
     """Whatever the case of the suffix; bit for bit but for .hdr."""
     if suffix in (".exr", ".hdr"):
         pytest.importorskip("OpenImageIO")
-    path, pixels = tmp_path / f"a{suffix}", np.random.default_rng(seed).random((*size, 3), "f4")
-    WRITERS[suffix](path, pixels)
-    image = read_image(path.rename(tmp_path / f"a{suffix.upper()}"))
-    assert image.pixels.dtype == np.float32 and image.size == size and image.coverage is None
-    expected = np.floor(128 + 127 * pixels) / 64 if suffix == ".hdr" else pixels
+    path = tmp_path / f"a{suffix.upper()}"
+    WRITERS[suffix](tmp_path / f"a{suffix}", PICTURE)
+    image = read_image((tmp_path / f"a{suffix}").rename(path))
+    assert image.pixels.dtype == np.float32 and image.size == (6, 8) and image.coverage is None
+    expected = np.floor(128 + 127 * PICTURE) / 64 if suffix == ".hdr" else PICTURE
     assert np.array_equal(image.pixels, expected)
 
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ddrecon.pictures.display import display, display_slope
 from ddrecon.pictures.noise import LEAST, Noise, estimate_noise
+from ddrecon.pictures.srgb import display, display_slope
 
 
 def smooth_picture(size: int = 160) -> torch.Tensor:

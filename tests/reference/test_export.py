@@ -19,8 +19,8 @@ from ddrecon.errors import UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
-from ddrecon.reference.trace import Traced, Tracer, open_tracer
-from ddrecon.scene import Scene, View
+from ddrecon.reference.trace import Traced, open_tracer
+from ddrecon.scene import View
 
 pytestmark = pytest.mark.slow
 
@@ -48,7 +48,7 @@ def opened(path: Path, **options: Any) -> np.ndarray:
     """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes
     its EXR reader has hung.
 
-    On two threads, as `tracer_of` traces: the random numbers of the variant `scalar_rgb` depend on
+    On two threads, as the tracer: the random numbers of the variant `scalar_rgb` depend on
     how many there are.
     """
     subprocess.run(
@@ -57,23 +57,9 @@ def opened(path: Path, **options: Any) -> np.ndarray:
     return np.load(f"{path}.npy")
 
 
-def tracer_of(scene: Scene) -> Tracer:
-    return open_tracer(scene, scene.views, threads=2)
-
-
 def sky() -> EnvironmentLight:
     radiance = COLOR.view(3, 1, 1) * torch.arange(18, dtype=torch.float64).view(1, 3, 6)
     return EnvironmentLight(radiance, COLOR[2], 25 * COLOR[2])
-
-
-def with_an_orthographic_view(scene: Scene) -> Scene:
-    return replace(
-        scene,
-        views=[
-            *scene.views,
-            View("other", make_camera(eye=(2.0, 0.5, 0.1), is_perspective=False, half_width=0.6)),
-        ],
-    )
 
 
 def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
@@ -93,35 +79,33 @@ def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("with_sky", [False, True])
 def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
+    """Through a camera of either kind, by lights of every kind."""
     pytest.importorskip("mitsuba", reason=NEEDED)
     lights = NEAR
     if with_sky:
         pytest.importorskip("OpenImageIO")
         lights = [*NEAR, sky()]
-    scene = with_an_orthographic_view(
-        make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
-    )
-    scene = replace(scene, lights=lights)
+    camera = make_camera(eye=(2.0, 0.5, 0.1), is_perspective=with_sky, half_width=0.6)
+    scene = make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
+    scene = replace(scene, lights=lights, views=[View("other", camera)])
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
-    tracer = tracer_of(scene)
-    for index in range(2):
-        np.testing.assert_allclose(
-            opened(tmp_path / "scene.xml", sensor=index, seed=5, spp=16),
-            tracer.trace(index, 5, 16),
-            rtol=1e-4,
-        )
+    np.testing.assert_allclose(
+        opened(tmp_path / "scene.xml", seed=5, spp=16),
+        open_tracer(scene, scene.views, threads=2).trace(0, 5, 16),
+        rtol=1e-4,
+    )
 
 
 def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
-    tracer = tracer_of(scene)
+    tracer = open_tracer(scene, scene.views, threads=2)
     theirs, ours = (
-        Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=128) for seed in range(8)]),
-        Traced.of([tracer.trace(0, seed, 128) for seed in range(8)]),
+        Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)]),
+        Traced.of([tracer.trace(0, seed, 256) for seed in range(3)]),
     )
-    assert max(theirs.noise, ours.noise) < 0.1
+    assert max(theirs.noise, ours.noise) < 0.15
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
 
 
@@ -133,10 +117,3 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
     assert (tmp_path / "scene.sigma_t.vol").read_text() == "mine" and not path.exists()
     export_scene(scene, path, may_exist=True)
     assert read_field(tmp_path / "scene.sigma_t.vol", "sigma_t").resolution == (5, 4, 3)
-
-
-def test_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="there is no folder"):
-        export_scene(
-            make_scene(random_values(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False
-        )

@@ -77,8 +77,9 @@ def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str
     assert not passes(replace(scene, render=RenderSettings(background=False)), 1, 16)[0].any()
 
 
-@pytest.mark.parametrize("corner", [(0, 0, 0), (2, 0, 4), (2, 3, 0)])
-@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(
+    ("side", "corner"), [("x", (0, 0, 0)), ("y", (2, 0, 4)), ("z", (2, 3, 0)), ("x", (2, 3, 0))]
+)
 def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int]) -> None:
     density = torch.zeros(3, 4, 5, dtype=torch.float64)
     density[corner] = 8.0
@@ -132,10 +133,10 @@ LIGHTS: dict[str, Callable[[], list[Light]]] = {
 }
 
 
-@pytest.mark.parametrize("is_perspective", [True, False])
 @pytest.mark.parametrize("light", LIGHTS)
-def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: bool) -> None:
+def test_light_scattered_once_is_ours_to_4_percent(light: str) -> None:
     grid, density = soft_ball(12)
+    is_perspective = light not in ("directional", "environment")
     half_width = 0.25 if is_perspective else 0.5
     camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
     camera = replace(camera, pixel_aspect=1.0 if is_perspective else 1.3)

@@ -75,7 +75,3 @@ def test_a_long_log_is_thinned_and_keeps_its_ends() -> None:
     )
     assert len(line) <= MOST + 20
     assert (line[0][0], line[-1][0]) == (ends[0][0], ends[-1][0])
-
-
-def test_names_are_text_not_markup() -> None:
-    assert "<script>" not in draw_curve("<script>", {"<script>": [(0.0, 1.0)]}, "<script>")

@@ -7,6 +7,7 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
+from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
     items,
@@ -19,7 +20,7 @@ from ddrecon.report.page import (
 )
 
 NASTY = '<script>alert("&")</script>'
-VOID = {"meta", "img", "line", "circle", "polyline"}
+VOID = {"meta", "img"}
 
 
 class Balance(HTMLParser):
@@ -33,6 +34,9 @@ class Balance(HTMLParser):
     def handle_starttag(self, tag: str, attrs: object) -> None:
         if tag not in VOID:
             self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: object) -> None:
+        """Those are closed."""
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
@@ -48,13 +52,14 @@ def test_a_page_is_whole_and_escapes_what_it_is_told(tmp_path: Path) -> None:
         table([NASTY], [[NASTY]]),
         fold(NASTY, NASTY),
         picture(b"PNG", NASTY),
+        draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY),
     ]
     write_page(tmp_path / "report.html", NASTY, NASTY, [section(NASTY, side_by_side(*parts))])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     reader = Balance()
     reader.feed(text)
     assert reader.open == [] and "<script>" not in text
-    assert sum(NASTY in piece for piece in reader.text) == 11
+    assert sum(NASTY in piece for piece in reader.text) == 14
 
 
 def test_a_page_names_no_other_file(tmp_path: Path) -> None:

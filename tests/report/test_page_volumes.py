@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ddrecon.io.images import srgb
+from ddrecon.pictures import srgb
 from ddrecon.report import volumes
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer

@@ -14,16 +14,14 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light.moments import Moments
 from ddrecon.renderer import render, solve_light
-from ddrecon.validate import hard
 from ddrecon.validate.balance import Balance, balance_of
 from ddrecon.validate.hard import HardResult, describe, run_case, table
 from ddrecon.validate.hard_cases import CASES, TOLERANCE, HardCase, full
 
 CPU = torch.device("cpu")
 SMALL = HardCase(full, shape=(4, 5, 6), g=0.4)
-KEPT = HardResult("kept", "", True, 3, 1e-6, 0.0, 1e-5, 1e-5, 0.0, 1e-7, 1e-15)
+KEPT = HardResult("kept", "", 3, 1e-6, 0.0, 1e-5, 1e-5, 0.0, 1e-7, 1e-15)
 BROKEN = {
-    "finite": {"is_finite": False},
     "residual": {"residual": 2e-6},
     "image": {"image_error": 2e-4},
     "gradient": {"gradient_error": float("nan")},
@@ -38,22 +36,17 @@ def test_a_hard_case_keeps_its_bounds(name: str):
     assert result.failures() == [], result
 
 
-def test_a_result_within_its_bounds_passes():
-    assert KEPT.failures() == [] and KEPT.row().endswith("pass |")
-
-
 @pytest.mark.parametrize(("bound", "change"), BROKEN.items(), ids=BROKEN.keys())
 def test_each_broken_bound_is_told(bound: str, change: dict):
+    """And no bound that is kept: residuals may be what rounding makes of them."""
+    for kept in (KEPT, replace(KEPT, residual=7e-5, attainable=1e-5)):
+        assert kept.failures() == [] and kept.row().endswith("pass |")
     result = replace(KEPT, **change)
     assert result.failures() == [bound] and result.row().endswith(f"FAIL: {bound} |")
     assert (
         table([KEPT, result])[-1] == "2 cases, 1 failed"
         and describe([KEPT, result])["passed"] is False
     )
-
-
-def test_a_residual_may_be_what_rounding_makes_of_it():
-    assert replace(KEPT, residual=7e-5, attainable=1e-5).failures() == []
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
@@ -94,17 +87,6 @@ def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
     assert balance(1.001).energy == pytest.approx(1e-3, rel=0.2)
 
 
-def test_what_rounding_makes_of_a_residual_is_attained():
-    """The solution in double precision, rounded to single, has a residual of that size and no more
-    than the tests allow.
-    """
-    case = CASES["optical depth 1e-4 a cell"]
-    memory = SolveMemory()
-    render(case.scene(torch.float64, CPU), memory=memory)
-    balance = balance_of(case.scene(torch.float32, CPU), memory.last["forward", 0].float())
-    assert balance.attainable / 8 < balance.residual < hard.ROUNDINGS * balance.attainable
-
-
 SHAPE = (6, 5, 7)
 
 
@@ -123,8 +105,10 @@ def checkerboard(shape: tuple[int, int, int]) -> Tensor:
     return 1e3 * (sum(torch.meshgrid(*map(torch.arange, shape), indexing="ij")) % 2).double()
 
 
-@pytest.mark.parametrize("density", [half_full, hot_voxel, checkerboard])
-@pytest.mark.parametrize(("sigma_a", "sigma_s"), [(10.0, 2.0), (0.5, 8.0), (0.0, 8.0)])
+@pytest.mark.parametrize(
+    ("density", "sigma_a", "sigma_s"),
+    [(half_full, 10.0, 2.0), (hot_voxel, 0.5, 8.0), (checkerboard, 0.0, 8.0)],
+)
 def test_isotropic_light_is_never_negative_in_the_dark(
     density: Callable[..., Tensor], sigma_a: float, sigma_s: float
 ):

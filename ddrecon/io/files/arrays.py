@@ -25,16 +25,18 @@ def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
     text, over 4 GiB, or shorter or longer than their header says.
     """
     check_size(size, path, name)
-    shape, dtype = _read_header(stream, path, name)
+    try:
+        version = npy.read_magic(stream)
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    except (ValueError, SyntaxError, TypeError, EOFError) as error:
+        raise FormatError(path, f"{name} is not NumPy data: {error}") from error
     if dtype.kind not in "fiub":
         kind = "Python objects" if dtype.hasobject else f"values of type {dtype}"
         raise FormatError(path, f"{name} holds {kind}; save it as float32")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
-        raise FormatError(
-            path,
-            f"{name} is damaged: its header says {list(shape)} of {dtype}, "
-            "which is not the size of its data",
-        )
+        told = f"its header says {list(shape)} of {dtype}, which is not the size of its data"
+        raise FormatError(path, f"{name} is damaged: {told}")
     stream.seek(0)
     return npy.read_array(stream, allow_pickle=False)
 
@@ -42,11 +44,8 @@ def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
 def check_size(size: int, path: Path, name: str) -> None:
     """Raises FormatError when `size` [bytes] is more than `MAX_BYTES`."""
     if size > MAX_BYTES:
-        raise FormatError(
-            path,
-            f"{name} takes {size / 2**30:.1f} GiB uncompressed; "
-            f"at most {MAX_BYTES // 2**30} GiB are read",
-        )
+        most = f"at most {MAX_BYTES // 2**30} GiB are read"
+        raise FormatError(path, f"{name} takes {size / 2**30:.1f} GiB uncompressed; {most}")
 
 
 def as_float32(values: np.ndarray) -> np.ndarray:
@@ -56,13 +55,3 @@ def as_float32(values: np.ndarray) -> np.ndarray:
     """
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(values, dtype=np.float32)
-
-
-def _read_header(stream: IO[bytes], path: Path, name: str) -> tuple[tuple[int, ...], np.dtype]:
-    try:
-        version = npy.read_magic(stream)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    except (ValueError, SyntaxError, TypeError, EOFError) as error:
-        raise FormatError(path, f"{name} is not NumPy data: {error}") from error
-    return shape, dtype

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from ddrecon.errors import FormatError
 
@@ -42,16 +44,17 @@ def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
         flush(temporary)
         if path.exists():
             with replace_file(kept_as) as kept:
-                _link_or_copy(path, kept)
+                try:
+                    os.link(path, kept)
+                except OSError:  # of a system without links
+                    shutil.copyfile(path, kept)
     flush(path.parent)
 
 
-def _link_or_copy(path: Path, other: Path) -> None:
-    """Makes `other` the same file as `path`, or one like it where the system has no links."""
-    try:
-        os.link(path, other)
-    except OSError:
-        shutil.copyfile(path, other)
+def write_json(path: Path, content: Any) -> None:
+    """Writes `content` to `path` as JSON, indented."""
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def remove_temporaries(folder: Path) -> None:

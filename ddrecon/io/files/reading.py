@@ -13,14 +13,6 @@ from pathlib import Path
 
 from ddrecon.errors import DdreconError, FormatError
 
-KINDS = {
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFSOCK: "a socket",
-}
-"""What might never end or never answer, by the kind that the system tells."""
-
 
 @contextmanager
 def guard_reading(path: Path) -> Iterator[None]:
@@ -42,7 +34,10 @@ def guard_reading(path: Path) -> Iterator[None]:
 
 
 def require_stored(path: Path) -> None:
-    """Raises FormatError where `path` is a pipe, a device or a socket; OSError where it is not."""
+    """Raises FormatError where `path` is a pipe, a device or a socket; OSError where it is not.
+
+    These might never end or never answer.
+    """
     kind = stat.S_IFMT(os.stat(path).st_mode)
-    if kind in KINDS:
-        raise FormatError(path, f"is {KINDS[kind]}; only regular files are read")
+    if kind not in (stat.S_IFREG, stat.S_IFDIR):
+        raise FormatError(path, "is a pipe, a device or a socket; only regular files are read")

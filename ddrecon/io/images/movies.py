@@ -13,7 +13,7 @@ import numpy as np
 
 from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.images import srgb
+from ddrecon.pictures import srgb
 
 SECONDS = 4.0
 """How long a movie takes from its first frame back to it."""
@@ -28,10 +28,7 @@ def encode(pixels: np.ndarray, extension: str, **settings: Any) -> bytes:
     """An image or frames as a file of this kind, by Pillow."""
     import imageio.v3 as iio
 
-    content: bytes = iio.imwrite(
-        "<bytes>", pixels, plugin="pillow", extension=extension, **settings
-    )
-    return content
+    return iio.imwrite("<bytes>", pixels, plugin="pillow", extension=extension, **settings)
 
 
 def webp_of(image: np.ndarray) -> bytes:
@@ -62,11 +59,7 @@ def write_mp4(path: Path, frames: np.ndarray) -> None:
     height, width = frames.shape[1:3]
     even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     with replace_file(path) as temporary:
+        rate = len(frames) / SECONDS
         iio.imwrite(
-            temporary,
-            even,
-            plugin="FFMPEG",
-            extension=".mp4",
-            fps=len(frames) / SECONDS,
-            macro_block_size=2,
+            temporary, even, plugin="FFMPEG", extension=".mp4", fps=rate, macro_block_size=2
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.extras import is_there, load_for_file
+from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
 
@@ -29,15 +29,10 @@ BEGINNINGS = {
 FLOATS = ("half", "float", "double")
 BLACK_IS_ZERO, RGB = 1, 2
 TOP_LEFT = 1
-DEEP_COLORS = (2, 4, 6)
-"""PNG's types of color but gray alone, which Pillow reads in full, and palettes."""
 HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
 """Its lines, then the size, then how the first row of pixels begins."""
-
-
-def has_exr() -> bool:
-    """Whether OpenImageIO is installed."""
-    return is_there(PACKAGE)
+STACK_MARK = "bounds="
+"""What the description of a volume says that we wrote as TIFF, if it has but one page."""
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -45,16 +40,21 @@ def read_exr(path: Path) -> np.ndarray:
 
     Raises FormatError where it is cropped, or has other channels.
     """
-    with _opened(path, "EXR") as (file, spec):
+    with opened(path, "EXR") as (file, spec):
         window = spec.x, spec.y, spec.width, spec.height
         if window != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
             raise FormatError(path, "its data window is not its display window; save it uncropped")
         if str(spec.format) not in FLOATS:
-            raise FormatError(
-                path, f"holds samples of type {spec.format}; save it as half or float"
-            )
-        kept = [spec.channelindex(name) for name in _color_names(spec.channelnames, path)]
-        pixels = _pixels(path, file, "float")[..., kept]
+            raise FormatError(path, f"holds samples of type {spec.format}; save it as half floats")
+        names = spec.channelnames
+        if {"R", "G", "B"} <= set(names):
+            kept = ["R", "G", "B", "A"] if "A" in names else ["R", "G", "B"]
+        elif len(names) == 1 or set(names) == {"Y", "A"}:
+            kept = [*names] if len(names) == 1 else ["Y", "Y", "Y", "A"]
+        else:
+            known = "expected R, G, B, optionally A, or a single one"
+            raise FormatError(path, f"has the channels {', '.join(names)}; {known}")
+        pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, kept)]]
     return pixels[..., 0] if len(kept) == 1 else pixels
 
 
@@ -65,33 +65,34 @@ def read_hdr(path: Path) -> np.ndarray:
     """
     with path.open("rb") as stream:
         head = HDR_HEADER.match(stream.read(65536))
-    with _opened(path, "HDR") as (file, spec):
+    with opened(path, "HDR") as (file, spec):
         if spec.get_int_attribute("Orientation", TOP_LEFT) != TOP_LEFT:
             raise FormatError(path, "has turned rows; save it with rows from the top, or as .exr")
         flat = 4 * spec.width * spec.height
         if head is None or (head[2] != b"\2\2" and path.stat().st_size - head.start(2) < flat):
             raise FormatError(path, "is cut short or encoded in an old way; save it as .exr")
-        pixels = _pixels(path, file, "float")
-    with np.errstate(over="ignore"):
-        return (pixels / _hdr_exposure(path, head[1])).astype(np.float32)
-
-
-def _hdr_exposure(path: Path, header: bytes) -> np.ndarray:
-    """What the values of a Radiance picture were multiplied by, [1] or [3]."""
+        pixels = read_pixels(path, file, "float")
     factor = np.ones(1)
-    for name, text in re.findall(rb"^(EXPOSURE|COLORCORR) *=(.*)$", header, re.MULTILINE):
+    for name, text in re.findall(rb"^(EXPOSURE|COLORCORR) *=(.*)$", head[1], re.MULTILINE):
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
             values = np.zeros(0)
-        if (
-            len(values) != (1 if name == b"EXPOSURE" else 3)
-            or not (np.isfinite(values) & (values > 0)).all()
-        ):
+        is_legal = np.isfinite(values).all() and (values > 0).all()
+        if len(values) != (1 if name == b"EXPOSURE" else 3) or not is_legal:
             shown = text.strip().decode(errors="replace")
             raise FormatError(path, f"is damaged: {shown!r} is no exposure or color correction")
         factor = factor * values
-    return factor
+    return as_float32(pixels / factor)
+
+
+def is_stack(path: Path) -> bool:
+    """Whether the TIFF file at `path` is a volume: of several pages, or written as one by us."""
+    with opened(path, "TIFF") as (file, spec):
+        marked = STACK_MARK in spec.get_string_attribute("ImageDescription")
+        is_paged = file.seek_subimage(1, 0)
+        file.geterror()  # that there is no other page is none
+        return marked or is_paged
 
 
 def read_tiff(path: Path) -> np.ndarray:
@@ -100,48 +101,29 @@ def read_tiff(path: Path) -> np.ndarray:
     Raises FormatError for a volume (several pages), and where pixels are not floats, or are laid
     out otherwise than from the top left.
     """
-    with _opened(path, "TIFF") as (file, spec):
-        # Ours say a box, if they have but one page.
-        is_stack = "bounds=" in spec.get_string_attribute("ImageDescription")
-        if is_stack or file.seek_subimage(1, 0):
-            raise FormatError(path, "is a volume (several pages); an image is a single page")
-        file.geterror()  # that there is no other page is none
-        file.seek_subimage(0, 0)
-        spec = file.spec()
+    if is_stack(path):
+        raise FormatError(path, "is a volume (several pages); an image is a single page")
+    with opened(path, "TIFF") as (file, spec):
         kind = spec.getattribute("tiff:PhotometricInterpretation")
         reason = None
         if spec.get_int_attribute("Orientation", TOP_LEFT) != TOP_LEFT:
             reason = "has turned rows"
         elif str(spec.format) not in FLOATS:
             reason = f"holds samples of type {spec.format}"
-        elif str(spec.format) == "double" and spec.tile_width:
-            reason = "holds samples of 64 bits in tiles"  # read as other numbers by OpenImageIO 3.2
         elif kind not in (BLACK_IS_ZERO, RGB):
             reason = f"has photometric interpretation {kind}"
         if reason:
             raise FormatError(
                 path, f"{reason}; only float TIFF, gray or RGB, is read: save it so, or as .exr"
             )
-        pixels = _pixels(path, file, "float")
+        pixels = read_pixels(path, file, "float")
     return pixels[..., 0] if pixels.shape[2] == 1 else pixels
 
 
-def has_deep_colors(path: Path) -> bool:
-    """Whether the file at `path` is a PNG of several channels of 16 bits."""
-    with path.open("rb") as stream:
-        head = stream.read(26)
-    is_png = head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 26
-    return is_png and head[24] == 16 and head[25] in DEEP_COLORS
-
-
 def read_deep_png(path: Path) -> np.ndarray:
-    """The stored values of such a file, uint16 [h, w, channels]; alpha has not been multiplied."""
-    from PIL import Image
-
-    with Image.open(path) as picture:
-        picture.verify()  # of its checksums libpng would tell stderr as well
-    with _opened(path, "PNG") as (file, _):
-        return _pixels(path, file, "uint16")
+    """The stored values of a PNG of 16 bits, uint16 [h, w, channels]; not multiplied by alpha."""
+    with opened(path, "PNG") as (file, _):
+        return read_pixels(path, file, "uint16")
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
@@ -154,16 +136,13 @@ def write_exr(path: Path, pixels: np.ndarray) -> None:
     spec.attribute("compression", "zip")
     with replace_file(path) as temporary:
         file = module.ImageOutput.create(str(temporary))
-        if not (
-            file.open(str(temporary), spec)
-            and file.write_image(as_float32(pixels))
-            and file.close()
-        ):
+        is_open = file.open(str(temporary), spec)
+        if not (is_open and file.write_image(as_float32(pixels)) and file.close()):
             raise OSError(_line(file.geterror()))
 
 
 @contextmanager
-def _opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
+def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     """The file at `path` and what its header says, for a block that reads it.
 
     Raises FormatError unless it is of this `kind`, and small enough.
@@ -183,12 +162,14 @@ def _opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
         check_size(size * width * height, path, f"an image of {width} x {height} pixels")
         if spec.deep or spec.depth > 1:
             raise FormatError(path, "has several values a pixel; flatten it first")
+        if str(spec.format) == "double" and spec.tile_width:  # misread by OpenImageIO 3.2
+            raise FormatError(path, "holds samples of 64 bits in tiles; save it as 32-bit float")
         yield file, spec
     finally:
         file.close()
 
 
-def _pixels(path: Path, file: Any, dtype: str) -> np.ndarray:
+def read_pixels(path: Path, file: Any, dtype: str) -> np.ndarray:
     """All pixels [h, w, channels]; raises FormatError where some are damaged or lacking."""
     pixels = file.read_image(dtype)
     if file.has_error or pixels is None:
@@ -198,17 +179,3 @@ def _pixels(path: Path, file: Any, dtype: str) -> np.ndarray:
 
 def _line(text: str) -> str:
     return " ".join(text.split())
-
-
-def _color_names(names: list[str], path: Path) -> list[str]:
-    """Which of the channels `names` are red, green and blue, and alpha, or the only one."""
-    if {"R", "G", "B"} <= set(names):
-        return ["R", "G", "B", "A"] if "A" in names else ["R", "G", "B"]
-    if len(names) == 1:
-        return [*names]
-    if set(names) == {"Y", "A"}:
-        return ["Y", "Y", "Y", "A"]
-    raise FormatError(
-        path,
-        f"has the channels {', '.join(names)}; expected R, G, B, optionally A, or a single one",
-    )

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
+from ddrecon.extras import is_there
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.images import srgb
 from ddrecon.io.images.movies import encode
 from ddrecon.io.images.oiio import (
-    has_deep_colors,
-    has_exr,
+    PACKAGE,
     read_deep_png,
     read_exr,
     read_hdr,
     read_tiff,
     write_exr,
 )
+from ddrecon.pictures import srgb
 
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
 """How the .png of an image is to be read."""
@@ -36,6 +36,8 @@ BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"W
 
 Pillow alone would go by content whatever the suffix, and run Ghostscript on PostScript.
 """
+COLORS = ("LA", "RGB", "RGBA")
+"""Pillow's modes of several channels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +88,12 @@ def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
     Where OpenImageIO is not installed, there is no .exr.
     """
     picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
-    if has_exr():
-        write_exr(picture, pixels)
     with replace_file(array) as temporary:
         np.save(temporary, as_float32(pixels), allow_pickle=False)
-    return [picture, array] if has_exr() else [array]
-
-
-def write_preview(path: Path, pixels: np.ndarray) -> None:
-    """Writes `pixels` [h, w, 3], linear, as an 8-bit sRGB .png at `path`, clipped to [0, 1]."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(png_of(pixels))
+    if not is_there(PACKAGE):
+        return [array]
+    write_exr(picture, pixels)
+    return [picture, array]
 
 
 def png_of(pixels: np.ndarray) -> bytes:
@@ -104,11 +101,14 @@ def png_of(pixels: np.ndarray) -> bytes:
     return encode(srgb.encode_bytes(pixels), ".png")
 
 
-def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
-    """Writes `pixels` [h, w, 3] as `write_linear` does, and a preview to `stem`.png.
+def write_preview(path: Path, pixels: np.ndarray) -> None:
+    """Writes `png_of` these `pixels` to `path`."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(png_of(pixels))
 
-    `preview` [h, w, 3] is what it shows (None: `pixels`). Returns all paths.
-    """
+
+def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
+    """`write_linear` of `pixels` [h, w, 3], and a preview of them, or of `preview`; all paths."""
     path = stem.with_name(stem.name + ".png")
     write_preview(path, pixels if preview is None else preview)
     return [*write_linear(stem, pixels), path]
@@ -118,36 +118,25 @@ def _read_values(path: Path) -> tuple[np.ndarray, float]:
     """Linear values [h, w], or [h, w, c] with c of 3 or 4, and the `step` of an image."""
     reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
-        raise FormatError(
-            path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}"
-        )
+        known = ", ".join(READERS)
+        raise FormatError(path, f"unknown image format {path.suffix!r}; known: {known}")
     with guard_reading(path):
         values = reader(path)
         if reader is _read_encoded:
             step = 1 / 65535 if values.dtype == np.uint16 else 1 / 255
             values = _decode(values)
-    if (
-        values.ndim not in (2, 3)
-        or (values.ndim == 3 and values.shape[2] not in (3, 4))
-        or values.size == 0
-    ):
-        raise FormatError(
-            path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]"
-        )
+    if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,), (4,)) or not values.size:
+        legal = "expected [h, w], [h, w, 3] or [h, w, 4]"
+        raise FormatError(path, f"has shape {list(values.shape)}; {legal}")
     values = as_float32(values)
-    _require_finite(values, path)
-    return values, step
-
-
-def _require_finite(values: np.ndarray, path: Path) -> None:
     flawed = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(axis=2)
     if flawed.any():
         row, column = np.argwhere(flawed)[0]
         what = "NaN" if np.isnan(values[row, column]).any() else "an infinite value"
         where = f"row {row}, column {column} ({np.count_nonzero(flawed)} such pixels)"
-        raise FormatError(
-            path, f"{what} at {where}; repair it: a pixel to ignore may hold any finite number"
-        )
+        advice = "repair it: a pixel to ignore may hold any finite number"
+        raise FormatError(path, f"{what} at {where}; {advice}")
+    return values, step
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -164,30 +153,27 @@ def _read_encoded(path: Path) -> np.ndarray:
         start = stream.read(12)
     if not any(start.startswith(head) and start.endswith(tail) for head, tail in BEGINNINGS):
         raise FormatError(path, "is no PNG, JPEG or WebP image")
-    if has_deep_colors(path):
-        return read_deep_png(path)
     with Pillow.open(path) as picture:
-        width, height = picture.size
-    check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
-    mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
+        (width, height), mode = picture.size, picture.mode
+        is_deep = any("16B" in str(tile[3]) for tile in picture.tile)
+        check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
+        if is_deep and mode in COLORS:  # which Pillow reads as 8 bits
+            picture.verify()  # of its checksums libpng would tell stderr as well
+            return read_deep_png(path)
     stored = iio.imread(path, plugin="pillow", index=0)
-    if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
+    if mode not in {"1", "L", "P", *COLORS} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
     return stored
 
 
 def _decode(stored: np.ndarray) -> np.ndarray:
-    """Linear values of `stored` [h, w] or [h, w, c]; the last of 2 or 4 channels is alpha.
-
-    Colors are multiplied by it.
-    """
+    """Linear values of `stored` [h, w] or [h, w, c], multiplied by alpha: the last of 2 or 4 c."""
     values = stored / (1 if stored.dtype == bool else np.iinfo(stored.dtype).max)
     if values.ndim == 2 or values.shape[2] == 3:
         return srgb.decode(values)
-    colors, alpha = values[..., :-1], values[..., -1:]
-    return np.concatenate(
-        [np.broadcast_to(srgb.decode(colors) * alpha, (*alpha.shape[:2], 3)), alpha], axis=2
-    )
+    alpha = values[..., -1:]
+    colors = srgb.decode(values[..., :-1]) * alpha
+    return np.concatenate([np.broadcast_to(colors, (*alpha.shape[:2], 3)), alpha], axis=2)
 
 
 READERS: dict[str, Callable[[Path], np.ndarray]] = {

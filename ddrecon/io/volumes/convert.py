@@ -22,12 +22,22 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
         for name in field_names(path):
             if name in fields:
                 raise FormatError(path, f"has a field {name!r}, and so has a file before it")
-            fields[name] = read_field(path, name)
-            _require_same_cells(path, fields[name], next(iter(fields.values())))
+            field = fields[name] = read_field(path, name)
+            if field.bounds is None:
+                raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
+            places = {_place(each) for each in fields.values()}
+            if len(places) > 1:
+                ours, theirs = _place(field), _place(next(iter(fields.values())))
+                raise FormatError(path, f"has {ours}, the first field {theirs}")
     if not fields:
         raise FormatError(sources[0], "has no fields")
-    values = {name: field.values for name, field in fields.items()}
-    return values, _bounds(sources[0], next(iter(fields.values())))
+    assert field.bounds is not None
+    return {name: each.values for name, each in fields.items()}, field.bounds
+
+
+def _place(field: Field) -> str:
+    cells = " x ".join(map(str, field.resolution))
+    return f"{cells} cells (x, y, z) in the box {np.asarray(field.bounds).tolist()}"
 
 
 def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
@@ -35,20 +45,3 @@ def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
     (x, y, z), (far_x, far_y, far_z) = bounds.tolist()
     box = np.array([[x, -far_z, y], [far_x, -z, far_y]])
     return {name: values.swapaxes(0, 1)[:, ::-1] for name, values in fields.items()}, box
-
-
-def _require_same_cells(path: Path, field: Field, first: Field) -> None:
-    if field.resolution != first.resolution:
-        ours, theirs = (" x ".join(map(str, each.resolution)) for each in (field, first))
-        raise FormatError(path, f"has {ours} cells (x, y, z), the first field {theirs}")
-    box, first_box = _bounds(path, field), _bounds(path, first)
-    if not np.array_equal(box, first_box):
-        raise FormatError(
-            path, f"lies in the box {box.tolist()}, the first field in {first_box.tolist()}"
-        )
-
-
-def _bounds(path: Path, field: Field) -> np.ndarray:
-    if field.bounds is None:
-        raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
-    return field.bounds

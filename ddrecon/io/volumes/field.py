@@ -8,12 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import as_float32
+
+BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
+"""What `bounds` are, in messages."""
+Fields = Mapping[str, np.ndarray]
+"""Values of several fields of the same cells, by name."""
+SIGNED = ("g",)
+"""What fields are called that may be negative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,29 +39,12 @@ class Field:
         return x, y, z
 
 
-BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
-"""What `bounds` are, in messages."""
-Fields = Mapping[str, np.ndarray]
-"""Values of several fields of the same cells, by name."""
-NO_FIELDS: Fields = MappingProxyType({})
-"""None of them."""
-SIGNED = ("g",)
-"""What fields are called that may be negative."""
-
-
-def name_from_file(path: Path) -> list[str]:
-    """The one name of the field at `path`, where the file says none: the end of its own name."""
-    return [path.stem.rpartition(".")[2]]
-
-
 def require_only_field(path: Path, fields: Fields) -> np.ndarray:
     """The values of the one of `fields`, for a format that holds no more."""
     if len(fields) != 1:
-        raise FormatError(
-            path,
-            f"a {path.suffix} holds one field, not {', '.join(fields)}; "
-            "write each into a file of its own",
-        )
+        names = ", ".join(fields)
+        advice = "write each into a file of its own"
+        raise FormatError(path, f"a {path.suffix} holds one field, not {names}; {advice}")
     (values,) = fields.values()
     return values
 
@@ -65,27 +54,21 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
 
     Raises FormatError unless they are legal.
     """
-    if values.ndim not in (3, 4) or (values.ndim == 4 and values.shape[3] != 3) or values.size == 0:
-        raise FormatError(
-            path,
-            f"{name} has shape {list(values.shape)}; "
-            "expected [z, y, x] or [z, y, x, 3], at least one cell",
-        )
+    if values.ndim not in (3, 4) or values.shape[3:] not in ((), (3,)) or values.size == 0:
+        legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
+        raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")
     values = as_float32(values)
-    is_signed = name in SIGNED
-    for legal, what in (
+    for is_legal, what in (
         (np.isfinite(values), "NaN or infinite"),
-        ((values >= 0) | is_signed, "negative"),
+        ((values >= 0) | (name in SIGNED), "negative"),
     ):
-        if not legal.all():
-            z, y, x = np.argwhere(~legal)[0, :3]
-            count = np.count_nonzero(~legal)
+        if not is_legal.all():
+            z, y, x = np.argwhere(~is_legal)[0, :3]
+            count = np.count_nonzero(~is_legal)
             where = f"cell (x, y, z) = ({x}, {y}, {z}) ({count} such values)"
             raise FormatError(path, f"{name} is {what} at {where}; clean it first")
-    return Field(values, None if bounds is None else _check_bounds(path, bounds))
-
-
-def _check_bounds(path: Path, bounds: np.ndarray) -> np.ndarray:
-    if bounds.shape != (2, 3) or not np.isfinite(bounds).all() or not (bounds[0] < bounds[1]).all():
+    if bounds is not None and not (
+        bounds.shape == (2, 3) and np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()
+    ):
         raise FormatError(path, f"bounds must be {BOX} with each minimum below its maximum")
-    return bounds.astype(np.float64)
+    return Field(values, None if bounds is None else bounds.astype(np.float64))

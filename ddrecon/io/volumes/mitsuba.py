@@ -21,34 +21,21 @@ MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
 
 
 def read_vol(path: Path, name: str) -> Field:
-    """The field in the file at `path`, taken for `name`.
-
-    Raises FormatError when it is damaged or not a legal field.
-    """
+    """The field in the file at `path`, taken for `name`; raises FormatError unless it is legal."""
     check_size(path.stat().st_size, path, "the volume")
     data = path.read_bytes()
     if len(data) < HEADER.size or data[:3] != MAGIC:
         raise FormatError(path, "not a Mitsuba volume: it does not begin with 'VOL' and a header")
     _, version, kind, x, y, z, colors, *corners = HEADER.unpack_from(data)
     if (version, kind) != (VERSION, FLOAT32):
-        raise FormatError(
-            path,
-            f"is of version {version} and type {kind}; "
-            f"only version {VERSION} with float32 values (type {FLOAT32}) can be read",
-        )
+        known = f"only version {VERSION} with float32 values (type {FLOAT32}) can be read"
+        raise FormatError(path, f"is of version {version} and type {kind}; {known}")
     if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
-        raise FormatError(
-            path,
-            f"is damaged: its header says {x} x {y} x {z} cells of {colors}, "
-            "which is not the size of its data",
-        )
+        told = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
+        raise FormatError(path, f"is damaged: its header says {told}")
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
-    return check_field(
-        path,
-        name,
-        values[..., 0] if colors == 1 else values,
-        np.array(corners, np.float64).reshape(2, 3),
-    )
+    values = values[..., 0] if colors == 1 else values
+    return check_field(path, name, values, np.array(corners).reshape(2, 3))
 
 
 def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
@@ -56,11 +43,9 @@ def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
     `bounds` [2, 3] are the corners (x, y, z) [u]. The format knows no names.
     """
-    values = require_only_field(path, fields)
+    values = as_float32(require_only_field(path, fields))
     colors = values.shape[3] if values.ndim == 4 else 1
     z, y, x = values.shape[:3]
-    header = HEADER.pack(
-        MAGIC, VERSION, FLOAT32, x, y, z, colors, *np.asarray(bounds, np.float64).ravel()
-    )
+    header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *bounds.ravel())
     with replace_file(path) as temporary:
-        temporary.write_bytes(header + as_float32(values).astype("<f4", copy=False).tobytes())
+        temporary.write_bytes(header + values.astype("<f4", copy=False).tobytes())

@@ -16,13 +16,14 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import NO_FIELDS, Field, Fields, check_field
+from ddrecon.io.volumes.field import Field, Fields, check_field
 
 COLOR = "color"
 NAMES = {
     "x": ("x", "west_east", "nx"),
     "y": ("y", "south_north", "ny"),
     "z": ("z", "height", "altitude", "bottom_top", "lev", "nz"),
+    COLOR: (COLOR,),
 }
 """What the names of axes begin with."""
 METERS = {
@@ -33,16 +34,13 @@ EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
 
 
-def write_netcdf(
-    path: Path, fields: Fields, bounds: np.ndarray, constants: Fields = NO_FIELDS
-) -> None:
+def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray, constants: Fields) -> None:
     """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and their box.
 
     `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds; `constants`
     as attributes of the file.
     """
     z, y, x = next(iter(fields.values())).shape[:3]
-    box = np.asarray(bounds, np.float64)
     with (
         replace_file(path) as temporary,
         load_for_file("netCDF4", path).Dataset(temporary, "w") as file,
@@ -50,14 +48,14 @@ def write_netcdf(
         file.setncatts({"Conventions": "CF-1.11", **constants})
         for name, count in {"x": x, "y": y, "z": z, "corner": 2, COLOR: 3}.items():
             file.createDimension(name, count)
-        for axis, count, low, high in zip("xyz", (x, y, z), *box, strict=True):
+        for axis, count, low, high in zip("xyz", (x, y, z), *bounds, strict=True):
             edges = np.linspace(low, high, count + 1)
-            centers = file.createVariable(axis, "f8", (axis,))
             corners = file.createVariable(f"{axis}_bounds", "f8", (axis, "corner"))
-            told = {"long_name": f"{axis} of cell centers", "bounds": corners.name}
-            centers.setncatts({"axis": axis.upper(), **told})
-            centers[:] = (edges[:-1] + edges[1:]) / 2
             corners[:] = np.column_stack([edges[:-1], edges[1:]])
+            centers = file.createVariable(axis, "f8", (axis,))
+            centers[:] = (edges[:-1] + edges[1:]) / 2
+            about = {"axis": axis.upper(), "long_name": f"{axis} of cell centers"}
+            centers.setncatts({**about, "bounds": corners.name})
         for name, values in fields.items():
             axes = ("z", "y", "x", COLOR)[: values.ndim]
             variable = file.createVariable(name, "f4", axes, compression="zlib", shuffle=True)
@@ -65,26 +63,25 @@ def write_netcdf(
 
 
 def netcdf_names(path: Path) -> list[str]:
-    """The variables of the file at `path` that have axes x, y and z.
-
-    Raises FormatError when it cannot be read.
-    """
+    """The variables of the file at `path` that have axes x, y and z; there must be some."""
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        return _names(file)
+        names = [
+            name
+            for name, variable in file.variables.items()
+            if set("xyz") <= {_axis_of(file, dimension) for dimension in variable.dimensions}
+        ]
+        if not names:
+            axes = ", ".join(file.dimensions)
+            raise FormatError(path, f"has the dimensions {axes}; name some of them x, y and z")
+        return names
 
 
 def read_netcdf(path: Path, name: str) -> Field:
     """The variable `name` of the file at `path`.
 
-    Raises FormatError when it is damaged, absent, unevenly spaced or not a legal field.
+    Raises FormatError when it is damaged, unevenly spaced or not a legal field.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        if name not in file.variables:
-            raise FormatError(
-                path,
-                f"has no variable {name!r}; on axes x, y and z it has "
-                f"{', '.join(map(repr, _names(file))) or 'none'}",
-            )
         variable = file.variables[name]
         check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
         values, axes = _arrange(path, file, variable)
@@ -98,19 +95,11 @@ def read_netcdf(path: Path, name: str) -> Field:
 def _axis_of(file: Any, dimension: str) -> str | None:
     """Which of x, y, z, or color, the `dimension` is."""
     attribute = str(getattr(file.variables.get(dimension), "axis", "")).lower()
-    if attribute in NAMES or dimension == COLOR:
-        return attribute or COLOR
+    if attribute in NAMES:
+        return attribute
     return next(
         (axis for axis, names in NAMES.items() if dimension.lower().startswith(names)), None
     )
-
-
-def _names(file: Any) -> list[str]:
-    return [
-        name
-        for name, variable in file.variables.items()
-        if {"x", "y", "z"} <= {_axis_of(file, one) for one in variable.dimensions}
-    ]
 
 
 def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
@@ -120,25 +109,18 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
     """
     # What is masked (_FillValue) is NaN, which `check_field` refuses.
     values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
-    axes = [_axis_of(file, dimension) for dimension in variable.dimensions]
-    for axis, dimension, count in zip(axes, variable.dimensions, values.shape, strict=True):
-        if axis is None and count > 1:
-            raise FormatError(
-                path,
-                f"{variable.name} has {count} entries along {dimension!r}; "
-                f"choose one (ncks -d {dimension},0)",
-            )
-    order = [axis for axis in ("z", "y", "x", COLOR) if axis in axes]
-    if order[:3] != ["z", "y", "x"] or len(order) != len(axes) - axes.count(None):
-        raise FormatError(
-            path,
-            f"{variable.name} has the dimensions {', '.join(variable.dimensions)}; "
-            "expected x, y and z: rename them so",
-        )
-    others = [index for index, axis in enumerate(axes) if axis is None]
-    values = values.transpose([*map(axes.index, order), *others])
-    known = [variable.dimensions[axes.index(axis)] for axis in "zyx"]
-    return values.reshape(values.shape[: len(order)]), known
+    dimensions = dict[str, str]()
+    for name, count in zip(variable.dimensions, values.shape, strict=True):
+        axis = _axis_of(file, name)
+        if axis and axis not in dimensions:
+            dimensions[axis] = name
+        elif count > 1:
+            advice = f"choose one (ncks -d {name},0)"
+            raise FormatError(path, f"{variable.name} has {count} entries along {name!r}; {advice}")
+    kept = [dimensions[axis] for axis in ("z", "y", "x", COLOR) if axis in dimensions]
+    order = sorted(variable.dimensions, key=lambda name: [*kept, name].index(name))
+    values = values.transpose([variable.dimensions.index(name) for name in order])
+    return values.reshape(values.shape[: len(kept)]), kept[:3]
 
 
 def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:
@@ -150,12 +132,9 @@ def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None
     steps = np.diff(centers)
     even = np.linspace(centers[0], centers[-1], len(centers))
     if len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
-        shortest, longest = np.abs(steps).min(), np.abs(steps).max()
-        raise FormatError(
-            path,
-            f"{dimension} is not evenly spaced ({shortest:g} to {longest:g}); "
-            "interpolate it first (xarray: .interp)",
-        )
+        spacing = f"{np.abs(steps).min():g} to {np.abs(steps).max():g}"
+        advice = "interpolate it first (xarray: .interp)"
+        raise FormatError(path, f"{dimension} is not evenly spaced ({spacing}); {advice}")
     step = -1 if centers[-1] < centers[0] else 1
     # The two ends of a cell come in either order, whichever way the axis goes.
     corners = file.variables.get(getattr(coordinate, "bounds", ""))

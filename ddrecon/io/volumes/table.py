@@ -10,7 +10,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.volumes.field import Field, Fields, name_from_file
+from ddrecon.io.volumes.field import Field, Fields
 from ddrecon.io.volumes.mitsuba import read_vol, write_vol
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf, write_netcdf
 from ddrecon.io.volumes.npz import npz_names, read_npz, write_npz
@@ -23,34 +23,34 @@ from ddrecon.io.volumes.vti import refuse_vti, write_vti
 class VolumeFormat:
     """How one kind of volume file is read and written.
 
-    By `names(path)`, `read(path, name)` and `write(path, fields, bounds)`. With `has_metadata`,
-    `write` takes constants as well.
+    By `write(path, fields, bounds)`, with `has_metadata` with constants as well, `read(path, name)`
+    and `names(path)`; without, a file holds one field and does not name it.
     """
 
-    names: Callable[[Path], list[str]]
-    read: Callable[[Path, str], Field]
     write: Callable[..., None]
+    read: Callable[[Path, str], Field]
+    names: Callable[[Path], list[str]] | None = None
     has_metadata: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
-    ".npz": VolumeFormat(npz_names, read_npz, write_npz),
-    ".vol": VolumeFormat(name_from_file, read_vol, write_vol),
-    ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb, has_metadata=True),
-    ".vti": VolumeFormat(refuse_vti, refuse_vti, write_vti),
-    ".nc": VolumeFormat(netcdf_names, read_netcdf, write_netcdf, has_metadata=True),
-    **dict.fromkeys((".tif", ".tiff"), VolumeFormat(name_from_file, read_stack, write_stack)),
+    ".npz": VolumeFormat(write_npz, read_npz, npz_names),
+    ".vol": VolumeFormat(write_vol, read_vol),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, has_metadata=True),
+    ".vti": VolumeFormat(write_vti, refuse_vti, refuse_vti),
+    ".nc": VolumeFormat(write_netcdf, read_netcdf, netcdf_names, has_metadata=True),
+    **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
 }
 
 
 def field_names(path: Path) -> list[str]:
-    """The fields that the volume file at `path` holds.
+    """The fields that the volume file at `path` holds; where it does not say, its own name's end.
 
     Raises FormatError when it cannot be read.
     """
     names = _format_of(path).names
     with guard_reading(path):
-        return names(path)
+        return names(path) if names else [path.stem.rpartition(".")[2]]
 
 
 def read_field(path: Path, name: str) -> Field:
@@ -58,9 +58,13 @@ def read_field(path: Path, name: str) -> Field:
 
     Raises FormatError when it cannot be used.
     """
-    read = _format_of(path).read
+    kind = _format_of(path)
     with guard_reading(path):
-        return read(path, name)
+        if kind.names and name not in (known := kind.names(path)):
+            others = ", ".join(map(repr, known)) or "none"
+            advice = f"; say name: {known[0]} beside file" if len(known) == 1 else ""
+            raise FormatError(path, f"has no field {name!r}; it has {others}{advice}")
+        return kind.read(path, name)
 
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
@@ -79,11 +83,8 @@ def write_fields(
     `constants`, each one number or three, become metadata where `keeps_constants`, else nothing.
     Raises FormatError where the format holds but one field.
     """
-    write = _format_of(path).write
-    if constants and keeps_constants(path):
-        write(path, fields, bounds, constants)
-    else:
-        write(path, fields, bounds)
+    more = (constants or {},) if keeps_constants(path) else ()
+    _format_of(path).write(path, fields, np.asarray(bounds, np.float64), *more)
 
 
 def keeps_constants(path: Path) -> bool:
@@ -92,9 +93,7 @@ def keeps_constants(path: Path) -> bool:
 
 
 def _format_of(path: Path) -> VolumeFormat:
-    try:
-        return FORMATS[path.suffix.lower()]
-    except KeyError:
-        raise FormatError(
-            path, f"unknown volume format {path.suffix!r}; known: {', '.join(FORMATS)}"
-        ) from None
+    if (suffix := path.suffix.lower()) not in FORMATS:
+        known = ", ".join(FORMATS)
+        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {known}")
+    return FORMATS[suffix]

@@ -17,28 +17,7 @@ from ddrecon.io.files.arrays import as_float32
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.volumes.field import Fields
 
-
-def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and their box.
-
-    `bounds` [2, 3], its corners (x, y, z) [u], are written as origin and spacing.
-    """
-    cells = np.array(next(iter(fields.values())).shape[2::-1])
-    low, high = np.asarray(bounds, np.float64)
-    extent = " ".join(f"0 {count}" for count in cells)
-    origin, spacing = (
-        " ".join(repr(float(number)) for number in line) for line in (low, (high - low) / cells)
-    )
-    arrays, data = "", b""
-    for name, values in fields.items():
-        components = values.shape[3] if values.ndim == 4 else 1
-        arrays += (
-            f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" '
-            f'format="appended" offset="{len(data)}"/>\n'
-        )
-        block = as_float32(values).astype("<f4", copy=False).tobytes()
-        data += np.array(len(block), "<u8").tobytes() + block
-    head = f"""<?xml version="1.0"?>
+FILE = """<?xml version="1.0"?>
 <VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">
 <Piece Extent="{extent}">
@@ -48,6 +27,28 @@ def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 </ImageData>
 <AppendedData encoding="raw">
 _"""
+ARRAY = """<DataArray type="Float32" Name={name} NumberOfComponents="{count}" format="appended" \
+offset="{offset}"/>
+"""
+
+
+def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and their box.
+
+    `bounds` [2, 3], its corners (x, y, z) [u], are written as origin and spacing.
+    """
+    cells = next(iter(fields.values())).shape[2::-1]
+    origin, spacing = (
+        " ".join(map(repr, line.tolist())) for line in (bounds[0], (bounds[1] - bounds[0]) / cells)
+    )
+    arrays, data = "", b""
+    for name, values in fields.items():
+        count = values.shape[3] if values.ndim == 4 else 1
+        arrays += ARRAY.format(name=quoteattr(name), count=count, offset=len(data))
+        block = as_float32(values).astype("<f4", copy=False).tobytes()
+        data += len(block).to_bytes(8, "little") + block
+    extent = " ".join(f"0 {count}" for count in cells)
+    head = FILE.format(extent=extent, origin=origin, spacing=spacing, arrays=arrays)
     with replace_file(path) as temporary:
         temporary.write_bytes(head.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")
 

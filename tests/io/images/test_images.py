@@ -15,9 +15,9 @@ from image_files import write_tiff
 from PIL import Image as Pillow
 
 from ddrecon.errors import FormatError
-from ddrecon.io.images import srgb
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.images.table import read_image, read_mask, write_linear, write_preview
+from ddrecon.pictures import srgb
 
 
 def pixels_of(seed: int, *shape: int) -> np.ndarray:
@@ -27,19 +27,15 @@ def pixels_of(seed: int, *shape: int) -> np.ndarray:
 WRITERS = {".exr": write_exr, ".tif": write_tiff, ".npy": np.save}
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".tif"])
-def test_gray_becomes_three_equal_channels(tmp_path: Path, suffix: str):
-    gray = pixels_of(1, 3, 4)
-    WRITERS[suffix](tmp_path / f"a{suffix}", gray)
-    assert np.array_equal(read_image(tmp_path / f"a{suffix}").pixels, np.stack([gray] * 3, -1))
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-@pytest.mark.parametrize("name", ["Y", "gray"])
-def test_single_channel_exr_is_gray(tmp_path: Path, name: str, dtype: type):
-    gray = pixels_of(2, 3, 4).astype(dtype)
-    image = read_image(save_exr(tmp_path / "a.exr", [name], gray[..., None]))
-    assert np.array_equal(image.pixels, np.stack([gray] * 3, -1).astype(np.float32))
+@pytest.mark.parametrize("name", ["a.npy", "a.tif", "Y", "gray"])
+def test_gray_becomes_three_equal_channels(tmp_path: Path, name: str):
+    """In EXR whatever a single channel is called."""
+    gray, path = pixels_of(1, 3, 4).astype(np.float16).astype(np.float32), tmp_path / name
+    if path.suffix:
+        WRITERS[path.suffix](path, gray)
+    else:
+        path = save_exr(tmp_path / "a.exr", [name], gray.astype(np.float16)[..., None])
+    assert np.array_equal(read_image(path).pixels, np.stack([gray] * 3, -1))
 
 
 @pytest.mark.parametrize("suffix", [".exr", ".npy", ".tif"])
@@ -59,18 +55,15 @@ def test_exr_of_other_channels_lists_them(tmp_path: Path):
         read_image(save_exr(tmp_path / "a.exr", ["depth", "normal"], planes))
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
 @pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
-def test_flawed_pixels_are_located_and_counted(
-    tmp_path: Path, suffix: str, value: float, what: str
-):
+def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, what: str):
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2, 1] = pixels[3, 0] = value
-    WRITERS[suffix](tmp_path / f"a{suffix}", pixels)
+    np.save(tmp_path / "a.npy", pixels)
     with pytest.raises(
         FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
     ):
-        read_image(tmp_path / f"a{suffix}")
+        read_image(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2, 2), (2, 2, 5), (1, 2, 2, 3), (0, 2, 3)])
@@ -85,12 +78,10 @@ def test_unknown_suffix_lists_the_known(tmp_path: Path):
         read_image(tmp_path / "a.bmp")
 
 
-def test_without_openimageio_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_openimageio_linear_files_are_arrays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    for suffix in (".exr", ".tif"):
-        (tmp_path / f"a{suffix}").write_bytes(b"")
-        with pytest.raises(FormatError, match=r'pip install "ddrecon\[exr\]"'):
-            read_image(tmp_path / f"a{suffix}")
     pixels = pixels_of(4, 2, 3, 3)
     assert write_linear(tmp_path / "b", pixels) == [tmp_path / "b.npy"]
     assert np.array_equal(read_image(tmp_path / "b.npy").pixels, pixels)
@@ -123,13 +114,15 @@ def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
-@pytest.mark.parametrize("suffix", [".png", ".webp"])
-def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str):
-    stored = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
-    Pillow.fromarray(stored).save(tmp_path / f"a{suffix}", lossless=True)
-    assert np.allclose(
-        read_image(tmp_path / f"a{suffix}").pixels, srgb.decode(stored / 255), atol=1e-6
-    )
+@pytest.mark.parametrize(
+    ("suffix", "off"), [(".png", 1e-6), (".webp", 1e-6), (".jpg", 0.02), (".jpeg", 0.02)]
+)
+def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str, off: float):
+    """Up to the compression of the file."""
+    stored = np.full((16, 16, 3), (200, 100, 50), np.uint8)
+    Pillow.fromarray(stored).save(tmp_path / f"a{suffix}", lossless=True, quality=95)
+    found = read_image(tmp_path / f"a{suffix}").pixels
+    assert np.allclose(found, srgb.decode(stored / 255), atol=off)
 
 
 def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
@@ -181,10 +174,3 @@ def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
     iio.imwrite(tmp_path / "m.png", stored)
     mask = read_mask(tmp_path / "m.png")
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
-
-
-def test_jpeg_is_srgb_up_to_its_compression(tmp_path: Path):
-    stored = np.full((16, 16, 3), (200, 100, 50), np.uint8)
-    for name in ("a.jpg", "a.jpeg"):
-        iio.imwrite(tmp_path / name, stored, quality=95)
-        assert np.allclose(read_image(tmp_path / name).pixels, srgb.decode(stored / 255), atol=0.02)

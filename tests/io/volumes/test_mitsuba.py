@@ -31,14 +31,6 @@ def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, values: np.ndar
     assert np.array_equal(read_field(theirs, "density").values, values)
 
 
-def altered(path: Path, offset: int, layout: str, value: int | bytes) -> Path:
-    write_field(path, "density", VALUES, BOUNDS)
-    data = bytearray(path.read_bytes())
-    struct.pack_into(layout, data, offset, value)
-    path.write_bytes(data)
-    return path
-
-
 @pytest.mark.parametrize(
     ("offset", "layout", "value", "reason"),
     [
@@ -48,12 +40,15 @@ def altered(path: Path, offset: int, layout: str, value: int | bytes) -> Path:
         (8, "<i", 5, "5 x 3 x 2 cells"),
         (8, "<i", -4, "is damaged"),
         (20, "<i", 2, "is damaged"),
-        (48, "<f", float("nan"), "NaN or infinite at cell"),
-        (24, "<f", 7.0, "bounds must be"),
     ],
 )
 def test_a_damaged_file_is_refused(
     tmp_path: Path, offset: int, layout: str, value: int | bytes, reason: str
 ) -> None:
+    path = tmp_path / "f.vol"
+    write_field(path, "density", VALUES, BOUNDS)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, offset, value)
+    path.write_bytes(data)
     with pytest.raises(FormatError, match=reason):
-        read_field(altered(tmp_path / "f.vol", offset, layout, value), "density")
+        read_field(path, "density")

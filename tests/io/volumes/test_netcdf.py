@@ -77,13 +77,13 @@ def test_other_programs_find_axes_and_units(tmp_path: Path) -> None:
     assert field_names(tmp_path / "f.nc") == ["density", "albedo"]
 
 
-@pytest.mark.parametrize("kind", ["NETCDF4", "NETCDF3_CLASSIC"])
 @pytest.mark.parametrize("order", ["z y x", "x y z", "y z x", "time z y x"])
-def test_axes_come_in_any_order(tmp_path: Path, order: str, kind: str) -> None:
+def test_axes_come_in_any_order(tmp_path: Path, order: str) -> None:
     places = ["zyx".index(name) for name in order.split() if name != "time"]
     values = VALUES.transpose(places).reshape(
         [1] * order.startswith("time") + [VALUES.shape[place] for place in places]
     )
+    kind = "NETCDF3_CLASSIC" if order == "x y z" else "NETCDF4"
     field = read_field(written(tmp_path / "f.nc", values, order, kind, **plain()), "QN")
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
@@ -114,20 +114,17 @@ def test_heights_are_in_the_unit_of_x(
     assert np.allclose(field.bounds, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("corners", [None, "low first", "in the order of the axis"])
-def test_downward_axes_are_turned(tmp_path: Path, corners: str | None) -> None:
-    """As pressure levels are: the first slice is the uppermost; the ends of a cell, where they are
-    said, come in either order.
-    """
+@pytest.mark.parametrize("order", [0, 1, -1])
+def test_downward_axes_are_turned(tmp_path: Path, order: int) -> None:
+    """As pressure levels are; the ends of a cell, where they are said, come in either order."""
     axes = plain() | {"z": (CENTERS["z"][::-1], {})}
     path = written(tmp_path / "f.nc", VALUES[::-1], "z y x", **axes)
-    if corners is not None:
-        ends = np.array(CENTERS["z"][::-1])[:, None] + [-0.5, 0.5]
+    if order:
         with netcdf.Dataset(path, "a") as file:
             file.createDimension("corner", 2)
             file.variables["z"].bounds = "z_bounds"
-            turned = ends if corners == "low first" else ends[:, ::-1]
-            file.createVariable("z_bounds", "f8", ("z", "corner"))[:] = turned
+            ends = np.array(CENTERS["z"][::-1])[:, None] + [-0.5, 0.5]
+            file.createVariable("z_bounds", "f8", ("z", "corner"))[:] = ends[:, ::order]
     field = read_field(path, "QN")
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
@@ -141,12 +138,12 @@ def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
     path = tmp_path / "f.nc"
     assert (
         refusal(written(path, VALUES, "z y x", **plain()))
-        == "has no variable 'density'; on axes x, y and z it has 'QN'"
+        == "has no field 'density'; it has 'QN'; say name: QN beside file"
     )
     assert "QN has 2 entries along 'time'; choose one" in refusal(
         written(path, np.stack([VALUES] * 2), "time z y x"), "QN"
     )
-    assert "has the dimensions a, y, x; expected x, y and z" in refusal(
+    assert "has the dimensions a, y, x; name some of them x, y and z" in refusal(
         written(path, VALUES[:1], "a y x"), "QN"
     )
     stretched = plain() | {"z": ([6.5, 7.5, 9.0], {})}

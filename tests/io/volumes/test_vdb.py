@@ -33,25 +33,15 @@ def written(path: Path, **fields: np.ndarray) -> Path:
 def test_the_tools_of_openvdb_list_the_grids(tmp_path: Path) -> None:
     if shutil.which("vdb_print") is None:
         pytest.skip("no vdb_print: apt-get install libopenvdb-tools")
-    density = sparse(9, 40, 17)
-    path = written(
-        tmp_path / "smoke.vdb",
-        density=density,
-        albedo=sparse(9, 40, 17, 3),
-        sigma_a=np.zeros((9, 40, 17)),
-    )
-    text = subprocess.run(
-        ["vdb_print", "-l", path], check=True, capture_output=True, text=True
-    ).stdout
+    shape, path = (9, 40, 17), tmp_path / "smoke.vdb"
+    density = sparse(*shape)
+    written(path, density=density, albedo=sparse(*shape, 3), sigma_a=np.zeros(shape))
+    command = ["vdb_print", "-l", path]
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     _, albedo, filled, empty = text.split("Name: ")
-    assert "Tree_vec3s_5_4_3" in albedo and all(
-        "class: fog volume" in part for part in (albedo, filled, empty)
-    )
-    assert (
-        filled.startswith("density\n")
-        and "Tree_float_5_4_3" in filled
-        and f"Number of active voxels:       {np.count_nonzero(density)}\n" in filled
-    )
+    assert all("class: fog volume" in part for part in (albedo, filled, empty))
+    assert "Tree_vec3s_5_4_3" in albedo and "Tree_float_5_4_3" in filled
+    assert f"Number of active voxels:       {np.count_nonzero(density)}\n" in filled
     assert empty.startswith("sigma_a\n") and "Background value: 0\n" in empty
 
 
@@ -84,28 +74,21 @@ def test_cells_lie_where_openvdb_has_them(
     assert name == kind and np.allclose(size, sides) and np.allclose(first, BOUNDS[0] + sides / 2)
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (9, 40, 17), (9, 12, 4200), (3, 130, 5, 3)])
-def test_what_we_write_is_read(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    """Also in a box so long that the root of the tree has two children."""
-    fields = {"density": sparse(*shape), "full": np.random.default_rng(1).random(shape, np.float32)}
-    path = tmp_path / "smoke.vdb"
-    write_fields(path, fields, BOUNDS, {"g": np.array(0.3), "albedo": np.ones(3)})
+def test_fields_of_a_file_are_read_by_name(tmp_path: Path) -> None:
+    fields = {"density": sparse(3, 130, 5, 3), "full": np.ones((3, 130, 5), np.float32)}
+    path = written(tmp_path / "smoke.vdb", **fields)
     assert field_names(path) == list(fields)
     for name, values in fields.items():
-        found = read_field(path, name)
-        assert np.array_equal(found.values, values)
-        assert np.allclose(found.bounds, BOUNDS, rtol=1e-14, atol=0)
-    with pytest.raises(FormatError, match="no grid 'lwc'; it has 'density', 'full'"):
+        assert np.array_equal(read_field(path, name).values, values)
+    with pytest.raises(FormatError, match="no field 'lwc'; it has 'density', 'full'"):
         read_field(path, "lwc")
 
 
 def test_openvdb_finds_the_constants(tmp_path: Path) -> None:
-    path, colors = tmp_path / "smoke.vdb", np.array([0.5, 0.25, 1])
-    write_fields(
-        path, {"density": np.ones((1, 2, 3))}, BOUNDS, {"g": np.array(0.5), "albedo": colors}
-    )
+    path, constants = tmp_path / "smoke.vdb", {"g": np.array(0.5), "albedo": np.array([0.5, 0, 1])}
+    write_fields(path, {"density": np.ones((1, 2, 3))}, BOUNDS, constants)
     found = openvdb_python.described("vdb.readAll(sys.argv[1])[1]", path)
-    assert found == {"g": 0.5, "albedo": colors.tolist()}
+    assert found == {name: value.tolist() for name, value in constants.items()}
 
 
 AGAIN = """
