@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.grid import array_order
-from ddrecon.light.beam import Beam
+from ddrecon.light.beam import Beam, unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import sum_mass_to_cells
@@ -83,13 +82,12 @@ class Pair:
 def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     """The beam of `light` in `medium`, and the pair that it becomes."""
     extinction = medium.extinction
-    direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
+    _, direction = unit_directions(light.direction)
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     is_uniform = extinction.field is medium.scattering.field and not medium.is_cellwise
     ways = (direction, -direction) if is_uniform else (direction,)
     (entered, step), *behind = (
-        recompute(sum_mass_to_cells, extinction.field, medium.grid, way, extinction.mass_bound)
-        for way in ways
+        sum_mass_to_cells(extinction.field, medium.grid, way, extinction.mass_bound) for way in ways
     )
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     turned = backward_fraction(medium)

@@ -12,12 +12,11 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from ddrecon.light.beam import Beam, follow_beam
+from ddrecon.light.beam import Beam, follow_beams
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import Moments
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
-from ddrecon.light.shear import is_fused_whole
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
@@ -46,47 +45,28 @@ def reduced_light(
     moments of the scattering that remains (E17), for k up to `degree`: Q0, and Q1 with 3 g'. With
     `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E20).
     """
-    beams: dict[int, Beam | PointBeam] = {}
+    beams: list[Beam | PointBeam] = []
     sources: list[Moments] = []
     turned: list[TurnedBeam] = []
-    directional = {
-        i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
-    }
-    is_even = directional and degree <= 1 and not has_pairs and not medium.is_cellwise
-    if is_even and is_fused_whole(
-        medium.grid, *(light.direction for light in directional.values())
-    ):
-        from ddrecon.light.fused.beams import follow_beams
-
-        found, source = follow_beams(medium, list(directional.values()), degree > 0)
-        beams.update(zip(directional, found, strict=True))
-        sources.append(source)
-    for i, light in enumerate(lights):
-        if i in beams:
-            continue
-        if isinstance(light, DirectionalLight) and has_pairs:
-            beams[i], pair = follow_pair(medium, light)
+    directional = [light for light in lights if isinstance(light, DirectionalLight)]
+    if has_pairs:
+        for light in directional:
+            beam, pair = follow_pair(medium, light)
+            beams.append(beam)
             sources.append(pair.source(medium))
             turned += pair.turned
-        elif isinstance(light, DirectionalLight | PointLight):
-            beams[i], received = _follow(medium, light, degree)
+    elif directional:
+        found, source = follow_beams(medium, directional, degree)
+        beams += found
+        sources.append(source)
+    for light in lights:
+        if isinstance(light, PointLight):
+            point_beam, received = follow_point_light(medium, light, degree)
+            beams.append(point_beam)
             sources.append(received.weighted(remaining_moments(medium)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     source = reduce(Moments.plus, sources) if sources else nothing
-    return ReducedLight(tuple(beams[i] for i in sorted(beams)), source, tuple(turned))
-
-
-def _follow(
-    medium: Medium, light: DirectionalLight | PointLight, degree: int
-) -> tuple[Beam | PointBeam, Moments]:
-    if isinstance(light, DirectionalLight) and is_fused_whole(medium.grid, light.direction):
-        from ddrecon.light.fused.beams import follow_beams
-
-        (beam,), received = follow_beams(medium, [light], has_flux=False)
-        return beam, beam_moments(received.mean, beam.direction, degree)
-    if isinstance(light, DirectionalLight):
-        return follow_beam(medium, light, degree)
-    return follow_point_light(medium, light, degree)
+    return ReducedLight(tuple(beams), source, tuple(turned))
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

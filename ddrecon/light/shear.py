@@ -38,19 +38,32 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused_whole(grid, direction):
-        from ddrecon.light.fused.beams import sum_mass
+    (entered,), (step,) = recompute(sum_masses, field, grid, direction[None], bound)
+    return entered, step
 
-        return sum_mass(field, grid, direction, bound)
+
+def sum_masses(
+    field: Tensor, grid: Grid, directions: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """The same of beams along `directions` [L, 3]: [L, K, z, y, x] and [L]; to be recomputed."""
+    if is_fused_whole(grid, directions):
+        from ddrecon.light.fused import shear
+
+        return shear.sum_masses(field, grid, directions, bound)
     sum_one: Callable[..., tuple[Tensor, Tensor]] = _sum_mass
     if isinstance(grid, Slab):
         from ddrecon.light import shear_slabs
 
         sum_one = shear_slabs.sum_mass
-    if field.shape[0] == 1:
-        return sum_one(field, grid, direction, bound)
-    each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
-    return torch.cat([entered for entered, _ in each]), each[0][1]
+    masses, steps = list[Tensor](), list[Tensor]()
+    for direction in directions:
+        if len(field) == 1:
+            each = [sum_one(field, grid, direction, bound)]
+        else:
+            each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
+        masses.append(torch.cat([entered for entered, _ in each]))
+        steps.append(each[0][1])
+    return torch.stack(masses), torch.stack(steps)
 
 
 def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ddrecon.light.beam import attenuate
 from ddrecon.light.moments import Moments, Vector
-from ddrecon.light.shear import is_fused_whole, sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_varied, recompute
@@ -35,24 +35,10 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     as going along its middle (E17).
     """
     skies = _lit_skies(lights)
-    if skies and is_fused_whole(medium.grid, *(sky.travel for sky in skies)):
-        from ddrecon.light.fused.beams import attenuate
-
-        weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
-        return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)[0]
-    total = None
-    for sky in skies:
-        for travel, weights in zip(sky.travel, _moment_weights(sky, degree), strict=True):
-            part = recompute(_attenuate_direction, medium, travel, weights)
-            total = part if total is None else total + part
-    return None if total is None else _as_moments(total)
-
-
-def _as_moments(sums: Tensor) -> Moments:
-    """Light of which `sums` has the mean, then the flux along z, y, x, then what is higher."""
-    if len(sums) == 1:
-        return Moments(sums[0])
-    return Moments(sums[0], (sums[1], sums[2], sums[3]), sums[4:] if len(sums) > 4 else None)
+    if not skies:
+        return None
+    weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
+    return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)[0]
 
 
 def _moment_weights(sky: Sky, degree: int) -> Tensor:
@@ -92,22 +78,6 @@ def _scatter_direction(
     medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
 ) -> Tensor:
     """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
-    visible = _attenuate_direction(medium, travel, irradiance[None])[0]
+    light, _ = attenuate(medium, travel[None], irradiance[None, None])
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-    return visible * medium.seen.value(torch.atleast_3d(z + y + x))
-
-
-def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> Tensor:
-    """`weights` [moments, C] times tau along `direction`, `[moments, C, z, y, x]`.
-
-    tau is averaged over each cell.
-    """
-    if len(weights) == 1 and is_fused_whole(medium.grid, direction):
-        from ddrecon.light.fused.beams import attenuate
-
-        return attenuate(medium, direction[None], weights[None])[0].mean[None]
-    extinction = medium.extinction
-    entered, step = sum_mass_to_cells(
-        extinction.field, medium.grid, direction, extinction.mass_bound
-    )
-    return extinction.mean_transmittance(entered, step) * weights[..., None, None, None]
+    return light.mean * medium.seen.value(torch.atleast_3d(z + y + x))
