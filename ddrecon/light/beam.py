@@ -134,23 +134,23 @@ def attenuate(
         field = medium.extinction.field
         eighth = moments * colors // (8 * len(field))
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
-    sums, masses = None, list[Tensor]()
+    sums: Sequence[Tensor] = ()
+    masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
-        parts, more = recompute(_attenuate_some, medium, *some, has_mass)
-        sums = parts if sums is None else [a + b for a, b in zip(sums, parts, strict=True)]
+        parts, more = recompute(attenuate_few, medium, *some, has_mass)
+        sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
         masses += more
-    assert sums is not None
     mean, *others = sums
     flux = (others[0], others[1], others[2]) if others else None
     return Moments(mean, flux, others[3] if len(others) > 3 else None), masses
 
 
-def _attenuate_some(
-    medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool
+def attenuate_few(
+    medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool = False
 ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
     """What is received of a few beams, for the mean, for each component of the flux, for all else.
 
-    And masses, as `attenuate` has them.
+    And masses, as `attenuate` has them. To be recomputed.
     """
     extinction = medium.extinction
     field, scale = extinction.field, extinction.scale

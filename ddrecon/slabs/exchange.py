@@ -49,11 +49,6 @@ def gather_own(own: Tensor, slab: Slab) -> Tensor:
     return _gather(own, slab.axis - 3, slab.sizes, slab.rank)
 
 
-def gather_parts(part: Tensor) -> Tensor:
-    """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
-    return _gather(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
-
-
 def sum_slabs(part: Tensor) -> Tensor:
     """The sum over ranks of `part`, any shape, differentiable (E40)."""
     total: Tensor = _Exchange.apply(_sum, _sum, part)

@@ -77,7 +77,7 @@ def test_penalties_do_not_depend_on_the_units_of_density_and_length(
         )
         scene = make_scene(field, sigma_a=sigma_a, sigma_s=sigma_s, grid=grid)
         if name != "density":
-            other = Volume(grid, field, sigma_a, 7 * sigma_s, g=field.new_tensor(0.5))
+            other = Volume(grid, field, sigma_a, 7 * sigma_s, field.new_tensor(0.5))
             scene = replace(scene, volume=mix_media({"smoke": scene.volume, "dust": other}))
         settings = OptimizeSettings({name: ParameterSettings(tv=1.0)})
         (parameter,) = start_parameters(scene, settings)

@@ -168,7 +168,8 @@ class _Masses(torch.autograd.Function):
             pairs, numbers = _with_change(field, d_field), _with_change(numbers, d_numbers)
             laid, d_entered = _lay(ctx.shears, pairs), []
             for light, shear in enumerate(ctx.shears):
-                given = {"light": light, "numbers": numbers, "field": laid[shear.is_across_x]}
+                given: dict[str, Any] = {"light": light, "numbers": numbers}
+                given["field"] = laid[shear.is_across_x]
                 made = {"masses": field.new_empty(2 * len(field) * shear.window)}
                 shear.launch("sum_along_rays_tangent", given, made)
                 entered = torch.empty_like(given["field"])
