@@ -137,7 +137,11 @@ def attenuate(
     sums: Sequence[Tensor] = ()
     masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
-        parts, more = recompute(attenuate_few, medium, *some, has_mass)
+        # Of lights, which are few, kernels keep what their adjoint needs.
+        if has_mass and is_fused_whole(medium.grid, directions):
+            parts, more = attenuate_few(medium, *some, has_mass)
+        else:
+            parts, more = recompute(attenuate_few, medium, *some, has_mass)
         sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
         masses += more
     mean, *others = sums

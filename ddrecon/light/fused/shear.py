@@ -31,7 +31,7 @@ def sum_masses(
     """The mass [L, K, z, y, x] up to where each beam enters each cell, and its path in a slice [L].
 
     Arguments as of `light.shear.sum_masses`; differentiated in forward mode by `field` and `bound`
-    alone, and backward once.
+    alone.
     """
     shears, numbers = _cross(grid, directions)
     bounds = torch.as_tensor(bound).to(numbers).expand(len(numbers), 1)
@@ -109,7 +109,7 @@ class Shear:
 
 
 class _Masses(torch.autograd.Function):
-    """The mass, and where it `has_adjoint` what that needs, for one backward pass.
+    """The mass, and where it `has_adjoint` what that needs.
 
     Row l of `numbers` [L, 4] holds the slope of beam l by rows and by columns, its path in a slice
     [u] and the bound of corrections.
@@ -146,7 +146,8 @@ class _Masses(torch.autograd.Function):
         laid, varies = _lay(ctx.shears, field), ctx.needs_input_grad[3]
         bars = {key: torch.zeros_like(one) for key, one in laid.items()}
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
-        for light, (shear, windows) in enumerate(zip(ctx.shears, kept, strict=True)):
+        for light, (shear, own) in enumerate(zip(ctx.shears, kept, strict=True)):
+            windows = own.clone()
             key, bar = shear.is_across_x, shear.turn(entered_bar[light])
             given = {"light": light, "numbers": numbers, "field": laid[key]}
             given |= {"varies": varies, "entered_bar": bar}
