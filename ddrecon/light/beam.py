@@ -22,7 +22,7 @@ from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
-MOST_NUMBERS = 1 << 22
+MOST_NUMBERS = 1 << 23
 """So many numbers of masses are held at once, or an eighth of the moments' where that is more:
 cells then receive the light of several beams in one pass.
 """
