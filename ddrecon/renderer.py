@@ -31,14 +31,18 @@ from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_once_more, scatter_towards
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
-from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.reduced import (
+    ambient_radiance,
+    ambient_sky,
+    reduced_light,
+    scatter_sky,
+    sum_unscattered_sky,
+)
 from ddrecon.light.sky import Sky, decompose_lights
-from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_through
-from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
-from ddrecon.medium.cut import cut_volume
+from ddrecon.medium.coefficients import Medium, cut_volume, keep_medium, scale_medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.remember import is_any_nonzero

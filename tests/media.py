@@ -21,6 +21,8 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase_peak import SeenPhase, peaked_series
+from ddrecon.numerics.legendre import legendre
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.tangents import varied
@@ -154,3 +156,12 @@ def render_tangent(
             key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
             for key, (primal, tangent) in pairs.items()
         }
+
+
+def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
+    """S(x, w) of E13, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`.
+
+    A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
+    """
+    weights = peaked_series(seen.phase, seen.degree, depth[..., None])
+    return (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)

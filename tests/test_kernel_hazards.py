@@ -18,9 +18,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SolveError
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.reduced import reduced_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
-from ddrecon.light.skylight import sum_unscattered_sky
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each

@@ -1,9 +1,11 @@
-"""The beam of a directional light inside the volume: its part of L_ri (E1) and of L_ss (E2)."""
+"""Beams of parallel light inside the volume: their part of L_ri (E1) and of L_ss (E2)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -11,12 +13,19 @@ from torch import Tensor
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import sum_mass_to_cells
-from ddrecon.medium.coefficients import Medium
+from ddrecon.light.shear import is_fused_whole, sum_masses
+from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
+from ddrecon.numerics.remember import remember
+
+MOST_NUMBERS = 1 << 23
+"""So many numbers of masses are held at once, or an eighth of the moments' where that is more:
+cells then receive the light of several beams in one pass.
+"""
 
 
 @dataclass(frozen=True)
@@ -61,20 +70,104 @@ def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
     return -(direction @ travel)
 
 
-def follow_beam(medium: Medium, light: DirectionalLight, degree: int) -> tuple[Beam, Moments]:
-    """The beam of `light` in `medium`, and the moments of E tau / (4 pi) at cells (E2).
+def follow_beams(
+    medium: Medium, lights: Sequence[DirectionalLight], degree: int
+) -> tuple[list[Beam], Moments]:
+    """The beams of `lights`, and the moments up to `degree` of what they scatter (E2, E17).
 
-    They go up to `degree`, and are those of radiance that all travels with the beam.
+    These are the sum of p_l Y_k(w) E tau / (4 pi).
+    """
+    directions, *each = unit_directions(*(light.direction for light in lights))
+    is_even = degree <= 1 and not medium.is_cellwise
+    cosine = medium.mean_cosine if is_even and degree else None
+    weights = _beam_weights(directions, cosine, *(light.irradiance for light in lights))
+    if is_even:
+        source, masses = attenuate(medium, directions, weights, has_mass=True)
+    else:
+        found = [
+            attenuate(medium, way, weight, has_mass=True)
+            for way, weight in zip(directions.split(1), weights.split(1), strict=True)
+        ]
+        masses = [mass for _, (mass,) in found]
+        received = (
+            beam_moments(light.mean, direction, degree).weighted(remaining_moments(medium))
+            for (light, _), direction in zip(found, each, strict=True)
+        )
+        source = reduce(Moments.plus, received)
+    beams = [
+        Beam(mass, direction, along_colors(light.irradiance))
+        for mass, direction, light in zip(masses, each, lights, strict=True)
+    ]
+    return beams, source
 
-    tau is averaged over each cell along the beam, so that the energy taken from the beam is what
-    cells receive, however thick they are.
+
+@remember
+def unit_directions(*directions: Tensor) -> tuple[Tensor, ...]:
+    """Unit `directions` (z, y, x) beside each other, [L, 3], and one by one."""
+    each = [torch.nn.functional.normalize(array_order(one), dim=0) for one in directions]
+    return torch.stack(each), *each
+
+
+@remember
+def _beam_weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: Tensor) -> Tensor:
+    """What `attenuate` is to weight beams by: E / (4 pi), and 3 g' w times that for the flux."""
+    weights = torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
+    if mean_cosine is None:
+        return weights
+    flux = 3 * mean_cosine.view(-1) * directions[..., None] * weights
+    return torch.cat([weights.expand(-1, -1, flux.shape[2]), flux], 1)
+
+
+def attenuate(
+    medium: Medium, directions: Tensor, weights: Tensor, *, has_mass: bool = False
+) -> tuple[Moments, list[Tensor]]:
+    """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over cells.
+
+    So the energy taken from a beam is what cells receive, however thick they are. `weights`
+    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Also the
+    mass up to cells' centers [K, z, y, x] of each beam where it `has_mass`.
+    """
+    count, (_, moments, colors) = 1, weights.shape
+    if is_fused_whole(medium.grid, directions):
+        from ddrecon.light.fused.receive import MOST_BEAMS
+
+        field = medium.extinction.field
+        eighth = moments * colors // (8 * len(field))
+        count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
+    sums: Sequence[Tensor] = ()
+    masses: list[Tensor] = []
+    for some in zip(directions.split(count), weights.split(count), strict=True):
+        # Of lights, which are few, kernels keep what their adjoint needs.
+        if has_mass and is_fused_whole(medium.grid, directions):
+            parts, more = attenuate_few(medium, *some, has_mass)
+        else:
+            parts, more = recompute(attenuate_few, medium, *some, has_mass)
+        sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
+        masses += more
+    mean, *others = sums
+    flux = (others[0], others[1], others[2]) if others else None
+    return Moments(mean, flux, others[3] if len(others) > 3 else None), masses
+
+
+def attenuate_few(
+    medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool = False
+) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    """What is received of a few beams, for the mean, for each component of the flux, for all else.
+
+    And masses, as `attenuate` has them. To be recomputed.
     """
     extinction = medium.extinction
-    direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
-    irradiance = light.irradiance.view(-1, 1, 1, 1)
-    entered, step = recompute(
-        sum_mass_to_cells, extinction.field, medium.grid, direction, extinction.mass_bound
-    )
-    received = irradiance / (4 * math.pi) * recompute(extinction.mean_transmittance, entered, step)
-    beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
-    return beam, beam_moments(received, direction, degree)
+    field, scale = extinction.field, extinction.scale
+    entered, steps = sum_masses(field, medium.grid, directions, extinction.mass_bound)
+    if is_fused_whole(medium.grid, directions):
+        from ddrecon.light.fused.receive import receive
+
+        colors = max(weights.shape[2], len(scale))
+        weights = weights.expand(-1, -1, colors)
+        received = receive(field, scale.flatten().expand(colors), entered, steps, weights)
+    else:
+        tau = extinction.mean_transmittance(entered[0], steps[0])
+        sums = tau * weights[0][..., None, None, None]
+        received = *sums[:4], *([sums[4:]] if len(sums) > 4 else [])
+    masses = zip(entered, steps, strict=True) if has_mass else ()
+    return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]

@@ -13,6 +13,7 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import EnvironmentLight
@@ -61,24 +62,13 @@ def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
     times_down = math.ceil((rows - 1) / (height - 1))
     times_across = 2 * math.ceil((columns / width - 1) / 2) + 1
     if times_down > 1:
-        radiance = _interpolate(radiance, times_down, 0, times_down * (height - 1) + 1, 1)
+        size = times_down * (height - 1) + 1, width
+        radiance = interpolate(radiance[None], size, mode="bilinear", align_corners=True)[0]
     if times_across > 1:
-        radiance = _interpolate(
-            _wrap(radiance), times_across, times_across - times_across // 2, times_across * width, 2
-        )
+        size = len(radiance[0]), times_across * (width + 2)
+        wide = interpolate(_wrap(radiance)[None], size, mode="bilinear")[0]
+        radiance = wide[..., times_across:-times_across]
     return radiance
-
-
-def _interpolate(values: Tensor, times: int, start: int, count: int, dim: int) -> Tensor:
-    """`count` values interpolated linearly between `values` [C, h, w] along `dim`.
-
-    They lie at (`start` + i) / `times` steps after the first value, i = 0 to `count` - 1.
-    """
-    place = (start + torch.arange(count, device=values.device)).to(values.dtype) / times
-    low = place.long().clamp(max=values.shape[dim] - 2)
-    fraction = (place - low).view([-1 if dim == other else 1 for other in range(3)])
-    before, after = values.index_select(dim, low), values.index_select(dim, low + 1)
-    return before + fraction * (after - before)
 
 
 def pixel_moments(height: int, width: int) -> np.ndarray:

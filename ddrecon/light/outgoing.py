@@ -13,7 +13,7 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase_cells import turned_in_cells
-from ddrecon.medium.remaining import remaining_moments, turned_phase
+from ddrecon.medium.remaining import remaining_moments, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember
@@ -46,6 +46,8 @@ def scatter_towards(
 
     With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
     """
+    if light.flux is None:
+        return scatter_once_more(medium, light).mean.clamp(min=0)
     if is_fused() and not medium.is_cellwise:
         from ddrecon.light.fused.outgoing import scatter_fused
 
@@ -77,5 +79,5 @@ def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor
     if medium.is_cellwise:
         phase = turned_in_cells(medium, beam.turns, angle_of(cosine))
         return beam.radiance * phase / (1 - medium.forward_fraction)
-    phase = look_up(turned_phase(medium, beam.turns), angle_of(cosine))[..., 0]
-    return beam.radiance * phase.to(cosine.dtype)
+    table = turned_table(medium.seen.phase, medium.seen.degree, beam.turns)
+    return beam.radiance * look_up(table, angle_of(cosine))[..., 0].to(cosine.dtype)

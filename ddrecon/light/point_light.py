@@ -142,24 +142,20 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
     """
     pairs = math.ceil(math.hypot(*grid.extent) / (2 * min(grid.spacing)))
     fraction = _gauss_pairs(pairs).to(field)[:, None]
-
-    def integrate(ends: Tensor, distance: Tensor) -> Tensor:
-        offset = ends - position
-        inside = _part_inside(grid, position, ends)
-        points = ends - (inside * fraction)[..., None] * offset
-        places = 2 * (points - points.new_tensor(grid.lower)) / points.new_tensor(grid.extent) - 1
-        values = sample_volume(field, places.flip(-1))
-        return values.mean(1) * (inside * distance)
-
+    inside = _part_inside(grid, position, ends)
+    ways = ends - inside[:, None] * (ends - position), ends, inside * distance
     if is_fused(position):
         from ddrecon.light.fused.point_light import integrate_ways
 
-        inside = _part_inside(grid, position, ends)
-        begins = ends - inside[:, None] * (ends - position)
-        return integrate_ways(field, grid, begins, ends, inside * distance, fraction)
-    count = max(1, CHUNK_SAMPLES // (2 * pairs))
-    chunks = zip(ends.split(count), distance.split(count), strict=True)
-    return torch.cat([recompute(integrate, *chunk) for chunk in chunks], 1)
+        return integrate_ways(field, grid, *ways, fraction)
+
+    def integrate(begins: Tensor, ends: Tensor, lengths: Tensor) -> Tensor:
+        points = ends - fraction[..., None] * (ends - begins)
+        places = 2 * (points - points.new_tensor(grid.lower)) / points.new_tensor(grid.extent) - 1
+        return sample_volume(field, places.flip(-1)).mean(1) * lengths
+
+    chunks = (way.split(max(1, CHUNK_SAMPLES // (2 * pairs))) for way in ways)
+    return torch.cat([recompute(integrate, *chunk) for chunk in zip(*chunks, strict=True)], 1)
 
 
 def _gauss_pairs(count: int) -> Tensor:

@@ -1,10 +1,11 @@
 """Light not yet scattered, L_ri: its beams, and the moments Q0 and Q1 that are the source of E4.
 
-Here are directional and point lights and the radiance of ambient light; skies are in `skylight.py`.
+Of skies only sums over directions are kept, so memory does not grow with their number.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -12,15 +13,17 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from ddrecon.light.beam import Beam, follow_beam
+from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
-from ddrecon.light.shear import is_fused_whole
-from ddrecon.light.sky import Source
+from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
+from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
 
 
@@ -46,47 +49,28 @@ def reduced_light(
     moments of the scattering that remains (E17), for k up to `degree`: Q0, and Q1 with 3 g'. With
     `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E20).
     """
-    beams: dict[int, Beam | PointBeam] = {}
+    beams: list[Beam | PointBeam] = []
     sources: list[Moments] = []
     turned: list[TurnedBeam] = []
-    directional = {
-        i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
-    }
-    is_even = directional and degree <= 1 and not has_pairs and not medium.is_cellwise
-    if is_even and is_fused_whole(
-        medium.grid, *(light.direction for light in directional.values())
-    ):
-        from ddrecon.light.fused.beams import follow_beams
-
-        found, source = follow_beams(medium, list(directional.values()), degree > 0)
-        beams.update(zip(directional, found, strict=True))
-        sources.append(source)
-    for i, light in enumerate(lights):
-        if i in beams:
-            continue
-        if isinstance(light, DirectionalLight) and has_pairs:
-            beams[i], pair = follow_pair(medium, light)
+    directional = [light for light in lights if isinstance(light, DirectionalLight)]
+    if has_pairs:
+        for parallel in directional:
+            beam, pair = follow_pair(medium, parallel)
+            beams.append(beam)
             sources.append(pair.source(medium))
             turned += pair.turned
-        elif isinstance(light, DirectionalLight | PointLight):
-            beams[i], received = _follow(medium, light, degree)
+    elif directional:
+        found, source = follow_beams(medium, directional, degree)
+        beams += found
+        sources.append(source)
+    for light in lights:
+        if isinstance(light, PointLight):
+            point_beam, received = follow_point_light(medium, light, degree)
+            beams.append(point_beam)
             sources.append(received.weighted(remaining_moments(medium)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     source = reduce(Moments.plus, sources) if sources else nothing
-    return ReducedLight(tuple(beams[i] for i in sorted(beams)), source, tuple(turned))
-
-
-def _follow(
-    medium: Medium, light: DirectionalLight | PointLight, degree: int
-) -> tuple[Beam | PointBeam, Moments]:
-    if isinstance(light, DirectionalLight) and is_fused_whole(medium.grid, light.direction):
-        from ddrecon.light.fused.beams import follow_beams
-
-        (beam,), received = follow_beams(medium, [light], has_flux=False)
-        return beam, beam_moments(received.mean, beam.direction, degree)
-    if isinstance(light, DirectionalLight):
-        return follow_beam(medium, light, degree)
-    return follow_point_light(medium, light, degree)
+    return ReducedLight(tuple(beams), source, tuple(turned))
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
@@ -99,3 +83,66 @@ def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
 def _add_radiances(dtype: torch.dtype, device: torch.device, *radiances: Tensor) -> Tensor:
     zero = torch.zeros(1, dtype=dtype, device=device)
     return torch.stack(torch.broadcast_tensors(*radiances, zero)).sum(0).view(-1, 1, 1, 1)
+
+
+def ambient_sky(radiance: Tensor) -> Sky:
+    """Ambient light of `radiance` [C, 1, 1, 1], as light from the directions of a quadrature."""
+    directions, weights = sphere_quadrature(radiance)
+    irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
+    return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
+
+
+def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Moments | None:
+    """Light of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
+
+    Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
+    and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
+    as going along its middle (E17).
+    """
+    skies = _lit_skies(lights)
+    if not skies:
+        return None
+    weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
+    return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)[0]
+
+
+def _moment_weights(sky: Sky, degree: int) -> Tensor:
+    """What transmittance is multiplied by, [N, moments, C]: the moments of light outside."""
+    weights = [sky.irradiance[:, None]]
+    if degree > 0:
+        weights.append(3 * sky.vector)
+    if degree > 1:
+        weights.append(harmonics(sky.travel, degree)[4:].T[..., None] * sky.irradiance[:, None])
+    return torch.cat(weights, 1) / (4 * math.pi)
+
+
+def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
+    """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
+
+    That is the inner integral of E2, sum over directions of p E tau / (4 pi), with the exact phase
+    function p. `towards`: unit, its components broadcast to cells.
+    """
+    total = torch.zeros_like(medium.extinction.value)
+    for sky in _lit_skies(skies):
+        for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
+            total = total + recompute(_scatter_direction, medium, travel, irradiance, towards)
+    return total / (4 * math.pi)
+
+
+def _lit_skies(lights: Sequence[object]) -> list[Sky]:
+    """The skies that differ from their mean, or may come to do so because they are being varied."""
+    skies = [light for light in lights if isinstance(light, Sky)]
+    return [
+        sky
+        for sky in skies
+        if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())
+    ]
+
+
+def _scatter_direction(
+    medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
+) -> Tensor:
+    """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
+    (visible,), _ = attenuate_few(medium, travel[None], irradiance[None, None])
+    z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
+    return visible * medium.seen.value(torch.atleast_3d(z + y + x))

@@ -3,23 +3,31 @@
 Times the scale of a `Coefficient` it is the optical depth in the tau of E2. It is found in three
 steps on whole slices: shear the grid until the beam runs along an axis, sum along that axis, shear
 back. What is interpolated is the field and its integral, never an exponential of them.
+
+Mass is linear in the field but for bounds on its corrections. So where ranks share cells, what lies
+before a slab is handed on as sums along rays, which are as few as a slice has cells (E42).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
-from ddrecon.slabs.slab import Slab
+from ddrecon.slabs.exchange import renew_halo, sum_before
+from ddrecon.slabs.slab import Slab, whole_of
+
+MARGIN = 2
+"""Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
 
 def sum_mass_to_cells(
@@ -38,19 +46,27 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused_whole(grid, direction):
-        from ddrecon.light.fused.beams import sum_mass
+    (entered,), (step,) = recompute(sum_masses, field, grid, direction[None], bound)
+    return entered, step
 
-        return sum_mass(field, grid, direction, bound)
-    sum_one: Callable[..., tuple[Tensor, Tensor]] = _sum_mass
-    if isinstance(grid, Slab):
-        from ddrecon.light import shear_slabs
 
-        sum_one = shear_slabs.sum_mass
-    if field.shape[0] == 1:
-        return sum_one(field, grid, direction, bound)
-    each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
-    return torch.cat([entered for entered, _ in each]), each[0][1]
+def sum_masses(
+    field: Tensor, grid: Grid, directions: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """The same of beams along `directions` [L, 3]: [L, K, z, y, x] and [L]; to be recomputed."""
+    if is_fused_whole(grid, directions):
+        from ddrecon.light.fused import shear
+
+        return shear.sum_masses(field, grid, directions, bound)
+    masses, steps = list[Tensor](), list[Tensor]()
+    for direction in directions:
+        if len(field) == 1:
+            each = [_sum_mass(field, grid, direction, bound)]
+        else:
+            each = [recompute(_sum_mass, one, grid, direction, bound) for one in field.split(1)]
+        masses.append(torch.cat([entered for entered, _ in each]))
+        steps.append(each[0][1])
+    return torch.stack(masses), torch.stack(steps)
 
 
 def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:
@@ -62,14 +78,45 @@ def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
     """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
-    slicing, slope, step = cross_grid(grid, direction)
-    slices = slicing.lay(field)
-    shear = Shear.of(slices.shape[0], slices.shape[2:], slope)
-    on_slices, bends = shear.look(slices)
+    whole = whole_of(grid)
+    slicing, slope, step = cross_grid(whole, direction)
+    count, _, *size = (1 if axis == 0 else whole.shape[axis - 1] for axis in slicing.order)
+    rays = Part(slicing, Shear.of(count, size, slope))
+    before = None
+    if isinstance(grid, Slab):
+        before = _sum_before(field, grid, rays, count, direction[grid.axis].item() >= 0)
+        # Near the ends of a slab rays are missing: there its neighbors' cells are right.
+        rays = rays.of_layers(grid.axis, grid.first, grid.last, count)
+        before = rays.cut(before)
+    on_slices, bends = rays.look(field)
+    # Trapezoids over half steps are more than those over whole ones by
+    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
+    bent = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
+    # The mass of all slices passed: step sum over j < k of rho_j.
+    passed = on_slices.cumsum(0) - on_slices
+    if before is not None:
+        passed, bent = passed + before[0], bent + before[1]
     third_order = ThirdOrder(0, 1, bound)
-    passed = mass_passed(on_slices, bends, step, third_order)
-    # Shear back, from rays to cells.
-    return slicing.lift(shear.to_cells(passed, third_order)), step
+    mass = passed * step + third_order.bounded(bent * (0.5 * step))
+    entered = rays.to_cells(mass, third_order)
+    return renew_halo(entered, grid) if isinstance(grid, Slab) else entered, step
+
+
+def _sum_before(field: Tensor, slab: Slab, rays: Part, count: int, is_upwards: bool) -> Tensor:
+    """Sums of what `Part.look` finds before `slab` and its halo, on all `rays` [2, K, *lattice]."""
+
+    def sums(begin: int, end: int) -> Tensor:
+        part = rays.of_layers(slab.axis, begin, end, count)
+        layers = field.narrow(slab.axis - 3, begin - slab.first, end - begin)
+        found = torch.stack([each.sum(0) for each in part.look(layers)])
+        return part.spread(found, rays.shear.lattice)
+
+    begin, end = slab.cuts[slab.rank : slab.rank + 2]
+    own = sums(begin, end)
+    upwards = torch.full(own[0].shape, is_upwards, device=own.device).flatten()
+    before = sum_before(own.flatten(1), upwards).view_as(own)
+    halo = (slab.first, begin) if is_upwards else (end, slab.last)
+    return before - sums(*halo) if halo[0] < halo[1] else before
 
 
 def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
@@ -85,25 +132,69 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
     return slicing, slope, grid.spacing[slicing.axis] / direction[slicing.axis].abs()
 
 
-def mass_passed(
-    on_slices: Tensor,
-    bends: Tensor,
-    step: Tensor,
-    third_order: ThirdOrder,
-    before: Tensor | None = None,
-) -> Tensor:
-    """The mass [N, K, *lattice] on rays up to each slice, from what `Shear.look` has found.
+@dataclass(frozen=True)
+class Part:
+    """Layers of a grid, in slices, and the rays that meet them.
 
-    `before` [2, K, *lattice] are sums of both over what lies before the first slice.
+    These are part of the whole's: from `offset` on in rows and columns. So many slices were `added`
+    before, and so many `after`: where the beam crosses slabs one by one, there is an empty slice at
+    either end, because the field bends there as well.
     """
-    # Trapezoids over half steps are more than those over whole ones by
-    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    bent = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
-    # The mass of all slices passed: step sum over j < k of rho_j.
-    passed = on_slices.cumsum(0) - on_slices
-    if before is not None:
-        passed, bent = passed + before[0], bent + before[1]
-    return passed * step + third_order.bounded(bent * (0.5 * step))
+
+    slicing: Slicing
+    shear: Shear
+    offset: tuple[int, ...] = (0, 0)
+    added: int = 0
+    after: int = 0
+
+    def of_layers(self, axis: int, begin: int, end: int, count: int) -> Part:
+        """Of the whole, in `count` slices, the layers `begin` to `end` along `axis`."""
+        whole, number, added, after = self.shear, 0, 0, 0
+        cut = self.slicing.order.index(1 + axis) - 2
+        if cut < 0:
+            number = count - end if self.slicing.is_reversed else begin
+            added, after = int(number > 0), int(number + end - begin < count)
+            count = end - begin + added + after
+            number -= added
+        # The rays that meet these cells on the first slice, on the last or between.
+        lines = []
+        for which, slope in enumerate(whole.slope.tolist()):
+            low, cells = (begin, end - begin) if which == cut else (0, whole.size[which])
+            drifts, start = (slope * number, slope * (number + count - 1)), low + whole.first[which]
+            nearest = max(math.floor(start - max(drifts)) - MARGIN, 0)
+            farthest = math.ceil(start + cells - min(drifts)) + MARGIN
+            rays = min(farthest, whole.lattice[which]) - nearest
+            lines.append((cells, rays, start - nearest, nearest))
+        size, lattice, first, offset = zip(*lines, strict=True)
+        shear = Shear(whole.slope, size, lattice, first, number)
+        return Part(self.slicing, shear, offset, added, after)
+
+    def cut(self, sums: Tensor) -> Tensor:
+        """Those of `sums` [2, K, *lattice] on all rays of the whole that are on these."""
+        (row, column), (rows, columns) = self.offset, self.shear.lattice
+        return sums[..., row : row + rows, column : column + columns]
+
+    def spread(self, sums: Tensor, lattice: tuple[int, ...]) -> Tensor:
+        """`sums` [2, K, ...] on these rays as those on all of the whole's `lattice`."""
+        (row, column), (rows, columns) = self.offset, self.shear.lattice
+        return pad(sums, (column, lattice[1] - column - columns, row, lattice[0] - row - rows))
+
+    def look(self, layers: Tensor) -> tuple[Tensor, Tensor]:
+        """The field on rays: rho_k on slices [N, K, *lattice], and how much it bends between two.
+
+        That is rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean of
+        rho_k and rho_(k + 1).
+        """
+        slices = pad(self.slicing.lay(layers), (0, 0, 0, 0, 0, 0, self.added, self.after))
+        on_slices = self.shear.to_rays(slices, 0.0)
+        midway = self.shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+        return on_slices, midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+
+    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
+        """`values` [N, K, *lattice] on the rays at the centers of cells, [K, z, y, x]."""
+        shear = replace(self.shear, begin=self.shear.begin + self.added)
+        own = values[self.added : len(values) - self.after]
+        return self.slicing.lift(shear.to_cells(own, third_order))
 
 
 @dataclass(frozen=True)
@@ -115,33 +206,19 @@ class Shear:
     """
 
     slope: Tensor
-    size: tuple[int, int]
-    lattice: tuple[int, int]
-    first: tuple[int, int]
+    size: tuple[int, ...]
+    lattice: tuple[int, ...]
+    first: tuple[int, ...]
     begin: int = 0
 
     @staticmethod
     def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
         """The rays that meet so many `slices` of `size` (height, width)."""
-        height, width = size
-        rows, columns = (math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slope.tolist())
-        is_on = [s > 0 for s in slope.tolist()]
-        return Shear(
-            slope,
-            (height, width),
-            (height + rows, width + columns),
-            (rows * is_on[0], columns * is_on[1]),
-        )
-
-    def look(self, slices: Tensor) -> tuple[Tensor, Tensor]:
-        """The field on rays: rho_k on `slices` [N, K, H, W], and how much it bends between two.
-
-        That is rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean of
-        rho_k and rho_(k + 1).
-        """
-        on_slices = self.to_rays(slices, 0.0)
-        midway = self.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
-        return on_slices, midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+        slopes = slope.tolist()
+        more = [math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slopes]
+        lattice = tuple(n + own for n, own in zip(size, more, strict=True))
+        first = tuple(own * (s > 0) for own, s in zip(more, slopes, strict=True))
+        return Shear(slope, tuple(size), lattice, first)
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
@@ -165,7 +242,7 @@ class Shear:
         return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)
 
     def _places(
-        self, like: Tensor, shift: float, points: tuple[int, int], cells: tuple[int, int], sign: int
+        self, like: Tensor, shift: float, points: tuple[int, ...], cells: tuple[int, ...], sign: int
     ) -> list[Tensor]:
         """Where rows and columns of `points` fall among those of `cells`, [N, count] in [-1, 1].
 

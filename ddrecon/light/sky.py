@@ -65,14 +65,15 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     Which regions are suns is decided without a derivative; all else is differentiable.
     """
     rows = math.ceil(math.sqrt(PIXELS_PER_REGION / 2 * light.directions))
-    radiance = refine_map(light.scale * light.radiance, rows, 2 * rows)
+    # Radiance is counted from the darkest pixel up, so that an even map has exact zeros.
+    radiance = light.scale * light.radiance
+    darkest = radiance.detach().amin((1, 2))
+    radiance = refine_map(radiance - darkest[:, None, None], rows, 2 * rows)
     regions = _regions(*radiance.shape[1:], light.directions)
 
-    # Moments: integrals over each region of radiance times 1, x, y, z, `[N, 4, C]`. Radiance is
-    # counted from the darkest pixel up, so that an even map has exact zeros; `geometry` holds the
-    # moments of radiance 1.
-    darkest = radiance.detach().amin((1, 2))
-    above_darkest = _integrate(radiance - darkest[:, None, None], regions)
+    # Moments: integrals over each region of radiance times 1, x, y, z, `[N, 4, C]`; `geometry`
+    # holds the moments of radiance 1.
+    above_darkest = _integrate(radiance, regions)
     geometry = regions.moments.to(above_darkest)[..., None]
     moments = above_darkest + darkest * geometry
 

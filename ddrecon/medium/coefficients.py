@@ -15,12 +15,12 @@ from torch import Tensor
 
 from ddrecon.display import Displayed
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, remember_of_phase
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.medium.sections import scale_sections
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.slabs.slab import Slab, own_slab
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -31,11 +31,10 @@ class Volume(Displayed):
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
-    [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function; or in its place `g`
-    in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
-    gradients. `media`: what the volume was mixed from, by name (`mixture`). `support` [z, y, x]:
-    where it is 0 the volume counts as empty, and derivatives by density are 0; None: it is 1
-    everywhere.
+    [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function, or g in (-1, 1), the
+    mean cosine of Henyey and Greenstein's. Tensors may be replaced or require gradients. `media`:
+    what the volume was mixed from, by name (`mixture`). `support` [z, y, x]: where it is 0 the
+    volume counts as empty, and derivatives by density are 0; None: it is 1 everywhere.
     """
 
     grid: Grid
@@ -52,14 +51,10 @@ class Volume(Displayed):
         density: Tensor,
         sigma_a: Tensor,
         sigma_s: Tensor,
-        phase: PhaseFunction | Tensor | None = None,
-        g: Tensor | None = None,
+        phase: PhaseFunction | Tensor,
         media: Mapping[str, Volume] | None = None,
         support: Tensor | None = None,
     ):
-        phase = phase if g is None else g
-        if phase is None:
-            raise TypeError("a volume needs a phase function, or g")
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
         self.media, self.support = media, support
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
@@ -168,13 +163,29 @@ class Medium:
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
 
 
+def cut_volume(volume: Volume) -> Volume:
+    """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
+    slab = own_slab(volume.grid)
+    if not isinstance(slab, Slab):
+        return volume
+    density, sigma_a, sigma_s = (
+        slab.cut(field) if field.shape[-3:] == volume.grid.shape else field
+        for field in (volume.density, volume.sigma_a, volume.sigma_s)
+    )
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(slab.cut(phase.cells))
+    support = None if volume.support is None else slab.cut(volume.support)
+    return Volume(slab, density, sigma_a, sigma_s, phase, support=support)
+
+
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
 
     f is what of the phase function lies beyond `degree`, g' = (g - f) / (1 - f). Source: Joseph,
     Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    fraction = _forward_fraction(volume.phase.kind, degree, *volume.phase.numbers)
+    fraction = _forward_fraction(volume.phase, degree)
     return _medium(volume, SeenPhase(volume.phase, degree), fraction)
 
 
@@ -187,7 +198,7 @@ def keep_medium(volume: Volume) -> Medium:
 
 
 def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
-    g = _mean_cosine(volume.phase.kind, *volume.phase.numbers)
+    g = _mean_cosine(volume.phase)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
     find = _find_coefficients
@@ -222,7 +233,9 @@ def _find_coefficients(
             return Coefficient(sigma, field)
         return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * field)
 
-    scaled, kept, peak = scale_sections(sigma_a, sigma_s, fraction)
+    is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
+    scale = _remember_scaled if is_small else _scale_sections
+    scaled, kept, peak = scale(sigma_a, sigma_s, fraction, is_any_nonzero(fraction))
     scattering = coefficient(sigma_s)
     remaining = coefficient(kept)
     if sigma_s[0].numel() > 1 and fraction.shape[1:].numel() == 1:
@@ -231,19 +244,42 @@ def _find_coefficients(
     return coefficient(scaled), scattering, remaining, coefficient(sigma_a), peak
 
 
+def _scale_sections(
+    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, has_peak: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Extinction and scattering that remain beside a peak of part f, per unit density (E18).
+
+    And what `Medium` has as `peak`. `sigma_a` and `sigma_s`: [C, 1, 1, 1] or [C, z, y, x];
+    `fraction`: f, which broadcasts to them.
+    """
+    remaining = (1 - fraction) * sigma_s
+    extinction = sigma_a + remaining
+    if not has_peak:
+        return extinction, remaining, None
+    mass, forward = torch.broadcast_tensors(extinction, fraction * sigma_s)
+    if mass.shape[1:].numel() == 1:
+        return extinction, remaining, forward
+    # Per unit of what is summed as mass: of the extinction where that varies, else of density.
+    peak = torch.where(mass > 0, forward / torch.where(mass > 0, mass, 1), 0)
+    return extinction, remaining, peak
+
+
+_remember_scaled = remember(_scale_sections)
+
+
 @remember
 def _mass_bound(scale: Tensor) -> Tensor:
     return 2 * scale.mean()
 
 
-@remember
-def _mean_cosine(kind: PhaseKind, *numbers: Tensor) -> Tensor:
-    return _for_cells(kind(*numbers).moments(2)[:, 1])
+@remember_of_phase
+def _mean_cosine(phase: PhaseFunction) -> Tensor:
+    return _for_cells(phase.moments(2)[:, 1])
 
 
-@remember
-def _forward_fraction(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
-    return _for_cells(kind(*numbers).forward_fraction(degree))
+@remember_of_phase
+def _forward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
+    return _for_cells(phase.forward_fraction(degree))
 
 
 @remember

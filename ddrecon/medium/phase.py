@@ -13,12 +13,13 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from ddrecon.numerics.legendre import COUNTS
+from ddrecon.numerics.remember import remember
 
 NEGLIGIBLE = 1e-9
 """Moments below this are left out of series."""
@@ -53,21 +54,21 @@ class PhaseFunction(ABC):
     def moments(self, count: int) -> Tensor:
         """chi_l for l < `count`, [C, count], or of cells [C, count, z, y, x]."""
 
-    @abstractmethod
     def peak_tail(self, degree: int, count: int) -> Tensor:
         """The moments f r_l of the forward peak for `count` degrees l > `degree`, [C, count].
 
         The first is f, the part of scattering that counts as not scattered where light is known to
         `degree` (docs/theory.md E16). f is 0 without a forward peak, and the others are at most f.
         """
+        return torch.zeros_like(self.moments(count))
 
-    @abstractmethod
     def backward_tail(self, degree: int, count: int) -> Tensor:
         """The moments b r_l of the backward peak for `count` degrees l > `degree`, [C, count].
 
         They are those about the backward direction. The first is b, the part of scattering that
         counts as turned back where light is known to `degree`; the others are at most b.
         """
+        return torch.zeros_like(self.moments(count))
 
     @abstractmethod
     def length(self) -> int:
@@ -167,14 +168,22 @@ class Rayleigh(PhaseFunction):
         found[:, :1], found[:, 2:3] = 1.0, 0.1
         return found
 
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        return self.like.new_zeros(1, count)
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return self.like.new_zeros(1, count)
-
     def length(self) -> int:
         return COUNTS[0]
+
+
+def remember_of_phase(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """`function` of a phase function, kept as long as the numbers of that stay (`remember`)."""
+
+    @remember
+    def find(kind: PhaseKind, count: int, *arguments: Any) -> Tensor:
+        return function(kind(*arguments[:count]), *arguments[count:])
+
+    @functools.wraps(function)
+    def recall(phase: PhaseFunction, *others: Any) -> Tensor:
+        return find(phase.kind, len(phase.numbers), *phase.numbers, *others)
+
+    return recall
 
 
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
-from ddrecon.medium.phase import (
-    HenyeyGreenstein,
-    PhaseFunction,
-    PhaseKind,
-    beside,
-    colored,
-)
-
-PARTS = "phases"
-"""What the two parts of a blend are called in names of its variables: `phases.0.g`."""
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind, beside, colored
 
 
 class Mixture(PhaseFunction):
@@ -111,28 +101,6 @@ class Blend(Mixture):
     def kind(self) -> PhaseKind:
         return _BlendOf(type(self.first), type(self.second))
 
-    @property
-    def variables(self) -> dict[str, Tensor]:
-        named = {
-            part_name(index, name): number
-            for index, part in enumerate(self.parts)
-            for name, number in part.variables.items()
-        }
-        return named | {"weight": self.weight}
-
-    def with_variables(self, values: Mapping[str, Tensor]) -> Self:
-        first, second = (
-            part.with_variables(
-                {
-                    name: values[part_name(index, name)]
-                    for name in part.variables
-                    if part_name(index, name) in values
-                }
-            )
-            for index, part in enumerate(self.parts)
-        )
-        return replace(self, first=first, second=second, weight=values.get("weight", self.weight))
-
 
 @dataclass(frozen=True)
 class _BlendOf:
@@ -144,8 +112,3 @@ class _BlendOf:
     def __call__(self, *numbers: Tensor) -> Blend:
         count = len(fields(self.first))
         return Blend(self.first(*numbers[:count]), self.second(*numbers[count:-1]), numbers[-1])
-
-
-def part_name(index: int, name: str) -> str:
-    """What the number `name` of a blend's part is called among its variables."""
-    return f"{PARTS}.{index}.{name}"

@@ -16,20 +16,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind, remember_of_phase
 from ddrecon.medium.phase_blend import Mixture
-from ddrecon.medium.phase_peak import peak_table
+from ddrecon.medium.phase_peak import in_double, peak_table
 from ddrecon.medium.remaining import turned_table
-from ddrecon.numerics.angle_table import (
-    STEPS,
-    angle_of,
-    look_up,
-    look_up_between,
-    with_slopes,
-)
+from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, look_up_between, with_slopes
 from ddrecon.numerics.chebyshev import evaluate_positive
 from ddrecon.numerics.legendre import even_angles
-from ddrecon.numerics.remember import remember
 
 STEEP_STEP, STEEP_STEPS = 0.05, 54
 """Of artanh g, so many from 0 on, to 0.991: a peak, 2 / (1 - g)^2 high, is cubic in it to 4e-6."""
@@ -89,7 +82,7 @@ def count_tables(phase: PhaseFunction) -> int:
 
 def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
     """Polynomials of S at all rungs, and slopes between, [1 or 3, n, 2, steps + 1, 2, K]."""
-    return _peak_tables(phase.kind, degree, *_rungs_and_others(phase, 0))
+    return _peak_tables(_at_rungs(phase, 0), degree)
 
 
 def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,14 +93,13 @@ def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
 
 def end_table(phase: PhaseFunction) -> Tensor:
     """The two of `at_ends` over the angle, as `look_up` has them, [1 or 3, steps + 1, 2, 2]."""
-    return _end_table(phase.kind, *others_of(phase))
+    return _end_table(_at_rungs(phase, 0))
 
 
-@remember
-def _end_table(kind: PhaseKind, *others: Tensor) -> Tensor:
-    cosines = even_angles(STEPS).to(others[0].device).cos()
-    phase = kind(*(each.double() for each in others), cosines.new_zeros(()))
-    return torch.cat([with_slopes(end) for end in at_ends(phase, cosines)], -1)
+@remember_of_phase
+def _end_table(phase: PhaseFunction) -> Tensor:
+    cosines = even_angles(STEPS).to(phase.numbers[0].device).cos()
+    return torch.cat([with_slopes(end) for end in at_ends(in_double(phase), cosines)], -1)
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
@@ -115,16 +107,13 @@ def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
     phase, kind = medium.seen.phase, medium.seen.phase.kind
     assert phase.cells is not None
     backward = STEEP_STEPS
-    tables = _turned_tables(kind, medium.seen.degree, turns, *_rungs_and_others(phase, backward))
+    tables = _turned_tables(_at_rungs(phase, backward), medium.seen.degree, turns)
     return _look_up(tables.to(phase.cells), _place(kind, phase.cells, backward), angle)[..., 0]
 
 
-def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
-    """The numbers at which tables are kept, [n], and the other numbers of `phase`.
-
-    Of g so many of them are `backward`.
-    """
-    return [_rungs(phase.kind, backward, phase.numbers[0].device), *others_of(phase)]
+def _at_rungs(phase: PhaseFunction, backward: int) -> PhaseFunction:
+    """`phase` at the numbers at which tables are kept; of g so many of them are `backward`."""
+    return phase.with_cells(_rungs(phase.kind, backward, phase.numbers[0].device))
 
 
 def others_of(phase: PhaseFunction) -> list[Tensor]:
@@ -164,22 +153,18 @@ def _rungs(kind: PhaseKind, backward: int, device: torch.device) -> Tensor:
     return torch.arange(EVEN_STEPS + 1, dtype=torch.float64, device=device) / EVEN_STEPS
 
 
-@remember
-def _peak_tables(kind: PhaseKind, degree: int, rungs: Tensor, *others: Tensor) -> Tensor:
-    """Polynomials of S at all `rungs`, and their slopes, [1 or 3, n, 2, steps + 1, 2, K].
-
-    `others` are the numbers of the phase function in front of the one that has the rungs.
-    """
+@remember_of_phase
+def _peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
+    """Polynomials of S at all rungs, and their slopes, [1 or 3, n, 2, steps + 1, 2, K]."""
     # one after the other: weak peaks have short series
-    return _with_slopes([peak_table(kind, degree, *others, rung) for rung in rungs])
+    return _with_slopes([peak_table(phase.with_cells(rung), degree) for rung in phase.numbers[-1]])
 
 
-@remember
-def _turned_tables(
-    kind: PhaseKind, degree: int, turns: int, rungs: Tensor, *others: Tensor
-) -> Tensor:
-    """How turned light scatters towards a camera at all `rungs`, as `_peak_tables`."""
-    return _with_slopes([turned_table(kind, degree, turns, *others, rung) for rung in rungs])
+@remember_of_phase
+def _turned_tables(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
+    """How turned light scatters towards a camera at all rungs, as `_peak_tables`."""
+    rungs = phase.numbers[-1]
+    return _with_slopes([turned_table(phase.with_cells(rung), degree, turns) for rung in rungs])
 
 
 def _with_slopes(tables: Sequence[Tensor]) -> Tensor:

@@ -12,17 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import PhaseFunction, PhaseKind
+from ddrecon.medium.phase import PhaseFunction, remember_of_phase
 from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
 from ddrecon.numerics.chebyshev import evaluate_positive, extrema
 from ddrecon.numerics.decay import decay_mean
-from ddrecon.numerics.legendre import (
-    even_angles,
-    legendre,
-    legendre_at_even_angles,
-    series_weights,
-)
-from ddrecon.numerics.remember import remember
+from ddrecon.numerics.legendre import even_angles, legendre_at_even_angles, series_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +39,6 @@ class SeenPhase:
         """p, [C, *cosine.shape]: what is scattered where no peak was scaled out."""
         return self.phase.value(cosine)
 
-    def at(self, depth: Tensor, cosine: Tensor) -> Tensor:
-        """S(x, w) of E13, [C, ...], summed term by term.
-
-        A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
-        `depth` x [C or 1, ...] >= 0: f times the optical depth of scattering from where the light
-        enters, by the point where it turns, to where the view ray leaves; at 0 this is p.
-        `cosine`: broadcast against one color of `depth`.
-        """
-        weights = peaked_series(self.phase, self.degree, depth[..., None])
-        rows = legendre(cosine, weights.shape[-1])
-        return (weights * rows).sum(-1).clamp(min=0)
-
     def along(self, depth: Tensor, cosine: Tensor) -> Tensor:
         """S at `depth` [N, C, R] along R rays, each with one `cosine` [R]."""
         return evaluate_positive(self.polynomials(cosine)[:, None], depth)
@@ -78,8 +60,7 @@ class SeenPhase:
 
         At even angles, with slopes by the angle (`numerics.angle_table`), in double precision.
         """
-        kind, numbers = self.phase.kind, self.phase.numbers
-        return peak_table(kind, self.degree, *numbers) if has_peak else _plain_table(kind, *numbers)
+        return peak_table(self.phase, self.degree) if has_peak else _plain_table(self.phase)
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
@@ -101,19 +82,23 @@ def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
     return series_weights(chi - peak + peak * turned)
 
 
-@remember
-def _plain_table(kind: PhaseKind, *numbers: Tensor) -> Tensor:
-    cosines = even_angles(STEPS).to(numbers[0].device).cos()
-    return with_slopes(kind(*(each.double() for each in numbers)).value(cosines))
+def in_double(phase: PhaseFunction) -> PhaseFunction:
+    """`phase` in double precision."""
+    return phase.kind(*(each.double() for each in phase.numbers))
 
 
-@remember
-def peak_table(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
-    """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of the phase function of `numbers`."""
-    depths, inverse = (each.to(numbers[0].device) for each in extrema())
+@remember_of_phase
+def _plain_table(phase: PhaseFunction) -> Tensor:
+    cosines = even_angles(STEPS).to(phase.numbers[0].device).cos()
+    return with_slopes(in_double(phase).value(cosines))
+
+
+@remember_of_phase
+def peak_table(phase: PhaseFunction, degree: int) -> Tensor:
+    """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of a phase function."""
+    depths, inverse = (each.to(phase.numbers[0].device) for each in extrema())
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].
-    phase = kind(*(each.double() for each in numbers))
-    series = peaked_series(phase, degree, depths[None, :, None])
+    series = peaked_series(in_double(phase), degree, depths[None, :, None])
     coefficients = (inverse @ series).mT
     curves = legendre_at_even_angles(STEPS, coefficients.shape[1])
     return torch.stack([rows.to(coefficients) @ coefficients for rows in curves], 2)

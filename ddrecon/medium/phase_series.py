@@ -10,11 +10,7 @@ from torch import Tensor
 
 from ddrecon.medium.phase import NEGLIGIBLE, PhaseFunction
 from ddrecon.numerics.angle_table import angle_of, look_up, with_slopes
-from ddrecon.numerics.legendre import (
-    COUNTS,
-    gauss_legendre,
-    legendre,
-)
+from ddrecon.numerics.legendre import COUNTS, gauss_legendre, legendre
 
 NODES = 2048
 """Of the quadrature over a table: twice as many as its steps, so that it sees its cubics."""
@@ -51,9 +47,6 @@ class Tabulated(PhaseFunction):
         peak = torch.minimum(chi[:, degree + 1 : degree + 2], chi[:, 1:2]).clamp(min=0)
         tail = torch.maximum(torch.minimum(chi[:, degree + 2 :], peak), -peak)
         return torch.cat([peak, tail], 1)
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return torch.zeros_like(self.moments(count))
 
     def length(self) -> int:
         large = self.moments(COUNTS[-1]).detach().abs().amax(0) > NEGLIGIBLE

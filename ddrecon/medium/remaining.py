@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import P1_DEGREE, Medium
-from ddrecon.medium.phase import PhaseKind
+from ddrecon.medium.phase import PhaseFunction, remember_of_phase
 from ddrecon.numerics.angle_table import STEPS
 from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
-from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.numerics.remember import is_any_nonzero
 
 
 def remaining_moments(medium: Medium) -> Tensor:
@@ -18,8 +18,14 @@ def remaining_moments(medium: Medium) -> Tensor:
     chi_l are the moments of the phase function of `medium`, f the part of its forward peak. Of one
     that differs from cell to cell they are [L + 1, C or 1, z, y, x].
     """
-    phase = medium.seen.phase
-    return _remaining(phase.kind, medium.forward_fraction, medium.seen.degree, *phase.numbers)
+    return _remaining(medium.seen.phase, medium.forward_fraction, medium.seen.degree)
+
+
+@remember_of_phase
+def _remaining(phase: PhaseFunction, fraction: Tensor, degree: int) -> Tensor:
+    moments = phase.moments(degree + 1).transpose(0, 1)
+    moments = moments if moments.ndim == 5 else moments[..., None, None, None]
+    return (moments - fraction) / (1 - fraction)
 
 
 def unturned_moments(medium: Medium) -> Tensor:
@@ -38,8 +44,13 @@ def backward_fraction(medium: Medium) -> Tensor:
 
     It is [C or 1, z, y, x] where the phase function differs from cell to cell.
     """
-    phase = medium.seen.phase
-    return _backward_fraction(phase.kind, medium.seen.degree, *phase.numbers)
+    return _backward_fraction(medium.seen.phase, medium.seen.degree)
+
+
+@remember_of_phase
+def _backward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
+    fraction = phase.backward_fraction(degree)
+    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
 
 
 def has_backward_peak(medium: Medium) -> bool:
@@ -47,34 +58,14 @@ def has_backward_peak(medium: Medium) -> bool:
     return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
 
 
-def turned_phase(medium: Medium, turns: int) -> Tensor:
+@remember_of_phase
+def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
     """How light that a backward peak has turned scatters once more, towards a camera (E21).
 
     A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
-    moments are chi_l up to the degree of the medium, and chi_l r_l^turns beyond, where r_l are the
-    backward peak's; less the forward peak's, which counts as not scattered.
+    moments are chi_l up to `degree`, and chi_l r_l^turns beyond, where r_l are the backward peak's;
+    less the forward peak's, which counts as not scattered.
     """
-    phase = medium.seen.phase
-    return turned_table(phase.kind, medium.seen.degree, turns, *phase.numbers)
-
-
-@remember
-def _remaining(kind: PhaseKind, fraction: Tensor, degree: int, *numbers: Tensor) -> Tensor:
-    moments = kind(*numbers).moments(degree + 1).transpose(0, 1)
-    moments = moments if moments.ndim == 5 else moments[..., None, None, None]
-    return (moments - fraction) / (1 - fraction)
-
-
-@remember
-def _backward_fraction(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
-    fraction = kind(*numbers).backward_fraction(degree)
-    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
-
-
-@remember
-def turned_table(kind: PhaseKind, degree: int, turns: int, *numbers: Tensor) -> Tensor:
-    """What `turned_phase` returns, of the phase function of `numbers`."""
-    phase = kind(*numbers)
     count = phase.length()
     tail = phase.backward_tail(degree, count - degree - 1).double()
     spread = tail / torch.where(tail[:, :1] > 0, tail[:, :1], 1)

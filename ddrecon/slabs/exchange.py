@@ -94,11 +94,6 @@ def gather_own(own: Tensor, slab: Slab) -> Tensor:
     return _gather(own, slab.axis - 3, slab.sizes)
 
 
-def gather_parts(part: Tensor) -> Tensor:
-    """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
-    return _gather(part[None], -part.ndim - 1, [1] * rank_count())
-
-
 def _gather(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
     """All ranks' `own` parts along `axis` < 0, of `sizes`."""
     begin, size = sum(sizes[: own_rank()]), sizes[own_rank()]

@@ -181,8 +181,8 @@ KINDS: Mapping[str, Kind] = {
     "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": _MEAN_COSINE,
     "phase.weight": _LOBE_WEIGHT,
-    # of one of the two media of a mixture, where it is called media.NAME.g
-    "phase.phases.N.g": _MEAN_COSINE,
+    # of one of two media: the weight of their blend differs from cell to cell, and no other number
+    "media.NAME.g": _MEAN_COSINE,
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
@@ -253,6 +253,5 @@ def pattern_of(name: str) -> str:
         return f"views.NAME.{match[1]}"
     medium, name = split_name(name)
     if medium and name == "g":
-        # two media are a blend: its weight differs from cell to cell, and no number of its parts
-        return "phase.phases.N.g"
-    return re.sub(r"^(lights|phase\.phases)\.[0-9]{1,9}\.", r"\1.N.", name)
+        return "media.NAME.g"
+    return re.sub(r"^lights\.[0-9]{1,9}\.", "lights.N.", name)

@@ -20,29 +20,18 @@ from ddrecon.renderer import solve_light, view_components
 
 pytestmark = pytest.mark.slow
 
-ALBEDOS = (0.5, 0.9, 0.99, 1.0)
-SUNS = (1.0, 0.6, 0.3)
+ALBEDOS = (0.9, 1.0)
+SUNS = (1.0, 0.3)
 """Cosines mu0 of the light with the normal."""
-ROUNDS = (0, 1, 4)
-"""Values of diffusion.transport_rounds."""
-ERRORS = {
-    0: {0.5: 0.036, 0.9: 0.071, 0.99: 0.072, 1.0: 0.063},
-    1: {0.5: 0.006, 0.9: 0.006, 0.99: 0.006, 1.0: 0.006},
-    4: {0.5: 0.008, 0.9: 0.014, 0.99: 0.015, 1.0: 0.013},
-}
-"""By rounds and albedo, bounds on the relative RMS error over all `SUNS` and `VIEWS`. Measured:
-0.0347, 0.0689, 0.0703 and 0.0608 for P1, which is 2.6 to 9.3 % too dark everywhere; at most 0.0047
-after one round and 0.0138 after four, where 50 directions have converged.
+ERRORS = {0: 0.08, 1: 0.006, 4: 0.015}
+"""By rounds, bounds on the relative RMS error over all `SUNS` and `VIEWS`: P1 is 2.6 to
+9.3 % too dark everywhere, and after four rounds 50 directions have converged.
 """
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
 
 
-NODES, WEIGHTS = (
-    scale * values + shift
-    for scale, shift, values in zip(
-        (0.5, 0.5), (0.5, 0), np.polynomial.legendre.leggauss(96), strict=True
-    )
-)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(96)
+NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
 
 
 @cache
@@ -89,13 +78,6 @@ def p1_multiple(albedo: float, sun: float, view: float) -> float:
     return albedo * (a * sun / (view + sun) + b / (1 + decay * view))
 
 
-@each_albedo
-def test_h_has_its_known_integral(albedo: float):
-    assert float(WEIGHTS @ h_at_nodes(albedo)) == pytest.approx(
-        2 / albedo * (1 - math.sqrt(1 - albedo)), rel=1e-5
-    )
-
-
 @pytest.mark.parametrize(
     ("cosine", "value"), [(0.0, 1.0), (0.1, 1.2474), (0.5, 2.0128), (1.0, 2.9078)]
 )
@@ -131,9 +113,9 @@ def test_p1_is_its_own_closed_form(albedo: float):
     )
 
 
-@pytest.mark.parametrize("rounds", ROUNDS)
+@pytest.mark.parametrize("rounds", ERRORS)
 @each_albedo
 def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int):
     found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, rounds=rounds))]
     wanted = [exact(albedo, sun, view) for sun in SUNS for view in VIEWS]
-    assert relative_rms(found, wanted) < ERRORS[rounds][albedo]
+    assert relative_rms(found, wanted) < ERRORS[rounds]

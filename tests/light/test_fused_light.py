@@ -20,10 +20,9 @@ from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.reduced import reduced_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.light.sky import decompose_lights
-from ddrecon.light.skylight import sum_unscattered_sky
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
@@ -40,8 +39,8 @@ pytestmark = pytest.mark.slow
 
 DIRECTIONS = [
     *[(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)],  # along axes
-    *[(1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, 0.5, 0.5), (1.0, 0.0, -1.0)],  # through centers
-    *[(0.3, -0.9, 0.2), (-0.1, 0.2, -0.8), (0.4, 0.2, 0.8), (0.9, 0.05, -0.01), (0.01, 1.0, 0.999)],
+    *[(1.0, -1.0, 1.0), (-1.0, 0.5, 0.5), (1.0, 0.0, -1.0)],  # through centers
+    *[(0.3, -0.9, 0.2), (-0.1, 0.2, -0.8), (0.9, 0.05, -0.01), (0.01, 1.0, 0.999)],
 ]
 SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
 
@@ -80,15 +79,17 @@ def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float,
                 assert_near(found, known, 1e-12)
 
 
-@pytest.mark.parametrize("shape", [(3, 300, 5), (3, 5, 300), (300, 3, 5)], ids=str)
-def test_rows_longer_than_a_block(shape: tuple[int, int, int]):
+@pytest.mark.parametrize("along", range(3))
+def test_rows_longer_than_a_block(along: int):
+    shape = tuple(262 if axis == along else 3 for axis in range(3))
     grid = Grid(shape, (0, 0, 0), tuple(0.2 * cells for cells in shape))
     # Slopes that no small fraction is: through a center of a cell derivatives have a kink.
-    for direction in ((0.8191, 0.1039, -0.2357), (0.2179, -0.7071, 0.4142), (0.3037, 0.2236, 0.9)):
-        heading = torch.nn.functional.normalize(vector(*direction), dim=0)
-        given = grid, random_values(1, *shape), heading, vector(0.5).squeeze()
-        for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
-            assert_near(found, known, 1e-11)
+    direction = [0.2357, -0.3163, 0.4142]
+    direction[along - 1] = 0.8191
+    heading = torch.nn.functional.normalize(vector(*direction), dim=0)
+    given = grid, random_values(1, *shape), heading, vector(0.5).squeeze()
+    for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
+        assert_near(found, known, 1e-11)
 
 
 def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
@@ -186,23 +187,6 @@ def test_single_precision():
     found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 2e-5)
-
-
-@pytest.mark.parametrize("name", NUMBERS)
-def test_tangent_and_adjoint_are_transposes_of_each_other(name: str):
-    scene = scene_of("fields")
-    value = value_of(scene, name).detach()
-    shift = random_values(*value.shape, seed=5)
-    with forward_ad.dual_level():
-        found = fields_of(scene, {name: forward_ad.make_dual(value, shift)}, "warp", 3)
-        tangents = [forward_ad.unpack_dual(each).tangent for each in found]
-    along = sum(
-        float((each * random_values(*each.shape, seed=3)).sum())
-        for each in tangents
-        if each is not None
-    )
-    back = float((gradients(scene, [name], "warp", 3)[-1] * shift).sum())
-    assert along == pytest.approx(back, rel=1e-10)
 
 
 def test_sums_of_a_part_of_the_cells_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch):

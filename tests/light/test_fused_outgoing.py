@@ -18,7 +18,8 @@ from ddrecon.light.outgoing import scatter_towards
 from ddrecon.medium.coefficients import Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.light.fused.outgoing import scatter_fused, scatter_kernel
+from ddrecon.kernels.cell_function import RowFunction
+from ddrecon.light.fused.outgoing import GIVEN, HEADER, VIEW, scatter_fused
 
 pytestmark = pytest.mark.slow
 
@@ -117,6 +118,6 @@ def test_light_of_any_degree(degree: int, has_more: bool):
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    kinds = "scatter", "tangent", "scatter_back<1>"
-    kernels = [scatter_kernel(kind, 3, True, 32) for kind in kinds]
-    assert_compiles(kernels, tmp_path)
+    function = RowFunction(HEADER, "Outgoing<3, 1, 1>", ((3, 1, 1, 1),), 1, VIEW, GIVEN)
+    kinds = "values", "tangents", "cotangents"
+    assert_compiles([function.kernel(kind, 17, 32) for kind in kinds], tmp_path)

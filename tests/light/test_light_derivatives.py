@@ -46,8 +46,6 @@ NUMBERS = [
     if field.name not in ("directions", "up")
 ]
 WAYS: dict[str, dict[str, Any]] = {
-    "isotropic": {},
-    "forward": {"g": 0.4},
     "no model": {"g": 0.4, "model": "none"},
     "camera inside": {"g": -0.3, "view": {"eye": (0.1, 0.1, 0.2), "half_width": 0.8}},
 }
@@ -104,20 +102,3 @@ def test_tangent_adjoint_and_differences_agree(name: str, number: str, way: dict
     size = float(terms.abs().sum())
     assert abs(float(tangent - terms.sum())) < 1e-10 * size
     assert abs(float(difference - terms.sum())) < 1e-6 * size
-
-
-@pytest.mark.parametrize("field", ["density", "g"])
-@pytest.mark.parametrize("name", ["sky with a sun", "point outside", "point inside"])
-def test_the_volume_is_differentiated_under_every_light(name: str, field: str, build):
-    scene = build(WAYS["forward"])
-    value = getattr(scene.volume, field)
-
-    def loss(varied: Tensor) -> Tensor:
-        return render(
-            replace(scene, volume=replace(scene.volume, **{field: varied}), lights=[LIGHTS[name]])
-        ).sum()
-
-    variable = value.clone().requires_grad_()
-    terms = torch.autograd.grad(loss(variable), variable)[0] * shift_of(value)
-    tangent = torch.func.jvp(loss, (value,), (shift_of(value),))[1]
-    assert abs(float(tangent - terms.sum())) < 1e-10 * float(terms.abs().sum())

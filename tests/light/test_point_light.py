@@ -20,7 +20,6 @@ from ddrecon.light.reduced import reduced_light
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import render
-from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
 SHAPE = (5, 4, 6)
@@ -160,35 +159,6 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     torch.testing.assert_close(radiance, expected, rtol=1e-7, atol=0)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5])
-def test_from_afar_a_point_light_is_a_directional_one(g: float):
-    """With irradiance I / r^2, up to the angle r subtends: first order in 1 / r. The depth is found
-    by another quadrature on this coarse grid, of a density that is the same in every cell.
-    """
-    scene = make_scene(torch.ones(*SHAPE, dtype=torch.float64), g=g)
-    towards, errors, distances = (
-        torch.nn.functional.normalize(torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64), dim=0),
-        [],
-        [1e2, 1e3, 1e4],
-    )
-    images = []
-    for distance in (*distances, 1e8):
-        point = PointLight(
-            distance * towards, torch.tensor([3.0], dtype=torch.float64) * distance**2
-        )
-        images.append(render(replace(scene, lights=[point])))
-    errors = [float((image - images[-1]).norm() / images[-1].norm()) for image in images[:-1]]
-    assert convergence_order([1 / distance for distance in distances], errors) == pytest.approx(
-        1, abs=0.05
-    ), errors
-    parallel = render(
-        replace(
-            scene, lights=[DirectionalLight(-towards, torch.tensor([3.0], dtype=torch.float64))]
-        )
-    )
-    assert float((images[-1] - parallel).norm() / parallel.norm()) < 0.1
-
-
 def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
     """The two ways to find depths agree as cells shrink."""
     errors, counts = [], [8, 16, 32]
@@ -212,32 +182,6 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
         errors[-1] < 1e-2
         and convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5
     ), errors
-
-
-@pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
-def test_a_moved_world_looks_the_same(position: tuple[float, ...]):
-    scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_at(position)])
-    image, shift = render(scene), (3.0, -2.0, 5.0)
-    grid, view = scene.volume.grid, scene.views[0]
-    lower, upper = (
-        tuple(c + s for c, s in zip(corner, shift[::-1], strict=True))
-        for corner in (grid.lower, grid.upper)
-    )
-    pose = torch.cat(
-        [
-            view.camera.pose[:, :3],
-            view.camera.pose[:, 3:] + torch.tensor(shift, dtype=torch.float64)[:, None],
-        ],
-        1,
-    )
-    moved = Scene(
-        replace(scene.volume, grid=Grid(SHAPE, lower, upper)),
-        [light_at(tuple(p + s for p, s in zip(position, shift, strict=True)))],
-        [replace(view, camera=replace(view.camera, pose=pose))],
-        scene.render,
-        scene.diffusion,
-    )
-    torch.testing.assert_close(render(moved), image, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])

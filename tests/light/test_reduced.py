@@ -10,10 +10,14 @@ from media import box_grid, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import ReducedLight, ambient_radiance, reduced_light
-from ddrecon.light.skylight import ambient_sky, sum_unscattered_sky
+from ddrecon.light.reduced import (
+    ReducedLight,
+    ambient_sky,
+    reduced_light,
+    sum_unscattered_sky,
+)
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
 
@@ -68,47 +72,6 @@ def test_the_flux_of_a_beam_is_its_mean_times_its_direction():
     torch.testing.assert_close(torch.stack(light_field.source.flux), expected, rtol=1e-14, atol=0)
 
 
-def test_without_a_medium_a_beam_arrives_whole():
-    light = DirectionalLight(
-        torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64),
-        torch.tensor([2.0, 1.0], dtype=torch.float64),
-    )
-    light_field = reduced(box_grid((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64), [light])
-    for color in range(2):
-        expected = torch.full(
-            (3, 4, 2), light.irradiance[color].item() / (4 * math.pi), dtype=torch.float64
-        )
-        torch.testing.assert_close(light_field.source.mean[color], expected, rtol=1e-15, atol=0)
-    assert not light_field.beams[0].mass.any()
-
-
-def test_without_a_medium_ambient_light_is_the_same_everywhere():
-    radiance = torch.tensor([0.7, 2.0], dtype=torch.float64).view(2, 1, 1, 1)
-    light = unscattered_ambient(
-        medium_in(box_grid((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64)), radiance
-    )
-    torch.testing.assert_close(light.mean, radiance.expand(2, 3, 4, 2), rtol=1e-15, atol=0)
-    assert max(float(component.abs().max()) for component in light.flux) < 1e-14
-
-
-def test_ambient_light_is_symmetric_in_a_symmetric_medium():
-    """A homogeneous cube amid empty space: the moments have the symmetries of the cube, and light
-    flows inward.
-    """
-    density = torch.nn.functional.pad(torch.ones(3, 3, 3, dtype=torch.float64), (1,) * 6)
-    medium = medium_in(Grid((5, 5, 5), (0, 0, 0), (1, 1, 1)), density)
-    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
-    for axis in (1, 2, 3):
-        torch.testing.assert_close(light.mean, light.mean.flip(axis), rtol=0, atol=1e-14)
-        torch.testing.assert_close(
-            light.flux[axis - 1], -light.flux[axis - 1].flip(axis), rtol=0, atol=1e-14
-        )
-        torch.testing.assert_close(
-            light.mean, light.mean.transpose(axis, axis % 3 + 1), rtol=0, atol=1e-14
-        )
-        assert bool((light.flux[axis - 1].narrow(axis, 0, 2) > 0).all())
-
-
 def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
     """Each attenuated by kappa z / |cosine|, averaged over the cell; none arrives from the sides,
     which are too far away.
@@ -131,13 +94,6 @@ def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
             mean, flux = mean + weight * average, flux + 3 * weight * cosine * average
         assert light.mean[0, cell, 4, 4].item() == pytest.approx(mean, rel=1e-12)
         assert light.flux[0][0, cell, 4, 4].item() == pytest.approx(flux, rel=1e-10, abs=1e-14)
-
-
-def test_ambient_lights_add_up():
-    like, colors = torch.zeros(1, dtype=torch.float64), [random_values(1), random_values(3, seed=1)]
-    total = ambient_radiance([AmbientLight(color) for color in colors], like)
-    torch.testing.assert_close(total.flatten(), colors[0] + colors[1], rtol=1e-15, atol=0)
-    assert not ambient_radiance([], like).any()
 
 
 def test_beams_add_up():

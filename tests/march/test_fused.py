@@ -151,7 +151,7 @@ EMISSIONS = [
     ("g by cell", OUTSIDE, ["density", "g", *POSE]),
     ("g by cell", OUTSIDE, [*LIGHT, "sigma_s"]),
     ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT]),
-    ("blend by cell", OUTSIDE, ["density", "phase.phases.0.g", "phase.weight"]),
+    ("blend by cell", OUTSIDE, ["density"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
 each_case = pytest.mark.parametrize(

@@ -12,7 +12,14 @@ from typing import Any
 
 import pytest
 import torch
-from media import convergence_order, make_camera, make_scene, march_rays, random_values
+from media import (
+    convergence_order,
+    make_camera,
+    make_scene,
+    march_rays,
+    random_values,
+    summed_series,
+)
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -73,12 +80,12 @@ def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     """Masses are interpolated linearly, and E13 is summed itself, in the fast march as well."""
 
     def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
-        return seen.at(depth.movedim(1, 0), cosine).movedim(0, 1)
+        return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
 
     def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
         if depth is None:
             return seen.value(angle.cos()).movedim(0, 1)
-        return seen.at(depth.movedim(1, 0), angle.cos()).movedim(0, 1)
+        return summed_series(seen, depth.movedim(1, 0), angle.cos()).movedim(0, 1)
 
     monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
     monkeypatch.setattr(SeenPhase, "along", along)
@@ -128,7 +135,7 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
         else:
             # E13: the forward peak spreads the light on its way to the node and to the camera.
             depth = interpolate(grid, emission.peak, points) * (passed + mass)
-            phase = seen.at(depth, cosine)
+            phase = summed_series(seen, depth, cosine)
         arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
         emitted = emitted + scattering * phase * arriving
     # E2 + E3: the integral of tau times that, and tau of the whole way.

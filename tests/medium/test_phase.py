@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from media import box_grid, random_values
+from media import box_grid, random_values, summed_series
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
@@ -122,7 +122,7 @@ def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(
     g: float, depth: float, degree: int
 ):
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
-    found = legendre_moments(seen.at(tensor(depth)[None], torch.tensor(NODES)), 8)[0]
+    found = legendre_moments(summed_series(seen, tensor(depth)[None], torch.tensor(NODES)), 8)[0]
     for moment in range(8):
         rest = g**moment - g ** (degree + 1) if moment <= degree else 0.0
         expected = rest + peak_moment(g, depth, moment, degree)
@@ -136,7 +136,9 @@ def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(
 ):
     cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
     seen, exact = SeenPhase(phase, degree), phase.value(cosine)
-    torch.testing.assert_close(seen.at(tensor(0.0)[None], cosine), exact, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(
+        summed_series(seen, tensor(0.0)[None], cosine), exact, rtol=1e-6, atol=1e-6
+    )
     along = seen.along(torch.zeros(1, len(exact), 101, dtype=torch.float64), cosine)
     torch.testing.assert_close(along[0], exact, rtol=1e-6, atol=1e-6)
 
@@ -160,7 +162,7 @@ def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
     along, exact = (
         seen.along(depth.expand(-1, 1, 41), cosine)[:, 0],
-        seen.at(depth.movedim(1, 0), cosine)[0],
+        summed_series(seen, depth.movedim(1, 0), cosine)[0],
     )
     torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
     assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
@@ -199,13 +201,6 @@ def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, de
     if isinstance(phase, Tabulated | Rayleigh):
         rest = (phase.moments(2)[:, 1] - f) / (1 - f)
         assert bool((rest >= -1e-12).all())
-
-
-def test_the_scaling_has_a_continuous_derivative_at_zero():
-    slopes = torch.autograd.functional.jacobian(
-        lambda g: HenyeyGreenstein(g).forward_fraction(1).sum(), tensor(-1e-9, 1e-9)
-    )
-    assert slopes[0].item() == pytest.approx(slopes[1].item(), abs=1e-8)
 
 
 @pytest.mark.parametrize("g", MEAN_COSINES)

@@ -6,11 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
-from torch import Tensor
+from media import make_scene, random_values
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import use_engine
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
@@ -111,18 +109,6 @@ def test_what_is_absorbed_and_leaks_is_what_came_in(phase: PhaseFunction):
     assert balance_of(scene, light.mean).energy < 1e-12
 
 
-def test_scattering_once_is_linear_in_the_weight():
-    """Where neither lobe has a forward peak."""
-    lobes = -LOBES.abs()
-
-    def image(weight: Tensor) -> Tensor:
-        return render(scene_of(TwoLobe(lobes, weight), model="none"))
-
-    one, other = random_values(2, *SHAPE, seed=6)
-    middle = image(0.25 * one + 0.75 * other)
-    torch.testing.assert_close(middle, 0.25 * image(one) + 0.75 * image(other))
-
-
 @each_field
 def test_cells_without_scattering_have_no_phase_function(phase: PhaseFunction):
     """Their number changes moments of nothing, and its derivative is zero and finite."""
@@ -135,22 +121,3 @@ def test_cells_without_scattering_have_no_phase_function(phase: PhaseFunction):
     assert bool(torch.isfinite(medium.peak).all())
     (bar,) = torch.autograd.grad(render(scene).sum(), number)
     assert bool(torch.isfinite(bar).all()) and bool((bar[..., 5] == 0).all())
-
-
-@pytest.mark.slow
-@each_field
-@pytest.mark.parametrize("rounds", [0, 2])
-def test_both_engines_agree(phase: PhaseFunction, rounds: int):
-    pytest.importorskip("warp")
-
-    def pictures(engine: str) -> tuple[Tensor, ...]:
-        use_engine(engine)
-        number = phase.cells.clone().requires_grad_()
-        scene = scene_of(
-            phase.with_cells(number), transport_rounds=rounds, camera=make_camera(size=(3, 3))
-        )
-        image = render(scene)
-        return image.detach(), *torch.autograd.grad(image.square().sum(), number)
-
-    for fused, plain in zip(pictures("warp"), pictures("torch"), strict=True):
-        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-12)

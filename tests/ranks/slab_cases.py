@@ -37,14 +37,13 @@ from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.engine import current_engine, use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.light.turning import turn_in_cells
+from ddrecon.light.pairs import turn_in_cells
 from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.slabs.exchange import (
     add_halo,
-    gather_parts,
     gather_slabs,
     sum_before,
     sum_slabs,
@@ -81,7 +80,6 @@ def exchange(axis: str) -> Found:
     exchanges: dict[str, Callable[[Tensor], Tensor]] = {
         "add_halo": lambda x: add_halo(x, slab),
         "gather_slabs": lambda x: gather_slabs(add_halo(x, slab), slab),
-        "gather_parts": lambda x: gather_parts(x[:, :3, :3, :3]),
         "sum_before": lambda x: sum_before(x.flatten(1)[:, :19], torch.arange(19) % 3 > 0),
         "sum_slabs": lambda x: sum_slabs(x[:, :3, :3, :3]),
         "swap_layers": lambda x: torch.stack(swap_layers(x[:, :3, :3, :3], x[:, 1:4, 1:4, 1:4])),

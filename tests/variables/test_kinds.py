@@ -32,7 +32,7 @@ MEDIA = (
     " {smoke: {density: 0.7, sigma_a: 1, sigma_s: 3, g: 0.5},"
     " air: {density: 1, sigma_a: 0, sigma_s: 1, phase: {type: rayleigh}}}}"
 )
-PHASES = {"phase.g": LOBES, "phase.weight": LOBES, "phase.phases.N.g": MEDIA}
+PHASES = {"phase.g": LOBES, "phase.weight": LOBES, "media.NAME.g": MEDIA}
 """Volumes that have numbers of phase functions other than g."""
 
 

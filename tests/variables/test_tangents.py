@@ -36,18 +36,7 @@ def images_of(scene: Scene) -> dict[str, Tensor]:
     }
 
 
-NAMES = [
-    "density",
-    "sigma_a",
-    "sigma_s.g",
-    "sigma_t",
-    "albedo.b",
-    "g",
-    "lights.0.irradiance",
-    "lights.0.direction.x",
-    "lights.1.radiance.r",
-]
-NAMES += ["views.view.camera.rotation_y", "views.view.camera.z"]
+NAMES = ["density", "albedo.b", "g", "lights.0.direction.x", "views.view.camera.rotation_y"]
 
 
 @pytest.mark.parametrize("name", NAMES)

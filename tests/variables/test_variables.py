@@ -13,7 +13,6 @@ from ddrecon.errors import UsageError
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import (
-    component_names,
     name_each,
     value_of,
     variable_names,
@@ -26,14 +25,6 @@ SHAPE = (4, 3, 5)
 @pytest.fixture
 def scene() -> Scene:
     return make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
-
-
-def test_every_name_has_a_value_and_putting_it_back_changes_nothing(scene: Scene) -> None:
-    image = render(scene)
-    for name in variable_names(scene):
-        torch.testing.assert_close(
-            render(with_values(scene, {name: value_of(scene, name)})), image, rtol=1e-12, atol=1e-15
-        )
 
 
 @pytest.mark.parametrize(
@@ -116,15 +107,6 @@ def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
         value_of(scene, name)
     with pytest.raises(UsageError):
         with_values(scene, {name: torch.zeros(3)})
-
-
-def test_components_follow_the_order_of_entries(scene: Scene) -> None:
-    for name in variable_names(scene):
-        value = value_of(scene, name)
-        names = component_names(name, value)
-        assert len(names) in (0, value.shape[0] if value.ndim else 0)
-        assert len(set(names)) == len(names)
-    assert component_names("density", torch.zeros(3, 4, 5)) == ()
 
 
 def test_a_twist_belongs_to_its_view_alone(scene: Scene) -> None:

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/kernels/dual.h"
+#include "ddrecon/kernels/cells.h"
 // E3 towards a camera, of light by its moments in angle; `Moments.positive_along` is the
 // definition.
 
@@ -65,161 +65,150 @@ INLINE Dual<F> bent(const Dual<F>& even, const Dual<F>& along, F margin, F least
     return even.chain(found.value, found.by_even, along, found.by_along);
 }
 
-// Light of DEGREE in angle: moments of degree l count times `factors` [DEGREE + 1, colors]. An item
-// is `width` cells of a row in one color. The camera is at a point, or without `is_eye` in a
-// direction.
-template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
-    int nz, ny, nx, width, is_eye, colors, mean_colors, flux_colors, higher_colors;
+// Where the camera is: at a point, or without `is_eye` in a direction; and what cells see of it.
+template <class F> struct View {
+    int ny, nx, is_eye;
     F hz, hy, hx, lz, ly, lx, margin, least;
-    static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
 
-    static INLINE int degree_of(int k) {
-        return (k > 0) + (k > 3) + (k > 8) + (k > 15) + (k > 24) + (k > 35) + (k > 48);
+    // Of the first cell in a row.
+    INLINE void center_of(const Row& row, F* center) const {
+        const long long line = row.start / nx;
+        center[0] = lz + hz * (F(line / ny) + F(0.5));
+        center[1] = ly + hy * (F(line % ny) + F(0.5));
+        center[2] = lx + hx * (F(row.start % nx) + F(0.5));
     }
+};
 
-    struct Row {
-        int color;
-        long long size, start;
-        F z, y, x;
-    };
-    INLINE Row row_of(int item) const {
-        const int parts = nx / width, rows = nz * ny, c = item / (rows * parts);
-        const int row = item / parts - c * rows, begin = item % parts * width;
-        const F z = lz + hz * (F(row / ny) + F(0.5)), y = ly + hy * (F(row % ny) + F(0.5));
-        return {c, (long long)rows * nx,         (long long)row * nx + begin, z,
-                y, lx + hx * (F(begin) + F(0.5))};
-    }
+// Light of DEGREE > 0 in angle, its moments of degree l times a factor. Given are fields: the mean,
+// the flux along z, y and x, all higher moments, and radiance besides (HAS_MORE). And numbers:
+// where the camera is, which VARIES, and the factors.
+template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
+    static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1), INS = COUNT + HAS_MORE;
+    enum { EYE = 0, FACTOR = 3, NUMBERS = 4 + DEGREE };
 
-    // A row of light: `arrays` are the mean, the flux along z, y and x, all higher moments one
-    // after the other, and radiance besides, which has all colors.
-    template <class In> struct Light {
-        In first[4], higher, more;
-        long long step;
-        INLINE decltype(auto) operator()(int k, int i) const {
-            return k < 4 ? first[k][i] : higher[(k - 4) * step + i];
-        }
-    };
-    template <class Arrays> INLINE auto light_of(
-        const Row& row, const Arrays& arrays, int mean_colors, int flux_colors,
-        int higher_colors) const {
-        auto own = [&](int k, int colors) HERE {
-            return arrays(k) + (colors > 1 ? row.color * row.size + row.start : row.start);
-        };
-        Light<decltype(own(0, 1))> found = {};
-        found.step = higher_colors * row.size;
-        UNROLLED
-        for (int k = 0; k < (DEGREE > 0 ? 4 : 1); ++k)
-            found.first[k] = own(k, k > 0 ? flux_colors : mean_colors);
-        if constexpr (DEGREE > 1) found.higher = own(4, higher_colors);
-        if constexpr (HAS_MORE) found.more = own(5, colors);
-        return found;
-    }
-
-    // Harmonics towards the camera, where those of degree 1 are a unit vector, at cell i of a row;
-    // what moments of each degree add; and what all but the mean do.
+    // Harmonics towards the camera, where those of degree 1 are a unit vector, at a cell; what
+    // moments of each degree add; and what all but the mean do.
     template <class N> struct Directed {
         N y[COUNT], sum[DEGREE + 1], along;
     };
-    template <class N, class P, class W, class In> INLINE void direct(
-        const Row& row, int i, const P* point, const W* factor, const Light<In>& light,
-        Directed<N>& found) const {
+    template <class F, class N, class W, class In> static INLINE void direct(
+        const View<F>& view, const F* first, int i, const N* eye, const W* factor, const In* in,
+        Directed<N>& found) {
         N *const y = found.y, v[3];
-        const F center[3] = {row.z, row.y, row.x + hx * F(i)};
+        const F center[3] = {first[0], first[1], first[2] + view.hx * F(i)};
         UNROLLED
-        for (int a = 0; a < 3; ++a) v[a] = is_eye ? point[a] - center[a] : N(point[a]);
+        for (int a = 0; a < 3; ++a) v[a] = view.is_eye ? eye[a] - center[a] : N(eye[a]);
         const N square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], distance = root(square);
         const bool is_there = value_of(distance) > F(0);
-        const N shortened = is_eye ? pick(is_there, F(1) / distance, N(F(0))) : N(F(1));
+        const N shortened = view.is_eye ? pick(is_there, F(1) / distance, N(F(0))) : N(F(1));
         UNROLLED
         for (int a = 0; a < 3; ++a) v[a] = shortened * v[a];
         if constexpr (DEGREE > 1)
             fill_harmonics<F, DEGREE>(
                 v, v[0] * v[0] + v[1] * v[1] + v[2] * v[2], N(F(1)), N(F(0)), y);
         found.along = N(F(0));
-        if constexpr (HAS_MORE) found.along = N(light.more[i]);
+        if constexpr (HAS_MORE) found.along = N(in[COUNT][i]);
         UNROLLED
         for (int l = 1; l <= DEGREE; ++l) {
             found.sum[l] = N(F(0));
             UNROLLED
             for (int k = l * l; k < (l + 1) * (l + 1); ++k) {
                 if (l == 1) y[k] = v[k - 1];
-                found.sum[l] += light(k, i) * y[k];
+                found.sum[l] += in[k][i] * y[k];
             }
             found.along += factor[l] * found.sum[l];
         }
     }
 
-    template <class N, class In, class Arrays> INLINE void scatter(
-        int item, const In& point, const In& factors, const Arrays& arrays, F* radiance) const {
-        const Row row = row_of(item);
-        const auto light = light_of(row, arrays, mean_colors, flux_colors, higher_colors);
-        const N eye[3] = {point[0], point[1], point[2]};
-        N factor[DEGREE + 1];
-        UNROLLED
-        for (int l = 0; l <= DEGREE; ++l) factor[l] = factors[l * colors + row.color];
-        F* out = radiance + row.color * row.size + row.start;
+    template <class F, class N, class In> static INLINE void scatter(
+        const Row& row, const View<F>& view, const In* in, const N* number, F* radiance) {
+        F first[3];
+        view.center_of(row, first);
+        F* out = radiance + row.at;
         INDEPENDENT
-        for (int i = 0; i < width; ++i) {
-            const N even = factor[0] * light(0, i);
-            if constexpr (DEGREE > 0) {
-                Directed<N> found;
-                direct(row, i, eye, factor, light, found);
-                out[i] = change_of(bent(even, found.along, margin, least));
-            } else {
-                out[i] = change_of(pick(value_of(even) < F(0), N(F(0)), even));
-            }
+        for (int i = 0; i < row.width; ++i) {
+            const N even = number[FACTOR] * in[0][i];
+            Directed<N> found;
+            direct(view, first, i, number + EYE, number + FACTOR, in, found);
+            out[i] = change_of(bent(even, found.along, view.margin, view.least));
         }
     }
 
-    // Cotangents in all colors; of factors and of the point, if it varies, `sums` of each item.
-    template <bool POINT_VARIES> INLINE void scatter_back(
-        int item, const F* point, const F* factors, const F* const* arrays, const F* radiance_bar,
-        F* const* bars, F* sums) const {
+    template <class F> static INLINE void scatter_back(
+        const Row& row, const View<F>& view, const F* const* in, const F* number, const F* bar,
+        F* const* out, F* sums) {
         REORDERED
-        typedef typename If<POINT_VARIES, Dual<F, 3>, F>::type N;
-        const Row row = row_of(item);
-        const auto light = light_of(
-            row, [&](int k) HERE { return arrays[k]; }, mean_colors, flux_colors, higher_colors);
-        const auto light_bar =
-            light_of(row, [&](int k) HERE { return bars[k]; }, colors, colors, colors);
-        const F* bar = radiance_bar + row.color * row.size + row.start;
-        N eye[3] = {N(point[0]), N(point[1]), N(point[2])};
-        if constexpr (POINT_VARIES)
+        typedef typename If<VARIES, Dual<F, 3>, F>::type N;
+        const F* const factor = number + FACTOR;
+        F first[3], sum[NUMBERS];
+        N eye[3] = {N(number[0]), N(number[1]), N(number[2])};
+        view.center_of(row, first);
+        if constexpr (VARIES)
             for (int a = 0; a < 3; ++a) eye[a].by[a] = F(1);
-        F factor[DEGREE + 1], factor_bar[DEGREE + 1], eye_bar[3] = {F(0), F(0), F(0)};
         UNROLLED
-        for (int l = 0; l <= DEGREE; ++l) {
-            factor[l] = factors[l * colors + row.color];
-            factor_bar[l] = F(0);
-        }
-        const int count = width;
+        for (int k = 0; k < NUMBERS; ++k) sum[k] = F(0);
         INDEPENDENT
-        for (int i = 0; i < count; ++i) {
+        for (int i = 0; i < row.width; ++i) {
             Directed<N> found;
-            const F even = factor[0] * light(0, i);
-            F even_bar = even < F(0) ? F(0) : bar[i], along_bar = F(0);
-            if constexpr (DEGREE > 0) {
-                direct(row, i, eye, factor, light, found);
-                const Bent<F> whole(even, value_of(found.along), margin, least);
-                even_bar = bar[i] * whole.by_even;
-                along_bar = bar[i] * whole.by_along;
+            direct(view, first, i, eye, factor, in, found);
+            const F even = factor[0] * in[0][i];
+            const Bent<F> whole(even, value_of(found.along), view.margin, view.least);
+            const F even_bar = bar[i] * whole.by_even, along_bar = bar[i] * whole.by_along;
+            sum[FACTOR] += in[0][i] * even_bar;
+            out[0][i] = factor[0] * even_bar;
+            UNROLLED
+            for (int l = 1; l <= DEGREE; ++l) {
+                sum[FACTOR + l] += value_of(found.sum[l]) * along_bar;
+                UNROLLED
+                for (int k = l * l; k < (l + 1) * (l + 1); ++k)
+                    out[k][i] = factor[l] * along_bar * value_of(found.y[k]);
             }
-            factor_bar[0] += light(0, i) * even_bar;
-            light_bar(0, i) = factor[0] * even_bar;
-            UNROLLED
-            for (int l = 1; l <= DEGREE; ++l) factor_bar[l] += value_of(found.sum[l]) * along_bar;
-            UNROLLED
-            for (int k = 1; k < COUNT; ++k)
-                light_bar(k, i) = factor[degree_of(k)] * along_bar * value_of(found.y[k]);
-            if constexpr (HAS_MORE) light_bar.more[i] = along_bar;
-            if constexpr (POINT_VARIES && DEGREE > 0)
-                for (int a = 0; a < 3; ++a) eye_bar[a] += along_bar * found.along.by[a];
+            if constexpr (HAS_MORE) out[COUNT][i] = along_bar;
+            if constexpr (VARIES)
+                for (int a = 0; a < 3; ++a) sum[EYE + a] += along_bar * found.along.by[a];
         }
-        const long long items = (long long)colors * nz * ny * (nx / width);
         UNROLLED
-        for (int l = 0; l <= DEGREE; ++l) sums[l * items + item] = factor_bar[l];
-        for (int a = 0; a < 3; ++a) sums[(DEGREE + 1 + a) * items + item] = eye_bar[a];
+        for (int k = 0; k < NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
     }
 };
+
+template <class Cell, class F> INLINE void find_values(
+    const Row& row, const View<F>& view, const int* channels, const F* const* fields,
+    const F* numbers, F* const* made) {
+    const F* in[Cell::INS];
+    F number[Cell::NUMBERS];
+    row.in_all<Cell::INS>(fields, channels, in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    Cell::scatter(row, view, in, number, made[0]);
+}
+
+template <class Cell, class F> INLINE void find_tangents(
+    const Row& row, const View<F>& view, const int* channels, const F* const* fields,
+    const F* const* d_fields, const F* numbers, const F* d_numbers, F* const* made) {
+    const F *values[Cell::INS], *changes[Cell::INS];
+    F number[Cell::NUMBERS], d_number[Cell::NUMBERS];
+    Changing<F> in[Cell::INS];
+    Dual<F> own[Cell::NUMBERS];
+    row.in_all<Cell::INS>(fields, channels, values);
+    row.in_all<Cell::INS>(d_fields, channels, changes);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.of_color<Cell::NUMBERS>(d_numbers, d_number);
+    UNROLLED
+    for (int k = 0; k < Cell::INS; ++k) in[k] = {values[k], changes[k]};
+    UNROLLED
+    for (int k = 0; k < Cell::NUMBERS; ++k) own[k] = {number[k], d_number[k]};
+    Cell::scatter(row, view, in, own, made[0]);
+}
+
+template <class Cell, class F> INLINE void find_cotangents(
+    const Row& row, const View<F>& view, const int* channels, const F* const* fields,
+    const F* numbers, const F* const* bars, F* const* made, F* sums) {
+    const F* in[Cell::INS];
+    F number[Cell::NUMBERS], *out[Cell::INS];
+    row.in_all<Cell::INS>(fields, channels, in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.in_all<Cell::INS>(made, out);
+    Cell::scatter_back(row, view, in, number, bars[0] + row.at, out, sums);
+}
 
 } // namespace ddrecon

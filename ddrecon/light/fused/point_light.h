@@ -130,7 +130,9 @@ template <class F, int BLOCK> struct Ways {
                         pz.by[0] = py.by[1] = px.by[2] = F(1);
                         return Corners<N>(*this, pz, py, px).look(*this, field);
                     };
-                    const N value = F(0.5) * (look(F(-1)) + look(F(1)));
+                    N value = look(F(1));
+                    if (shift(z, depth) + shift(y, height) + shift(x, width) > F(0))
+                        value = F(0.5) * (value + look(F(-1)));
                     UNROLLED
                     for (int axis = 0; axis < 3; ++axis) {
                         const F own = part[t] * value.by[axis];

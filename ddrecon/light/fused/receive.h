@@ -23,29 +23,25 @@ template <class F> INLINE Dual<F> visible(const Dual<F>& mass, const Dual<F>& de
     return mass.chain(found.value, found.by_mass, depth, found.by_depth);
 }
 
-// What all beams have: fields [channels, cells], weights [L, moments, colors], numbers [L, 4] whose
-// third is the path in a slice. An item is a CHUNK of cells and `lights` from number `light` on.
+// What all beams have: fields [channels, cells], weights [lights, moments, colors], and the path of
+// each in a slice, `steps`. An item is a CHUNK of cells.
 template <class F, int CHUNK> struct Receiver {
     long long cells;
-    int channels, colors, moments, light, lights;
-    const F* numbers;
+    int channels, colors, moments, lights;
 
     INLINE int count_from(long long begin) const {
         return begin + CHUNK < cells ? CHUNK : (int)(cells - begin);
     }
-    INLINE F step(int i) const { return numbers[4 * (light + i) + 2]; }
-    INLINE int weight(int i, int a, int c) const {
-        return ((light + i) * moments + a) * colors + c;
-    }
+    INLINE int weight(int i, int a, int c) const { return (i * moments + a) * colors + c; }
     // Moment number a in color c: the fifth of `arrays` has all but four.
     template <class P> INLINE P moment(P const* arrays, int a, int c) const {
         return a < 4 ? arrays[a] + c * cells : arrays[4] + ((a - 4LL) * colors + c) * cells;
     }
 
-    // Writes to moments `made`, or `adds`, what is received of at most BEAMS beams; as dual numbers
-    // N, given as `In`, its change.
+    // Writes to moments `made` what is received of at most BEAMS beams; as dual numbers N, given as
+    // `In`, its change.
     template <class N, int BEAMS, class In> INLINE void receive(
-        int item, bool adds, In scale, In weights, In field, In entered, F* const* made) const {
+        int item, In field, In scale, In entered, In steps, In weights, F* const* made) const {
         const long long begin = (long long)item * CHUNK;
         const int count = count_from(begin);
         for (int c = 0; c < colors; ++c) {
@@ -55,7 +51,7 @@ template <class F, int CHUNK> struct Receiver {
             N seen[BEAMS][CHUNK];
             for (int i = 0; i < lights; ++i) {
                 const In e = entered + ((i * channels + channel) * cells + begin);
-                const N along = step(i) * s;
+                const N along = s * steps[i];
                 INDEPENDENT
                 for (int t = 0; t < count; ++t) seen[i][t] = visible(s * e[t], along * f[t]);
             }
@@ -67,18 +63,16 @@ template <class F, int CHUNK> struct Receiver {
                     for (int t = 0; t < count; ++t) sums[t] += own * seen[i][t];
                 }
                 F* __restrict out = moment(made, a, c) + begin;
-                for (int t = 0; t < count; ++t)
-                    out[t] = (adds ? out[t] : F(0)) + change_of(sums[t]);
+                for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);
             }
         }
     }
 
     // Adds the field's cotangent, and writes that of what `entered`; where it `varies`, `sums`
-    // [lights, 1 + (1 + moments) colors] of the step, scales and weights. Moments that have one: a
-    // bit each.
+    // [lights, 1 + (1 + moments) colors] of the step, scales and weights.
     INLINE void receive_back(
-        int item, int first_item, bool varies, int has_bar, const F* scale, const F* weights,
-        const F* field, const F* entered, const F* const* bars, F* entered_bar, F* field_bar,
+        int item, int first_item, bool varies, const F* field, const F* scale, const F* entered,
+        const F* steps, const F* weights, const F* const* bars, F* field_bar, F* entered_bar,
         double* sums) const {
         const long long begin = ((long long)item + first_item) * CHUNK;
         const int count = count_from(begin);
@@ -86,7 +80,7 @@ template <class F, int CHUNK> struct Receiver {
             const int one = i / channels, channel = i % channels;
             const F* __restrict e = entered + i * cells + begin;
             const F* __restrict f = field + channel * cells + begin;
-            const F own_step = step(one);
+            const F own_step = steps[one];
             double* found = sums + ((long long)item * lights + one) * (1 + (1 + moments) * colors);
             F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
             for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
@@ -96,7 +90,6 @@ template <class F, int CHUNK> struct Receiver {
                 F bar[CHUNK], seen[CHUNK], of_scale[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
-                    if (!(has_bar >> (a < 4 ? a : 4) & 1)) continue;
                     const F own = weights[weight(one, a, c)];
                     const F* __restrict from = moment(bars, a, c) + begin;
                     for (int t = 0; t < count; ++t) bar[t] += own * from[t];
@@ -115,7 +108,6 @@ template <class F, int CHUNK> struct Receiver {
                 found[0] += total(of_step, count);
                 found[1 + c] = total(of_scale, count);
                 for (int a = 0; a < moments; ++a) {
-                    if (!(has_bar >> (a < 4 ? a : 4) & 1)) continue;
                     const F* __restrict from = moment(bars, a, c) + begin;
                     for (int t = 0; t < count; ++t) of_scale[t] = from[t] * seen[t];
                     found[1 + (1 + a) * colors + c] = total(of_scale, count);

@@ -10,123 +10,124 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 CHUNK = 512
 """Cells that one item does on a processor; on a GPU it is one."""
-
 MOST_BEAMS = 16
 """So many beams at most are received at once."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 
-_SHARED = "cells, channels, colors, moments, light, lights, numbers"
-_ARRAYS = "scale", "weights", "field", "entered"
-_GIVEN = """
-long cells; int first_item, channels, colors, moments, light, lights, adds, varies, has_bar;
-F *numbers, *scale, *weights, *field, *entered
-"""
-"""`has_bar` says which moments have cotangents, a bit each, of which the last is for `higher`."""
+
+def receive(
+    field: Tensor, scale: Tensor, entered: Tensor, steps: Tensor, weights: Tensor
+) -> tuple[Tensor, ...]:
+    """Moments of L beams together: `weights` [L, moments, C] times tau, averaged over cells.
+
+    `field` [K, z, y, x] and `scale` [C] of the extinction; `entered` [L, K, z, y, x]: the mass up
+    to where beams enter cells; `steps` [L] [u]: their paths in these. The first is the mean
+    [C, z, y, x], then come three of a flux, and all others [moments - 4, C, z, y, x].
+    """
+    moments: tuple[Tensor, ...] = _Received.apply(field, scale, entered, steps, weights)
+    return moments
+
+
+class _Received(torch.autograd.Function):
+    """What `receive` returns."""
+
+    @staticmethod
+    def forward(*tensors: Tensor) -> tuple[Tensor, ...]:
+        return _receive("receive", tensors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        keep(ctx, *inputs)
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        field, _, entered, _, weights = ctx.saved_tensors
+        _, needs_scale, _, needs_steps, needs_weights = ctx.needs_input_grad
+        varies = needs_scale or needs_steps or needs_weights
+        lights, moments, colors = weights.shape
+        given = _given(ctx.saved_tensors) | {"varies": varies, "bars": _five(bars)}
+        field_bar, entered_bar = field.new_zeros(field.shape), field.new_empty(entered.shape)
+        made = {"field_bar": field_bar, "entered_bar": entered_bar}
+        items, _ = cut(field[0].numel(), CHUNK, field)
+        width = 1 + (1 + moments) * colors
+        found = field.new_zeros(lights, width, dtype=torch.float64)
+        part = max(1, MOST_SUMS // found.numel()) if varies else items
+        for first in range(0, items, part):
+            count = min(part, items - first)
+            sums = found.new_zeros(count * varies, lights, width)
+            kernel = receive_kernel("receive_back", 8 * field.element_size())
+            kernel.launch(count, given | {"first_item": first}, made | {"sums": sums})
+            found += sums.sum(0)
+        if not varies:
+            return field_bar, None, entered_bar, None, None
+        steps_bar, scale_bar, weights_bar = found.to(field).split([1, colors, moments * colors], 1)
+        weights_bar = weights_bar.reshape(weights.shape)
+        return field_bar, scale_bar.sum(0), entered_bar, steps_bar[:, 0], weights_bar
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = tensors[:5], tensors[5:]
+            pairs = zip(values, d_values, strict=True)
+            changes = [torch.zeros_like(one) if d_one is None else d_one for one, d_one in pairs]
+            return _receive("tangent", values, changes)
+
+        d_moments: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_moments
+
+
+_ARRAYS = "field", "scale", "entered", "steps", "weights"
+_SIZES = "cells, channels, colors, moments, lights"
+
+
+def _given(tensors: Sequence[Tensor]) -> dict[str, Any]:
+    """What all kernels are given."""
+    field, weights, given = tensors[0], tensors[-1], dict(zip(_ARRAYS, tensors, strict=True))
+    lights, moments, colors = weights.shape
+    sizes = field[0].numel(), len(field), colors, moments, lights
+    return given | dict(zip(_SIZES.split(", "), sizes, strict=True))
+
+
+def _receive(
+    kind: str, tensors: Sequence[Tensor], changes: Sequence[Tensor] = ()
+) -> tuple[Tensor, ...]:
+    """Moments, or of kind "tangent" their changes."""
+    given, (field, *_) = _given(tensors), tensors
+    given |= {f"d_{name}": change for name, change in zip(_ARRAYS, changes, strict=False)}
+    moments, shape = given["moments"], (given["colors"], *field.shape[1:])
+    made = [field.new_empty(shape) for _ in range(min(moments, 4))]
+    made += [field.new_empty(moments - 4, *shape)] if moments > 4 else []
+    items, _ = cut(field[0].numel(), CHUNK, field)
+    receive_kernel(kind, 8 * field.element_size()).launch(items, given, {"made": _five(made)})
+    return tuple(made)
+
+
+def _five(moments: Sequence[Tensor]) -> list[Tensor | None]:
+    """`moments` as kernels have them, None for those that are missing."""
+    return [*moments, *[None] * (5 - len(moments))]
 
 
 @functools.cache
 def receive_kernel(kind: str, bits: int) -> TextKernel:
     """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
     arrays, more, made = ", ".join(_ARRAYS), "F *made[5]", "made"
-    call = f"receive<F, {MOST_BEAMS}>(item, adds, {arrays}, made)"
+    call = f"receive<F, {MOST_BEAMS}>(item, {arrays}, made)"
     if kind == "tangent":
         pairs = ", ".join(f"Changing<F>{{{one}, d_{one}}}" for one in _ARRAYS)
-        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, adds, {pairs}, made)"
+        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, {pairs}, made)"
         more = ", ".join([more, *(f"*d_{one}" for one in _ARRAYS)])
     elif kind == "receive_back":
-        own = "bars, entered_bar, field_bar, sums"
-        call = f"receive_back(item, first_item, varies, has_bar, {arrays}, {own})"
-        more = "F *bars[5], *entered_bar, *field_bar; double *sums"
-        made = "entered_bar field_bar sums"
-    text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SHARED}}};\nreceiver.{call};"
-    given = f"{_GIVEN}; {more}"
+        own = "bars, field_bar, entered_bar, sums"
+        call = f"receive_back(item, first_item, varies, {arrays}, {own})"
+        more = "F *bars[5], *field_bar, *entered_bar; double *sums"
+        made = "field_bar entered_bar sums"
+    text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SIZES}}};\nreceiver.{call};"
+    given = "long cells; int first_item, channels, colors, moments, lights, varies;"
+    given += f" F *{', *'.join(_ARRAYS)}; {more}"
     return TextKernel(f"beams_{kind}", bits, text, given, made, "light/fused/receive.h")
-
-
-class Receiver:
-    """What cells receive of L beams: the same for all of them, as kernels read it.
-
-    `field` [K, z, y, x], `scale` [C], `numbers` [L, 4] and `weights` [L, moments, C].
-    """
-
-    def __init__(self, field: Tensor, scale: Tensor, numbers: Tensor, weights: Tensor):
-        self.field, self.colors, self.moments = field, weights.shape[2], weights.shape[1]
-        self.bits, cells = field.element_size() * 8, field[0].numel()
-        self.items, _ = cut(cells, CHUNK, field)
-        self.given: dict[str, Any] = {
-            "cells": cells,
-            "channels": len(field),
-            "colors": self.colors,
-            "moments": self.moments,
-            "numbers": numbers,
-            "scale": scale.contiguous(),
-            "weights": weights.contiguous(),
-            "field": field.contiguous(),
-        }
-
-    def new_moments(self) -> list[Tensor]:
-        """Uninitialized moments of all colors: the mean, three of the flux, and all others."""
-        shape = self.colors, *self.field.shape[1:]
-        found = [self.field.new_empty(shape) for _ in range(min(self.moments, 4))]
-        if self.moments > 4:
-            found.append(self.field.new_empty(self.moments - 4, *shape))
-        return found
-
-    def receive(
-        self, light: int, entered: Tensor, moments: Sequence[Tensor], **d_given: Tensor | None
-    ) -> None:
-        """Writes what is received of beams from number `light` on to `moments`; adds of the others.
-
-        `entered` [n, K, z, y, x]: the mass that n of them pass up to where they enter each cell.
-        With changes `d_given` of that, and of the field, scale and weights, it is the change.
-        """
-        given = self.given | {
-            "light": light,
-            "lights": len(entered),
-            "adds": light > 0,
-            "entered": entered,
-        }
-        for name, change in d_given.items():
-            given[name] = torch.zeros_like(given[name[2:]]) if change is None else change
-        kernel = receive_kernel("tangent" if d_given else "receive", self.bits)
-        kernel.launch(self.items, given, {"made": _five(moments)})
-
-    def adjoint(
-        self,
-        light: int,
-        entered: Tensor,
-        bars: Sequence[Tensor | None],
-        field_bar: Tensor,
-        varies: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """The cotangent of `entered`, and if it `varies` those [n, ...] of step, scale and weights.
-
-        Arguments as of `receive`; `bars`: of the moments, None for zero. Adds to the cotangent of
-        the field.
-        """
-        lights, entered_bar = len(entered), torch.zeros_like(entered)
-        own = {"light": light, "lights": lights, "varies": varies, "entered": entered}
-        own["has_bar"] = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
-        given = self.given | own | {"bars": _five(bars)}
-        made = {"entered_bar": entered_bar, "field_bar": field_bar}
-        width = 1 + (1 + self.moments) * self.colors
-        part = max(1, MOST_SUMS // (lights * width)) if varies else self.items
-        found = entered.new_zeros(lights, width, dtype=torch.float64)
-        if not own["has_bar"]:
-            return entered_bar, found
-        for first in range(0, self.items, part):
-            items = min(part, self.items - first)
-            sums = found.new_zeros(items * varies, lights, width)
-            given["first_item"] = first
-            receive_kernel("receive_back", self.bits).launch(items, given, made | {"sums": sums})
-            found += sums.sum(0)
-        return entered_bar, found if varies else None
-
-
-def _five(moments: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """`moments` as kernels have them, None for those that are missing."""
-    return [*moments, *[None] * (5 - len(moments))]

@@ -1,4 +1,4 @@
-"""The mass that a beam passes on its way to each cell, by fused kernels, and its adjoint.
+"""The mass that beams pass on their way to each cell, by fused kernels, and its derivatives.
 
 Rays gather the field of all slices, one row of rays at a time; cells gather from rays. The same in
 the other order for the adjoint: in no step do two items write to the same place.
@@ -8,32 +8,68 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.kernels.text import TextKernel
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 
 BLOCK = 256
 """Neighbors in a row that one item does on a processor; on a GPU it is one."""
 
 
+def sum_masses(
+    field: Tensor, grid: Grid, directions: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """The mass [L, K, z, y, x] up to where each beam enters each cell, and its path in a slice [L].
+
+    Arguments as of `light.shear.sum_masses`; differentiated in forward mode by `field` and `bound`
+    alone.
+    """
+    shears, numbers = _cross(grid, directions)
+    bounds = torch.as_tensor(bound).to(numbers).expand(len(numbers), 1)
+    numbers = torch.cat([numbers, bounds], 1)
+    has_adjoint = torch.is_grad_enabled() and (field.requires_grad or numbers.requires_grad)
+    entered, *_ = _Masses.apply(shears, has_adjoint, field, numbers)
+    return entered, numbers[:, 2]
+
+
+@remember
+def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear, ...], Tensor]:
+    """How beams along `directions` [L, 3] cross slices, and the numbers [L, 3] of each.
+
+    These are the slope by rows and by columns, and the path in a slice [u].
+    """
+    speed = directions / directions.new_tensor(grid.spacing)
+    slicings = [Slicing.of(each) for each in speed.tolist()]
+    order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
+    ordered = speed.gather(1, torch.tensor(order, device=speed.device))
+    fastest = ordered[:, 2:].abs()
+    slope = ordered[:, :2] / fastest
+    shears = tuple(Shear(grid, *each) for each in zip(slicings, slope.tolist(), strict=True))
+    return shears, torch.cat([slope, 1 / fastest], 1)
+
+
 class Shear:
     """How a beam of some `slope` (by rows, by columns) crosses the slices of `grid`.
 
-    Kernels want the columns of slices beside each other in memory: `lay` sees to that, and `lift`
-    brings cells back.
+    Kernels want the columns of slices beside each other in memory: `turn` sees to that, and brings
+    cells back.
     """
 
-    def __init__(self, grid: Grid, slicing: Slicing, slope: tuple[float, float]):
-        self.axis = slicing.axis
-        count, height, width = (grid.shape[a] for a in (self.axis, *across(self.axis)))
+    def __init__(self, grid: Grid, slicing: Slicing, slope: Sequence[float]):
+        self.is_across_x = slicing.axis == 2
+        count, height, width = (grid.shape[a] for a in (slicing.axis, *across(slicing.axis)))
         more = [math.floor(abs(s) * (count - 1) + 1e-9) + 1 for s in slope]
         # A row of one slice is followed by the same row of the next, but for slices across z.
-        is_slices_first = self.axis != 0
+        is_slices_first = slicing.axis != 0
         slice_stride, row_stride = (
             (width, count * width) if is_slices_first else (height * width, width)
         )
@@ -55,90 +91,100 @@ class Shear:
         }
         self.window = count * (height + 3) * (width + 3)
 
-    def lay(self, cells: Tensor) -> Tensor:
-        """`cells` [K, z, y, x] as kernels read them."""
-        return (cells.transpose(2, 3) if self.axis == 2 else cells).contiguous()
+    def turn(self, cells: Tensor) -> Tensor:
+        """`cells` [K, z, y, x, ...] as kernels read and write them, and these as cells again."""
+        return cells.transpose(2, 3).contiguous() if self.is_across_x else cells.contiguous()
 
-    def lift(self, laid: Tensor) -> Tensor:
-        """What `lay` makes of cells, as cells [K, z, y, x]."""
-        return laid.transpose(2, 3).contiguous() if self.axis == 2 else laid
-
-    def sum(self, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False) -> Sum:
-        """The mass of `laid`."""
-        return Sum(self, laid, numbers, light, has_adjoint)
-
-    def items(self, field: Tensor) -> tuple[int, int]:
-        """How many items kernels of rays have, and those of cells."""
-        block, record = 1 if field.is_cuda else BLOCK, self.record
-        rays = (record["rows"] + 3) * math.ceil(record["columns"] / block)
-        cells = record["slices"] * record["height"] * math.ceil(record["width"] / block)
-        return len(field) * rays, len(field) * cells
+    def launch(self, name: str, given: dict[str, Any], made: dict[str, Any]) -> Tensor:
+        """Runs a kernel for all rays, or all cells, of a `field`; the sum of its `sums`, if any."""
+        laid, record, varies = given["field"], self.record, given.get("varies", False)
+        lines, length = record["rows"] + 3, record["columns"]
+        if not name.startswith("sum"):
+            lines, length = record["slices"] * record["height"], record["width"]
+        items = len(laid) * lines * math.ceil(length / (1 if laid.is_cuda else BLOCK))
+        sums = laid.new_zeros(items * varies, 4, dtype=torch.float64)
+        made = made | ({"sums": sums} if "varies" in given else {})
+        getattr(shear_kernels(laid.element_size() * 8), name).launch(items, record | given, made)
+        return sums.sum(0)
 
 
-class Sum:
-    """The mass of `laid`, a field as `shear` lays it, up to where a beam enters each cell.
+class _Masses(torch.autograd.Function):
+    """The mass, and where it `has_adjoint` what that needs.
 
-    Row `light` of `numbers` [L, 4] holds the beam's slope by rows and by columns, its path in a
-    slice [u] and the bound of corrections. `entered` is laid out as the field is. Only where it
-    `has_adjoint` what that needs is kept.
+    Row l of `numbers` [L, 4] holds the slope of beam l by rows and by columns, its path in a slice
+    [u] and the bound of corrections.
     """
 
-    def __init__(
-        self, shear: Shear, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False
-    ):
-        self.shear, self.laid = shear, laid
-        self.entered = torch.empty_like(laid)
-        windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
-        self.masses, self.corrections = windows[0], windows[-1]
-        self.given = shear.record | {"light": light, "numbers": numbers, "field": laid}
-        made = {"masses": self.masses, "corrections": self.corrections if has_adjoint else None}
-        kernels = shear_kernels(laid.element_size() * 8)
-        rays, cells = shear.items(laid)
-        kernels.sum_along_rays.launch(rays, self.given, made)
-        kernels.carry_to_cells.launch(cells, self.given | made, {"entered": self.entered})
+    @staticmethod
+    def forward(
+        shears: Sequence[Shear], has_adjoint: bool, field: Tensor, numbers: Tensor
+    ) -> tuple[Tensor, ...]:
+        entered, laid = field.new_empty(len(shears), *field.shape), _lay(shears, field)
+        kept = []
+        for light, shear in enumerate(shears):
+            given = {"light": light, "numbers": numbers, "field": laid[shear.is_across_x]}
+            windows = field.new_empty(1 + has_adjoint, len(field) * shear.window)
+            made = {"masses": windows[0], "corrections": windows[1] if has_adjoint else None}
+            shear.launch("sum_along_rays", given, made)
+            own = torch.empty_like(laid[True]) if shear.is_across_x else entered[light]
+            shear.launch("carry_to_cells", given | made, {"entered": own})
+            if shear.is_across_x:
+                entered[light] = own.transpose(2, 3)
+            kept += [windows] if has_adjoint else []
+        return entered, *kept
 
-    def adjoint(self, entered_bar: Tensor, field_bar: Tensor, varies: bool) -> Tensor | None:
-        """The cotangent [4] of the beam's numbers, if it `varies`; adds to that of the field.
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.shears, _, *tensors = inputs
+        ctx.mark_non_differentiable(*output[1:])
+        keep(ctx, *tensors, *output[1:])
 
-        To be called once. All cotangents are laid out as the field is.
-        """
-        kernels, (rays, cells) = (
-            shear_kernels(self.laid.element_size() * 8),
-            self.shear.items(self.laid),
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, entered_bar: Tensor, *_: Tensor) -> tuple[Any, ...]:
+        field, numbers, *kept = ctx.saved_tensors
+        laid, varies = _lay(ctx.shears, field), ctx.needs_input_grad[3]
+        bars = {key: torch.zeros_like(one) for key, one in laid.items()}
+        numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
+        for light, (shear, own) in enumerate(zip(ctx.shears, kept, strict=True)):
+            windows = own.clone()
+            key, bar = shear.is_across_x, shear.turn(entered_bar[light])
+            given = {"light": light, "numbers": numbers, "field": laid[key]}
+            given |= {"varies": varies, "entered_bar": bar}
+            made = {"masses": windows[0], "corrections": windows[1], "field_bar": bars[key]}
+            made["corrections_bar"] = torch.empty_like(bar)
+            for name in ("carry_back", "sum_back", "look_back"):
+                numbers_bar[light] += shear.launch(name, given, made)
+        field_bar = functools.reduce(
+            torch.add, (bar.transpose(2, 3) if key else bar for key, bar in bars.items())
         )
-        steps = (kernels.carry_back, cells), (kernels.sum_back, rays), (kernels.look_back, cells)
-        given = self.given | {"varies": varies, "entered_bar": entered_bar}
-        made = {"masses": self.masses, "corrections": self.corrections, "field_bar": field_bar}
-        made["corrections_bar"] = torch.empty_like(entered_bar)
-        found = self.laid.new_zeros(4, dtype=torch.float64)
-        for kernel, items in steps:
-            sums = found.new_zeros(items * varies, 4)
-            kernel.launch(items, given, made | {"sums": sums})
-            found += sums.sum(0)
-        return found if varies else None
+        return None, None, field_bar, numbers_bar.to(numbers) if varies else None
+
+    @staticmethod
+    def jvp(
+        ctx: Any, _: None, _has: None, d_field: Tensor | None, d_numbers: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        def change(*tensors: Any) -> Tensor:
+            (field, numbers), (d_field, d_numbers) = tensors[:2], tensors[-2:]
+            pairs, numbers = _with_change(field, d_field), _with_change(numbers, d_numbers)
+            laid, d_entered = _lay(ctx.shears, pairs), []
+            for light, shear in enumerate(ctx.shears):
+                given: dict[str, Any] = {"light": light, "numbers": numbers}
+                given["field"] = laid[shear.is_across_x]
+                made = {"masses": field.new_empty(2 * len(field) * shear.window)}
+                shear.launch("sum_along_rays_tangent", given, made)
+                entered = torch.empty_like(given["field"])
+                shear.launch("carry_to_cells_tangent", given | made, {"entered": entered})
+                d_entered.append(shear.turn(entered[..., 1]))
+            return torch.stack(d_entered)
+
+        d_entered: Tensor = run_plainly(change, *ctx.saved_tensors, d_field, d_numbers)
+        return d_entered, *[None] * (len(ctx.saved_tensors) - 2)
 
 
-def change_sum(
-    shear: Shear,
-    light: int,
-    field: Tensor,
-    d_field: Tensor | None,
-    numbers: Tensor,
-    d_numbers: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """The mass up to where beam number `light` enters cells [K, z, y, x], and its change.
-
-    Of `d_numbers` that of the bound counts.
-    """
-    laid = _with_change(shear.lay(field), None if d_field is None else shear.lay(d_field))
-    kernels, (rays, cells) = shear_kernels(laid.element_size() * 8), shear.items(field)
-    numbers = _with_change(numbers, d_numbers)
-    given = shear.record | {"light": light, "numbers": numbers, "field": laid}
-    masses, entered = laid.new_empty(2 * len(laid) * shear.window), torch.empty_like(laid)
-    kernels.sum_along_rays_tangent.launch(rays, given, {"masses": masses})
-    kernels.carry_to_cells_tangent.launch(cells, given | {"masses": masses}, {"entered": entered})
-    value, change = (shear.lift(each.contiguous()) for each in entered.unbind(-1))
-    return value, change
+def _lay(shears: Sequence[Shear], cells: Tensor) -> dict[bool, Tensor]:
+    """`cells` as kernels read them, for those of `shears` that are across x and for others."""
+    return {key: one.turn(cells) for key, one in {s.is_across_x: s for s in shears}.items()}
 
 
 def _with_change(value: Tensor, change: Tensor | None) -> Tensor:
