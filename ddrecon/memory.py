@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.rounds.fused.jobs import piece_numbers
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.kernels import shares
@@ -133,11 +134,15 @@ def count_threads(device: torch.device) -> int:
 
 def shared_memory(needs: Needs) -> int:
     """Bytes of such copies at most, beyond those of two threads (`kernels.shares`)."""
-    # What view rays meet, fields of matter and light and the mass to each light; or moments.
-    fields = max(MATTER + needs.lights, needs.moments)
-    copy = needs.size * needs.cells * needs.colors * fields
-    adds = needs.varied is not None or needs.has_rounds
-    return min(shares.MOST_BYTES, max(0, needs.threads - 2) * copy) * adds
+    if needs.threads <= 2:
+        return 0
+    x, y, z = needs.resolution
+    # What view rays meet: fields of matter and light, and the mass to each light.
+    of_cells = needs.size * needs.cells * needs.colors * (MATTER + needs.lights)
+    of_rays = min(shares.MOST_BYTES, (needs.threads - 2) * of_cells)
+    piece = needs.size * piece_numbers((z, y, x), needs.colors, needs.moments)
+    pieces = shares.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
+    return max(of_rays * (needs.varied is not None), pieces * piece * needs.has_rounds)
 
 
 def _overhead(needs: Needs, is_short: bool) -> float:
