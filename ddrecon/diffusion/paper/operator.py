@@ -41,7 +41,7 @@ class PrintedOperator:
     @cached_property
     def _pull(self) -> Callable[[Tensor], tuple[Tensor]]:
         forward = replace(self, is_transposed=False).from_neighbors
-        _, pull = torch.func.vjp(forward, torch.zeros_like(self.diagonal))
+        _, pull, *_ = torch.func.vjp(forward, torch.zeros_like(self.diagonal))
         return pull
 
     def apply(self, u: Tensor) -> Tensor:
@@ -58,7 +58,7 @@ class PrintedOperator:
         def applied(diagonal: Tensor, coefficients: Tensor, echo: Tensor) -> Tensor:
             return PrintedOperator(self.stencils, diagonal, coefficients, echo).apply(u)
 
-        _, pull = torch.func.vjp(applied, self.diagonal, self.coefficients, self.echo)
+        _, pull, *_ = torch.func.vjp(applied, self.diagonal, self.coefficients, self.echo)
         diagonal_bar, coefficients_bar, echo_bar = pull(-adjoint)
         return diagonal_bar, coefficients_bar, echo_bar
 
