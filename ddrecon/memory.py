@@ -61,41 +61,6 @@ class Needs:
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
 
-@dataclass(frozen=True)
-class Arrays:
-    """How many numbers are alive at the peak, in each cell, marched node and pixel of all views.
-
-    By what they are for: one array each, whatever the scene (`once`), or of every `color`, `varied`
-    field, or color of L1 (`flux`), of transport rounds (`rounds`) and each moment more than one
-    that they keep (`moments`), of a flux limiter (`limited`).
-    """
-
-    cell: dict[str, int]
-    node: dict[str, int]
-    pixel: int
-
-
-RENDER = Arrays(
-    cell={"once": 19, "color": 7, "flux": 3, "rounds": 9, "moments": 3, "limited": 7},
-    node={"once": 6, "color": 2},
-    pixel=12,  # what rays meet, renders
-)
-OPTIMIZE = Arrays(
-    cell={
-        "once": 14,
-        "varied": 11,
-        "color": 11,
-        "flux": 8,
-        "rounds": 20,
-        "moments": 4,
-        "limited": 29,
-    },
-    node={"color": 24, "varied": 4},
-    pixel=18,  # targets, those of a coarser level, what rays meet, renders
-)
-"""Fitted to arrays that `benchmarks/memory.py --count` finds alive, but for nodes and pixels."""
-
-
 def needs_of(
     grid: Grid,
     phase: PhaseFunction,
@@ -133,20 +98,32 @@ def memory_of(needs: Needs, is_short: bool = False) -> int:
 
     With derivatives where something is optimized. `is_short`: where freed memory is given back.
     """
-    arrays = RENDER if needs.varied is None else OPTIMIZE
-    counts = {
-        "once": 1,
-        "color": needs.colors,
-        "varied": needs.varied or 0,
-        "flux": needs.colors * needs.has_flux,
-        "rounds": needs.colors * needs.has_rounds,
-        "moments": needs.colors * needs.has_rounds * (needs.moments - 1),
-        "limited": needs.colors * needs.is_limited,
-    }
-    in_cells = needs.cells * sum(number * counts[name] for name, number in arrays.cell.items())
-    at_nodes = CHUNK_NODES * sum(number * counts[name] for name, number in arrays.node.items())
-    held = (in_cells + at_nodes) * _overhead(needs, is_short)
-    return int(needs.size * (held + arrays.pixel * needs.pixels)) + shared_memory(needs)
+    alive = CHUNK_NODES * _numbers_at_node(needs) + needs.cells * _numbers_in_cell(needs)
+    held = alive * _overhead(needs, is_short)
+    # Targets, those of a coarser level, what rays meet, renders.
+    in_pixel = 12 if needs.varied is None else 18
+    return int(needs.size * (held + in_pixel * needs.pixels)) + shared_memory(needs)
+
+
+def _numbers_in_cell(needs: Needs) -> float:
+    """How many numbers are alive at the peak in each cell.
+
+    Fitted to arrays that `benchmarks/memory.py --count` finds alive: some whatever the scene,
+    others of every color, or varied field.
+    """
+    colors, rounds, more = needs.colors, needs.has_rounds, needs.moments - 1
+    if needs.varied is None:
+        of_color = 7 + 3 * needs.has_flux + 7 * needs.is_limited + rounds * (9 + 3 * more)
+        return 19 + colors * of_color
+    of_color = 11 + 8 * needs.has_flux + 29 * needs.is_limited + rounds * (20 + 4 * more)
+    return 14 + 11 * needs.varied + colors * of_color
+
+
+def _numbers_at_node(needs: Needs) -> float:
+    """The same at each node that is marched at once."""
+    if needs.varied is None:
+        return 6 + 2 * needs.colors
+    return 24 * needs.colors + 4 * needs.varied
 
 
 def count_threads(device: torch.device) -> int:

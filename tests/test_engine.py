@@ -9,7 +9,7 @@ import pytest
 
 import ddrecon
 from ddrecon import engine
-from ddrecon.engine import ENGINES, PARTS, current_engine, engine_of_parts, engine_versions
+from ddrecon.engine import PARTS, current_engine, engine_of_parts, engine_versions
 from ddrecon.errors import MissingExtraError, UsageError
 
 ADVICE = 'needs warp: pip install "ddrecon[fast]"'
@@ -26,18 +26,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 def missing(monkeypatch: pytest.MonkeyPatch) -> None:
     """warp-lang is not installed."""
     monkeypatch.setattr(engine, "find_spec", {}.get)
-
-
-def test_it_is_public() -> None:
-    assert ddrecon.use_engine is engine.use_engine
-
-
-@pytest.mark.parametrize("name", ENGINES)
-def test_an_engine_is_used_until_another_is(installed: None, name: str) -> None:
-    ddrecon.use_engine(name)
-    assert current_engine() == current_engine() == name
-    ddrecon.use_engine("torch")
-    assert current_engine() == "torch"
 
 
 def test_auto_takes_warp_where_it_is_installed(installed: None) -> None:
@@ -75,11 +63,6 @@ def test_the_environment_chooses(
     assert current_engine() == expected
     ddrecon.use_engine("torch")
     assert current_engine() == "torch"
-
-
-def test_without_a_word_it_is_auto(installed: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DDRECON_ENGINE", raising=False)
-    assert current_engine() == "warp"
 
 
 def test_an_environment_that_cannot_be_is_named(

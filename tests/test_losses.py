@@ -23,13 +23,6 @@ def box(cells: int, side: float = 1.0) -> Grid:
     return Grid((cells,) * 3, (0.0,) * 3, (side,) * 3)
 
 
-def test_l2_is_the_mean_square() -> None:
-    image, target = torch.rand(3, 4, 5), torch.rand(3, 4, 5)
-    assert image_loss("l2", image, target, None) == pytest.approx(
-        float(((image - target) ** 2).sum()) / 60
-    )
-
-
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None:
     image, target = (

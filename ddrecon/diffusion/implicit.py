@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import keep, run_plainly
 
 
 class DifferentiableOperator(Protocol):
@@ -59,14 +59,13 @@ class SolveRecord:
 class SolveMemory:
     """What solves remember between renders: last solutions, to start from, and a record of each.
 
-    `last`, and the `iterations` these took: by kind and transport round. With `is_warm` False every
-    solve starts from zero. `tolerance_floor`: by kind, the tolerance below which nothing is gained;
-    no solve goes below it, whatever it is asked for.
+    `last` is by kind and transport round. With `is_warm` False every solve starts from zero.
+    `tolerance_floor`: by kind, the tolerance below which nothing is gained; no solve goes below it,
+    whatever it is asked for.
     """
 
     is_warm: bool = True
     last: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    iterations: dict[tuple[str, int], int] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
     tolerance_floor: dict[str, float] = field(default_factory=dict)
 
@@ -119,7 +118,6 @@ class SolverWithMemory(Generic[AnyOperator]):
         seconds = perf_counter() - began
         record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
         self.memory.records.append(record)
-        self.memory.iterations[kind, self.round_index] = solution.iterations
         if self.memory.is_warm:
             # Without the graph that the solution is about to get.
             self.memory.last[kind, self.round_index] = solution.value.detach()
@@ -173,29 +171,12 @@ class ImplicitSolve(torch.autograd.Function):
         right = torch.zeros_like(u) if d_source is None else d_source.clone()
         for term in operator.change_terms(d_tensors, u):
             right -= term
-        d_u: Tensor = _Tangent.apply(ctx.solve, ctx.assemble, ctx.prepared, right, *tensors)
+
+        def solve(right: Tensor, *tensors: Tensor) -> Tensor:
+            return ctx.solve("tangent", ctx.assemble(ctx.prepared, *tensors), right)
+
+        d_u: Tensor = run_plainly(solve, right, *tensors)
         return d_u
-
-
-class _Tangent(torch.autograd.Function):
-    """The solution du of E8 for its right side.
-
-    A function of its own, so that torch.func hands it plain tensors, which kernels need.
-    """
-
-    @staticmethod
-    def forward(
-        solve: SolverWithMemory[AnyOperator],
-        assemble: Callable[..., AnyOperator],
-        prepared: dict[Any, Any],
-        right: Tensor,
-        *tensors: Tensor,
-    ) -> Tensor:
-        return solve("tangent", assemble(prepared, *tensors), right)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
 
 
 def solve_diffusion(

@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.separable import Weights, sample_lattice
+from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.slabs.exchange import renew_halo, sum_before
@@ -225,26 +225,25 @@ class Shear:
 
         They fall to zero one cell beyond their outermost centers.
         """
-        places = self._places(slices, shift, self.lattice, self.size, 1)
-        rows, columns = (
-            Weights.at(place, size, fades=True)
-            for place, size in zip(places, self.size, strict=True)
-        )
-        return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
+        # Around each slice lies a ring of zeros.
+        points = self._points(slices, shift, self.lattice, self.size, 1, ring=1)
+        return sample_slices(pad(slices, (1, 1, 1, 1)), points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
-        places = self._places(values, 0.0, self.size, self.lattice, -1)
-        rows, columns = (
-            Weights.at(place, size, has_third_order=third_order is not None)
-            for place, size in zip(places, self.lattice, strict=True)
-        )
-        return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)
+        points = self._points(values, 0.0, self.size, self.lattice, -1)
+        return sample_slices(values, points, third_order).unflatten(-1, self.size)
 
-    def _places(
-        self, like: Tensor, shift: float, points: tuple[int, ...], cells: tuple[int, ...], sign: int
-    ) -> list[Tensor]:
-        """Where rows and columns of `points` fall among those of `cells`, [N, count] in [-1, 1].
+    def _points(
+        self,
+        like: Tensor,
+        shift: float,
+        points: tuple[int, ...],
+        cells: tuple[int, ...],
+        sign: int,
+        ring: int = 0,
+    ) -> Tensor:
+        """Where `points` fall among `cells` and those of a `ring` around, [N, count, 2] in [-1, 1].
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
@@ -255,5 +254,7 @@ class Shear:
         for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
             drift = sign * (index * slope - first)
             position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
-            lines.append((2 * position + 1) / size - 1)
-        return lines
+            lines.append((2 * position + 1 - size) / (size + 2 * ring))
+        rows, columns = lines
+        pairs = torch.broadcast_tensors(columns[:, None], rows[:, :, None])
+        return torch.stack(pairs, -1).flatten(1, 2)

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 Shape = tuple[int, int, int]
 Found = tuple[list[Tensor], list[Tensor]]
-SHAPES: list[Shape] = [(5, 7, 19), (2, 2, 2), (1, 4, 3), (3, 1, 2), (4, 3, 1), (1, 1, 1)]
+SHAPES: list[Shape] = [(5, 7, 19), (1, 4, 3), (3, 1, 2), (4, 3, 1), (1, 1, 1)]
 COLORS = [(1, 1), (1, 3), (3, 3)]
 """Of the medium and of the light."""
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -110,11 +110,11 @@ def assert_equal(find: Callable[[str], Found], error: float) -> None:
 def test_systems_and_fluxes_are_those_of_torch(shape: Shape, colors: tuple[int, int]):
     for kind in itertools.product((False, True), repeat=2):
         assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float64), 1e-12)
-        assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float32), 1e-5)
+    assert_equal(lambda e: problem_of(e, shape, colors, (False, True), torch.float32), 1e-5)
 
 
 @pytest.mark.parametrize("name", ["geometric", "smooth"])
-@pytest.mark.parametrize("shape", [*SHAPES[::2], (35, 3, 70)], ids=str)
+@pytest.mark.parametrize("shape", [(1, 4, 3), (35, 3, 70)], ids=str)
 @pytest.mark.parametrize("shift", [0.0, 0.05], ids=["positive", "negative"])
 def test_closures_are_those_of_torch(name: str, shape: Shape, shift: float):
     """Also where density is negative, as only finite differences have it."""
@@ -130,27 +130,7 @@ def test_closures_are_those_of_torch(name: str, shape: Shape, shift: float):
     for colors, has_fields in itertools.product((1, 3), (False, True)):
         kind = colors, has_fields
         assert_equal(lambda e, k=kind: find(e, *k, torch.float64), 1e-12)
-        assert_equal(lambda e, k=kind: find(e, *k, torch.float32), 1e-5 + 2e-3 * shift)
-
-
-def test_density_alone_gets_one_sum_of_all_colors():
-    """Where only the field varies that coefficients share, kernels sum what goes to it."""
-
-    def find(engine: str) -> Found:
-        use_engine(engine)
-        density, sections = half_empty(4, 5, 6).requires_grad_(), random_values(2, 3)
-        volume = Volume(box_grid((4, 5, 6)), density, *sections, sections.new_tensor(0.4))
-        medium = scale_medium(volume)
-        problem, _ = make_problem(medium, 3, True, torch.float64)
-        problem = DiffusionProblem(
-            medium, Closure("geometric", medium.grid), problem.source, problem.outside, True
-        )
-        operator, right = problem.system
-        flux = problem.flux(right)
-        assert flux is not None
-        return weigh([*operator.conductances, operator.loss, *flux], [density])
-
-    assert_equal(find, 1e-12)
+    assert_equal(lambda e: find(e, 3, True, torch.float32), 1e-5 + 2e-3 * shift)
 
 
 def test_adjoints_are_the_transposes_of_tangents():

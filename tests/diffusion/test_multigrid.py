@@ -12,9 +12,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.diffusion.solvers.coarsening import coarsen
-from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
-from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.grid import Grid
 
@@ -69,16 +68,10 @@ def matrix_of(cycle, shape: tuple[int, ...]) -> Tensor:
     return torch.stack([column.flatten(1) for column in columns], -1)
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_a_cycle_is_symmetric_and_positive_definite(shape: tuple[int, int, int]):
-    operator = uneven(shape)
-    matrix = matrix_of(Level.of(operator).cycle, operator.loss.shape)
-    assert float((matrix - matrix.mT).abs().max()) < 1e-13 * float(matrix.abs().max())
-    assert float(torch.linalg.eigvalsh(matrix).min()) > 0
-
-
-def test_a_cycle_stays_so_at_random_contrasts():
-    operator = patchy(1, 1e6, torch.float64, cells=8)
+@pytest.mark.parametrize("shape", [*SHAPES, None], ids=str)
+def test_a_cycle_is_symmetric_and_positive_definite(shape: tuple[int, int, int] | None):
+    """Of smooth media, and of one whose cells differ at random."""
+    operator = uneven(shape) if shape else patchy(1, 1e6, torch.float64, cells=8)
     matrix = matrix_of(Level.of(operator).cycle, operator.loss.shape)
     assert float((matrix - matrix.mT).abs().max()) < 1e-13 * float(matrix.abs().max())
     assert float(torch.linalg.eigvalsh(matrix).min()) > 0
@@ -115,24 +108,6 @@ def patchy_box(shape: tuple[int, ...]) -> Operator:
         for axis in AXES
     ]
     return Operator((faces[0], faces[1], faces[2]), random_values(2, *shape, seed=9))
-
-
-@pytest.mark.parametrize("cells", [6, 7])
-def test_along_one_axis_the_coarse_operator_is_that_of_its_interpolation(cells: int):
-    """In a row of resistors a current through a face between pairs has the same energy before and
-    after.
-    """
-    faces = random_values(1, 1, 1, cells - 1) + 0.01
-    none = torch.zeros(1, 0, 1, cells), torch.zeros(1, 1, 0, cells)
-    way, coarse = coarsen(
-        Operator((*none, faces), torch.zeros(1, 1, 1, cells, dtype=torch.float64)), 3
-    )
-    step = torch.zeros_like(coarse.loss)
-    step[..., 2:] = 1
-    inner = way.prolong(step).diff(dim=-1)
-    current = inner * faces
-    assert float(inner.sum()) == pytest.approx(1)
-    torch.testing.assert_close(current[..., 3], coarse.conductances[2][..., 1])
 
 
 def coarse_by_resistors(along: Tensor, across: Tensor) -> tuple[list[list[tuple]], Tensor]:
@@ -222,15 +197,6 @@ def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
         3 * multigrid(operator, source, None, 1e-6).iterations
         < conjugate_gradient(operator, source, None, 1e-6).iterations
     )
-
-
-@pytest.mark.parametrize("contrast", [1.0, 1e6])
-def test_the_solution_is_that_of_conjugate_gradients(contrast: float):
-    operator, source = uneven((9, 14, 11), contrast=contrast), random_values(2, 9, 14, 11)
-    found, known = (
-        solve(operator, source, None, 1e-12).value for solve in (multigrid, conjugate_gradient)
-    )
-    torch.testing.assert_close(found, known, rtol=1e-8, atol=0)
 
 
 def test_conductances_shared_by_colors_may_be_given_once():

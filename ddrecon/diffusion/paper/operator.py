@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.paper.stencils import (
-    Stencils,
-    convolve,
-    convolve_transposed,
-    extend,
-    fold,
-)
+from ddrecon.diffusion.paper.stencils import Stencils, convolve, extend
 
 
 @dataclass(frozen=True)
@@ -36,18 +31,18 @@ class PrintedOperator:
         """Sigma5(u) / h^2 and grad u, `[C, 4, z, y, x]`."""
         return convolve(self.echo * extend(u), self.stencils.terms)
 
-    def spread(self, v: Tensor) -> Tensor:
-        """The transpose of the stencils: each cell's `v` times its coefficients, at all they reach.
-
-        `[C, z + 2, y + 2, x + 2]`, ghost cells included.
-        """
-        return convolve_transposed(self.coefficients * v[:, None], self.stencils.terms)
-
     def from_neighbors(self, u: Tensor) -> Tensor:
         """kappa Sigma5(u) / h^2 + Sigma4(u) / (4 h^2), or the transpose of this map."""
         if self.is_transposed:
-            return fold(self.echo * self.spread(u))
+            (transposed,) = self._pull(u)
+            return transposed
         return (self.coefficients * self.terms(u)).sum(1)
+
+    @cached_property
+    def _pull(self) -> Callable[[Tensor], tuple[Tensor]]:
+        forward = replace(self, is_transposed=False).from_neighbors
+        _, pull, *_ = torch.func.vjp(forward, torch.zeros_like(self.diagonal))
+        return pull
 
     def apply(self, u: Tensor) -> Tensor:
         """M u, or its transpose, `[C, z, y, x]`."""
@@ -59,8 +54,13 @@ class PrintedOperator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Those of diagonal, coefficients and echo, for M_bar = -lambda u^T (E9)."""
-        coefficients_bar = adjoint[:, None] * self.terms(u)
-        return -adjoint * u, coefficients_bar, self.spread(adjoint) * extend(u)
+
+        def applied(diagonal: Tensor, coefficients: Tensor, echo: Tensor) -> Tensor:
+            return PrintedOperator(self.stencils, diagonal, coefficients, echo).apply(u)
+
+        _, pull, *_ = torch.func.vjp(applied, self.diagonal, self.coefficients, self.echo)
+        diagonal_bar, coefficients_bar, echo_bar = pull(-adjoint)
+        return diagonal_bar, coefficients_bar, echo_bar
 
     def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
         """dM u by changes of diagonal, coefficients and echo, term by term (E8, Eq. 29)."""

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv3d, conv_transpose3d, pad
+from torch.nn.functional import conv3d, pad
 
-from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 
 
@@ -62,24 +61,9 @@ def extend(u: Tensor) -> Tensor:
     return pad(u, (1,) * 6, mode="replicate")
 
 
-def fold(extended: Tensor) -> Tensor:
-    """The transpose of `extend`: what ghost cells hold is added to their neighbors in the box."""
-    for axis in AXES:
-        low, inside, high = extended.split([1, extended.shape[axis] - 2, 1], dim=axis)
-        extended = inside.clone()
-        extended.narrow(axis, 0, 1).add_(low)
-        extended.narrow(axis, extended.shape[axis] - 1, 1).add_(high)
-    return extended
-
-
 def convolve(extended: Tensor, kernels: Tensor) -> Tensor:
     """Each of the n `kernels` on `extended` [C, z + 2, y + 2, x + 2]: `[C, n, z, y, x]`."""
     return conv3d(extended[:, None], kernels)
-
-
-def convolve_transposed(values: Tensor, kernels: Tensor) -> Tensor:
-    """The transpose of `convolve`: `values` [C, n, z, y, x] to `[C, z + 2, y + 2, x + 2]`."""
-    return conv_transpose3d(values, kernels)[:, 0]
 
 
 def divergence(vector: list[Tensor], stencils: Stencils) -> Tensor:
@@ -97,13 +81,8 @@ def outward(like: Tensor) -> Tensor:
     Its components are those along z, y, x. Ghost cells at edges and corners of the box lie outside
     two or three faces; no stencil reaches them.
     """
-    normals = []
-    for axis, cells in zip(AXES, like.shape[1:], strict=True):
-        line = like.new_zeros(cells + 2)
-        line[0], line[-1] = -1, 1
-        normals.append(
-            line.view([-1 if other == axis else 1 for other in AXES]).expand(
-                [n + 2 for n in like.shape[1:]]
-            )
-        )
-    return torch.stack(normals)
+    lines = [
+        torch.cat([like.new_tensor([-1.0]), like.new_zeros(n), like.new_ones(1)])
+        for n in like.shape[1:]
+    ]
+    return torch.stack(torch.meshgrid(*lines, indexing="ij"))

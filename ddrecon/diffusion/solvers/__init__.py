@@ -1,13 +1,12 @@
-"""Iterative solvers of A u = b, one per file, chosen by name from `SOLVERS`.
+"""Iterative solvers of A u = b, chosen by name from `SOLVERS`.
 
 Each is a function `solve(operator, source, guess, tolerance) -> Solution`. All work on the system
 scaled to a unit diagonal, S A S (S^-1 u) = S b with S = diagonal^(-1/2), and stop when the norm of
 its residual falls below `tolerance` times that of its right side, for every color. To add one:
-write its file, enter it here.
+write it, enter it here.
 """
 
-from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.jacobi import jacobi
-from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
 
 SOLVERS = {"multigrid": multigrid, "conjugate_gradient": conjugate_gradient, "jacobi": jacobi}

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, upper_cells
 
@@ -60,7 +60,9 @@ class Coarsening:
 def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     """`operator` on half as many cells along `axis`, and the way there and back."""
     along = operator.conductances[axis - 1]
-    half = _pad(0.5 / _first(along, axis), axis, (along.shape[axis] + 2) // 2)
+    half = 0.5 / _first(along, axis)
+    # Zeros after it, where the last cell stands alone.
+    half = pad(half, [0, 0] * (3 - axis) + [0, (along.shape[axis] + 2) // 2 - half.shape[axis]])
     resistance = lower_cells(half, axis) + 1 / _second(along, axis) + upper_cells(half, axis)
     way = Coarsening(
         axis,
@@ -123,9 +125,3 @@ def _below(u: Tensor, axis: int) -> Tensor:
 def _above(u: Tensor, axis: int) -> Tensor:
     """The cells on the high side of every face between pairs (a view)."""
     return upper_cells(_first(u, axis), axis)
-
-
-def _pad(u: Tensor, axis: int, size: int) -> Tensor:
-    """`u` with zeros after it, to `size` entries along `axis`."""
-    rest = u.new_zeros([size - n if other == axis else n for other, n in enumerate(u.shape)])
-    return torch.cat([u, rest], axis)

@@ -19,8 +19,10 @@ def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: 
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)
     for iteration in range(MAX_ITERATIONS + 1):
-        if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
-            break
+        if iteration % CHECK_EVERY == 0:
+            relative = float(system.relative(residual).max())
+            if not relative > tolerance:
+                break
         y += residual
         residual = system.matrix.residual(y, system.source)
     if not relative <= tolerance:

@@ -97,18 +97,13 @@ class ScaledSystem:
         helps = self.matrix.norm(residual) < self.source_norm
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
-    def relative(self, residual: Tensor) -> float:
-        """The norm of `residual` over that of the right side, largest over the colors.
+    def relative(self, residual: Tensor) -> Tensor:
+        """The norm of `residual` over that of the right side, `[C, 1, 1, 1]`.
 
         0 for a color without source.
         """
-        return float(self.relative_by_color(residual).max())
-
-    def relative_by_color(self, residual: Tensor) -> Tensor:
-        """The same of each color, `[C, 1, 1, 1]`."""
-        return self.matrix.norm(residual) / self.source_norm.clamp(
-            min=torch.finfo(residual.dtype).tiny
-        )
+        tiny = torch.finfo(residual.dtype).tiny
+        return self.matrix.norm(residual) / self.source_norm.clamp(min=tiny)
 
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 import torch
 from media import box_grid, random_values
@@ -12,11 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion.paper.stencils import (
     Stencils,
     convolve,
-    convolve_transposed,
     divergence,
-    extend,
-    fold,
-    outward,
 )
 from ddrecon.grid import Grid
 
@@ -83,59 +77,6 @@ def test_gradients_of_quadratics_and_laplacians_of_cubics_are_exact(
     )
 
 
-def test_each_stencil_against_indices(grid: Grid, extended: Tensor):
-    stencils = Stencils.on(grid, extended)
-    coefficients, terms = (
-        convolve(extended, stencils.coefficients),
-        convolve(extended, stencils.terms),
-    )
-    for z, y, x in itertools.product(*map(range, SHAPE)):
-        at = extended[:, z : z + 3, y : y + 3, x : x + 3]
-        pairs = [
-            (at[:, 2, 1, 1], at[:, 0, 1, 1]),
-            (at[:, 1, 2, 1], at[:, 1, 0, 1]),
-            (at[:, 1, 1, 2], at[:, 1, 1, 0]),
-        ]
-        gradient = [
-            (high - low) / (2 * h) for (high, low), h in zip(pairs, grid.spacing, strict=True)
-        ]
-        neighbors = sum(
-            (high + low) / h**2 for (high, low), h in zip(pairs, grid.spacing, strict=True)
-        )
-        torch.testing.assert_close(
-            coefficients[:, :, z, y, x],
-            torch.stack([at[:, 1, 1, 1], *gradient], 1),
-            rtol=1e-13,
-            atol=1e-13,
-        )
-        torch.testing.assert_close(
-            terms[:, :, z, y, x], torch.stack([neighbors, *gradient], 1), rtol=1e-13, atol=1e-13
-        )
-
-
-def test_ghost_cells_repeat_their_neighbors():
-    u = random_values(2, *SHAPE)
-    extended = extend(u)
-    assert torch.equal(inside(extended), u)
-    for axis in (1, 2, 3):
-        for ghost, neighbor in ((0, 1), (-1, -2)):
-            assert torch.equal(extended.select(axis, ghost), extended.select(axis, neighbor))
-
-
-def test_transposes(grid: Grid, extended: Tensor):
-    u, v = random_values(2, *SHAPE, seed=1), random_values(2, 4, *SHAPE, seed=2)
-    kernels = Stencils.on(grid, u).terms
-    torch.testing.assert_close(
-        (fold(extended) * u).sum(), (extended * extend(u)).sum(), rtol=1e-13, atol=0
-    )
-    torch.testing.assert_close(
-        (convolve_transposed(v, kernels) * extended).sum(),
-        (v * convolve(extended, kernels)).sum(),
-        rtol=1e-12,
-        atol=0,
-    )
-
-
 def test_the_divergence_of_position_is_three_inside():
     grid = box_grid((3, 4, 5))
     z, y, x = (
@@ -145,13 +86,3 @@ def test_the_divergence_of_position_is_three_inside():
     assert not divergence([torch.ones_like(z)] * 3, stencils).any()
     found = inside(divergence([z, y, x], stencils))
     torch.testing.assert_close(found, torch.full_like(found, 3), rtol=1e-13, atol=0)
-
-
-def test_normals_point_out_of_the_box():
-    normals = outward(random_values(1, *SHAPE))
-    assert not inside(normals).any()
-    for axis in range(3):
-        faces = normals[axis].movedim(axis, 0)
-        assert (
-            bool((faces[0] == -1).all()) and bool((faces[-1] == 1).all()) and not faces[1:-1].any()
-        )

@@ -149,12 +149,11 @@ template <class F> APART double go_up(
     return total;
 }
 
-// What a launch does: the finest level's way down, all coarser levels, the finest's way up. `mine`:
-// right sides and solutions of coarser levels. `parts`: of the slices of a color.
-enum Leg { DOWN, COARSER, UP };
+// From the way down of the finest level to its way up. `mine`: right sides and solutions.
 template <class F>
 APART void coarser_levels(const Grids<F>& grids, int matrix, F* mine, F* memory) {
     int levels[64], count = 0, s = (int)grids.at(0, NEXT);
+    if (s < 0) return;
     for (; grids.at(s, NEXT) >= 0; s = (int)grids.at(s, NEXT)) {
         const int next = (int)grids.at(s, NEXT);
         go_down(
@@ -162,8 +161,8 @@ APART void coarser_levels(const Grids<F>& grids, int matrix, F* mine, F* memory)
             (int)grids.at(next, NZ));
         levels[count++] = s;
     }
-    const int n = (int)(grids.at(s, NZ) * grids.at(s, NY) * grids.at(s, NX));
-    const F* inverse = grids.data + grids.at(s, INVERSE) + (Size)matrix * n * n;
+    const int n = (int)grids.cells(s);
+    const F* inverse = grids.array(s, INVERSE, (Size)matrix * n * n);
     for (int i = 0; i < n; ++i)
         mine[grids.at(s, U) + i] = (F)inner(inverse + i * n, mine + grids.at(s, SOURCE), (Size)n);
     while (count > 0) {
@@ -174,25 +173,25 @@ APART void coarser_levels(const Grids<F>& grids, int matrix, F* mine, F* memory)
             (int)grids.at(s, NZ), false);
     }
 }
-template <class F>
-INLINE void cycle(const Solve<F>& solve, int leg, int parts, F* mine, F* memory) {
-    if (solve.is_done()) return;
+// The finest level's ways down and up, of a share of its slices.
+template <class F> APART void begin_cycle(const Solve<F>& solve, F* mine, F* memory) {
     const Grids<F>& grids = solve.grids;
-    const int matrix = solve.matrix(), after = (int)grids.at(0, NEXT);
+    const int next = (int)grids.at(0, NEXT);
+    if (next < 0) return;
+    go_down(
+        grids, 0, solve.matrix(), solve.vector(R), mine + grids.at(next, SOURCE), memory,
+        solve.divide(next, 0), solve.divide(next, 1));
+}
+template <class F> APART void end_cycle(const Solve<F>& solve, const F* mine, F* memory) {
+    const Grids<F>& grids = solve.grids;
+    const int next = (int)grids.at(0, NEXT);
     const F* const residual = solve.vector(R);
-    const auto divide = [&](int stage, int k) { return (int)(grids.at(stage, NZ) * k / parts); };
-    if (leg == DOWN && after >= 0)
-        go_down(
-            grids, 0, matrix, residual, mine + grids.at(after, SOURCE), memory,
-            divide(after, solve.part), divide(after, solve.part + 1));
-    if (leg == COARSER && after >= 0) coarser_levels(grids, matrix, mine, memory);
-    if (leg != UP) return;
     F* const out = solve.vector(P);
-    double& total = solve.sum(CORRECTED + solve.now);
-    if (after >= 0) {
+    double& total = solve.sum(CORRECTED + solve.now());
+    if (next >= 0) {
         total = go_up(
-            grids, 0, matrix, residual, mine + grids.at(after, U), out, memory,
-            divide(0, solve.part), divide(0, solve.part + 1), true);
+            grids, 0, solve.matrix(), residual, mine + grids.at(next, U), out, memory,
+            solve.divide(0, 0), solve.divide(0, 1), true);
     } else {
         // A single cell: S A S is 1.
         out[0] = residual[0];

@@ -1,11 +1,13 @@
 #pragma once
-#include "ddrecon/diffusion/solvers/fused/levels.h"
+#include "ddrecon/diffusion/solvers/fused/cycle.h"
 // Conjugate gradients (`solvers/multigrid.py`): start, directions, steps.
 
 namespace ddrecon {
 
-// What a launch does: residual of a guess, which start is better, a direction, a step along it.
-enum Act { START, CHOOSE, DIRECT, ADVANCE };
+// What a launch does, of a color's shares: residual of a guess, which start is better, the cycle's
+// way down, its coarser levels (one share does them all), its way up, a direction, a step along it;
+// or whole iterations, of a color that is one share.
+enum Act { START, CHOOSE, DOWN, COARSER, UP, DIRECT, ADVANCE, SOLVE };
 
 // A share of the slices of a color, from which on `cell` are `count` cells.
 template <class F> struct Share {
@@ -16,8 +18,8 @@ template <class F> struct Share {
     INLINE Share(const Solve<F>& solve, F* memory)
         : level(solve.grids.level(0, solve.matrix())),
           slot(memory, level),
-          from((int)((Size)level.nz * solve.part / solve.shares)),
-          to((int)((Size)level.nz * (solve.part + 1) / solve.shares)),
+          from(solve.divide(0, 0)),
+          to(solve.divide(0, 1)),
           cell(from * level.slice),
           count((to - from) * level.slice) {}
 };
@@ -80,15 +82,16 @@ APART void choose(const Solve<F>& solve, const Share<F>& own, const F* source, c
 }
 
 // d, and q = A d.
-template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own, int iteration) {
+template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own) {
     const Level<F>& l = own.level;
     const Slots<F>& slot = own.slot;
     F *const p = solve.vector(P), *const q = solve.vector(Q),
              *const made = solve.vector(D + solve.later());
     const double before_now = solve.above(solve.total(CORRECTED + solve.later()));
-    const F more = iteration == 0 ? F(0) : (F)(solve.total(CORRECTED + solve.now) / before_now);
+    const F more =
+        solve.iteration == 0 ? F(0) : (F)(solve.total(CORRECTED + solve.now()) / before_now);
     // Where nothing is to be added of the direction before, it is not read: it may be anything.
-    const F* const before = iteration == 0 ? p : solve.vector(D + solve.now);
+    const F* const before = solve.iteration == 0 ? p : solve.vector(D + solve.now());
     slot.clear(4);
     double curved = 0.0;
     int ready = own.from > 0 ? own.from - 1 : 0;
@@ -109,14 +112,10 @@ template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own,
 }
 
 // A step of y along d, and r after it.
-template <class F> APART void advance(const Solve<F>& solve, const Share<F>& own, bool is_done) {
-    const int now = solve.now, later = solve.later();
+template <class F> APART void advance(const Solve<F>& solve, const Share<F>& own) {
+    const int now = solve.now(), later = solve.later();
     const Size slice = own.level.slice;
-    solve.sum(COUNT + later) = solve.sum(COUNT + now) + (is_done ? 0.0 : 1.0);
-    if (is_done) {
-        solve.sum(RESIDUAL + later) = solve.sum(RESIDUAL + now);
-        return;
-    }
+    solve.sum(COUNT) += 1.0;
     const F step = (F)(solve.total(CORRECTED + now) / solve.above(solve.total(CURVED)));
     const F *const d = solve.vector(D + later), *const q = solve.vector(Q);
     F *const y = solve.vector(Y), *const r = solve.vector(R);
@@ -133,17 +132,35 @@ template <class F> APART void advance(const Solve<F>& solve, const Share<F>& own
     solve.sum(RESIDUAL + later) = square;
 }
 
-template <class F> INLINE void iterate(
-    const Solve<F>& solve, int act, int iteration, const F* source, const F* guess, F* memory) {
-    const Share<F> own(solve, memory);
-    const Size first = solve.color * own.level.cells;
-    const F *const right = source + first, *const guessed = guess ? guess + first : guess;
+template <class F> INLINE void act(
+    const Solve<F>& solve, int what, const Share<F>& own, const F* source, const F* guess, F* mine,
+    F* memory) {
+    if (what == START) return start(solve, own, source, guess);
     // Before a solve has begun there are no sums yet.
-    if (act == START) return start(solve, own, right, guessed);
-    if (act == CHOOSE) return choose(solve, own, right, guessed);
-    const bool is_done = solve.is_done();
-    if (act == ADVANCE) return advance(solve, own, is_done);
-    if (!is_done) direct(solve, own, iteration);
+    if (what == CHOOSE) return choose(solve, own, source, guess);
+    if (solve.is_done()) {
+        if (what == ADVANCE)
+            solve.sum(RESIDUAL + solve.later()) = solve.sum(RESIDUAL + solve.now());
+        return;
+    }
+    if (what == DOWN) begin_cycle(solve, mine, memory);
+    if (what == COARSER) coarser_levels(solve.grids, solve.matrix(), mine, memory);
+    if (what == UP) end_cycle(solve, mine, memory);
+    if (what == DIRECT) direct(solve, own);
+    if (what == ADVANCE) advance(solve, own);
+}
+// In iteration `first`, or in all up to `last`.
+template <class F> INLINE void iterate(
+    Solve<F> solve, int what, int first, int last, const F* source, const F* guess, F* mine,
+    F* memory) {
+    const Share<F> own(solve, memory);
+    const Size before = solve.color * own.level.cells;
+    const bool is_all = what == SOLVE;
+    for (int i = first; i < (is_all ? last : first + 1); ++i) {
+        solve.iteration = i;
+        for (int k = is_all ? DOWN : what; k <= (is_all ? ADVANCE : what); ++k)
+            act(solve, k, own, source + before, guess ? guess + before : guess, mine, memory);
+    }
 }
 
 } // namespace ddrecon

@@ -24,48 +24,39 @@ def _names(header: str, enum: str) -> dict[str, int]:
 COLUMNS = _names("levels.h", "Column")
 SUMS = _names("levels.h", "Sum")
 VECTORS = _names("levels.h", "Vector")
-LEGS = _names("cycle.h", "Leg")
 ACTS = _names("gradients.h", "Act")
 MAKING = _names("prepare.h", "Step")
-_SOLVE = """
-int item_parts, iteration, matrices, all_colors, shares; double tolerance, tiny, *sums;
-long *table, first_vector, vector_size, scratch_size; F *data, *vectors, *scratch;
-"""
-_ITEM = f"""
-const int color = item / item_parts, part = item - color * item_parts;
-const Solve<F> solve = {{
-    {{table, data, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
-    tolerance, tiny, matrices, all_colors, shares, color, part, iteration & 1}};
-F* const memory = scratch + item * scratch_size;
-"""
 
 
 @functools.cache
 def prepare_kernel(bits: int) -> TextKernel:
     """A step of making a hierarchy, for a share of the cells of a color."""
     text = """
-    const Maker<F> make(table, matrix, is_each, data, work, scratch, item);
-    prepare(make, step, stage, item, colors, parts, finest_parts, strengths);
+    const Maker<F> make(table, matrix, is_each, scratch, item);
+    prepare(make, step, stage, last, item, parts, strengths);
     """
     given = """
-    int step, stage, colors, parts, finest_parts, is_each[4]; long *table;
-    F *matrix[4], *data, *work, *scratch; double *strengths
+    int step, stage, last, parts, is_each[4]; long *table; F *matrix[4], *scratch;
+    double *strengths
     """
-    made = "data work scratch strengths"
-    return TextKernel("prepare", bits, text, given, made, f"{_ROOM}/prepare.h")
+    return TextKernel("prepare", bits, text, given, "scratch strengths", f"{_ROOM}/prepare.h")
 
 
 @functools.cache
-def cycle_kernel(bits: int) -> TextKernel:
-    """A `leg` of the cycle, for one of the parts of the slices of a color."""
-    text = _ITEM + "cycle(solve, leg, item_parts, coarser + color * share, memory);"
-    given, made = _SOLVE + "int leg; F *coarser; long share", "vectors scratch sums coarser"
-    return TextKernel("cycle", bits, text, given, made, f"{_ROOM}/cycle.h")
-
-
-@functools.cache
-def gradient_kernel(bits: int) -> TextKernel:
-    """An `act` of conjugate gradients, for one of the shares of the slices of a color."""
-    text = _ITEM + "iterate(solve, act, iteration, source, guess, memory);"
-    given, made = _SOLVE + "int act; F *source, *guess", "vectors scratch sums"
-    return TextKernel("advance", bits, text, given, made, f"{_ROOM}/gradients.h")
+def solve_kernel(bits: int) -> TextKernel:
+    """An `act` of a solve, for one of the parts of the slices of a color."""
+    text = f"""
+    const int color = item / parts, part = item - color * parts;
+    const Solve<F> solve = {{
+        {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
+        tolerance, tiny, matrices, colors, shares, color, part, 0}};
+    F *const mine = coarser + color * share, *const memory = scratch + item * scratch_size;
+    iterate(solve, act, first, last, source, guess, mine, memory);
+    """
+    given = """
+    int act, first, last, parts, matrices, colors, shares; double tolerance, tiny, *sums;
+    long *table, first_vector, vector_size, scratch_size, share;
+    F *vectors, *scratch, *coarser, *source, *guess
+    """
+    made = "vectors scratch sums coarser"
+    return TextKernel("multigrid", bits, text, given, made, f"{_ROOM}/gradients.h")

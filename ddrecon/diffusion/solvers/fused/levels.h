@@ -10,10 +10,9 @@ namespace ddrecon {
 typedef long long Size;
 
 // What the table says of each stage: how many cells it has; along which AXIS they become pairs, or
-// -1, the coarsest; where a level begins the stage of the NEXT one, else -1; and where arrays
-// begin. Of conductances and loss of A, in `work`; weights of the coarsening, the scaled matrix,
-// and the inverse of the coarsest, in `data`; right side and solution of a level, in a color's
-// `coarser`.
+// -1, the coarsest; where a level begins the stage of the NEXT one, else -1; and where arrays lie,
+// as addresses. Of conductances and loss of A; weights of the coarsening; the scaled matrix; the
+// inverse of the coarsest. Right side and solution of a level lie so far into a color's `coarser`.
 // clang-format off
 enum Column {
     NZ, NY, NX, AXIS, NEXT, CZ, CY, CX, LOSS, BELOW, ABOVE, SZ, SY, SX, SCALE, TAKEN, INVERSE,
@@ -38,18 +37,26 @@ struct Ways {
 
 template <class F> struct Grids {
     const long long* table;
-    const F* data;
     F steps[2];
 
     INLINE Size at(int stage, int column) const { return table[(Size)stage * COLUMNS + column]; }
+    INLINE Size cells(int s) const { return at(s, NZ) * at(s, NY) * at(s, NX); }
+    // An array of a stage, of so many numbers in each matrix before.
+    INLINE F* array(int s, int column, Size before) const { return (F*)at(s, column) + before; }
     INLINE Level<F> level(int s, int matrix) const {
-        Level<F> l;
-        l.nz = (int)at(s, NZ), l.ny = (int)at(s, NY), l.nx = (int)at(s, NX);
-        l.slice = (Size)l.ny * l.nx, l.cells = l.nz * l.slice;
-        const F* const own = data + matrix * l.cells;
-        l.cz = own + at(s, SZ), l.cy = own + at(s, SY), l.cx = own + at(s, SX);
-        l.scale = own + at(s, SCALE), l.taken = own + at(s, TAKEN);
-        return l;
+        const int nz = (int)at(s, NZ), ny = (int)at(s, NY), nx = (int)at(s, NX);
+        const Size own = matrix * cells(s);
+        return {
+            nz,
+            ny,
+            nx,
+            (Size)ny * nx,
+            cells(s),
+            array(s, SZ, own),
+            array(s, SY, own),
+            array(s, SX, own),
+            array(s, SCALE, own),
+            array(s, TAKEN, own)};
     }
     INLINE Ways ways(int s) const {
         Ways w = {-1, -1, -1, (int)at(s, NEXT)};
@@ -58,8 +65,8 @@ template <class F> struct Grids {
     }
     // Of the grid of stage s, from a `place` on in the coarser one.
     INLINE Weights<F> weights(int s, int matrix, Size place) const {
-        const F* own = data + matrix * at(s + 1, NZ) * at(s + 1, NY) * at(s + 1, NX) + place;
-        return {own + at(s, BELOW), own + at(s, ABOVE)};
+        place += matrix * cells(s + 1);
+        return {array(s, BELOW, place), array(s, ABOVE, place)};
     }
 };
 
@@ -123,7 +130,7 @@ enum Vector { Y, R, D, D_ODD, P, Q, VECTORS };
 // even and odd number.
 // clang-format off
 enum Sum {
-    CORRECTED, CORRECTED_ODD, CURVED, RESIDUAL, RESIDUAL_ODD, SOURCE_NORM, COUNT, COUNT_ODD, SUMS
+    CORRECTED, CORRECTED_ODD, CURVED, RESIDUAL, RESIDUAL_ODD, SOURCE_NORM, COUNT, SUMS
 };
 // clang-format on
 
@@ -134,13 +141,13 @@ template <class F> struct Solve {
     double* sums;
     Size first_vector, vector_size;
     double tolerance, tiny;
-    int matrices, colors, shares, color, part, now;
+    int matrices, colors, shares, color, part, iteration;
 
-    INLINE int later() const { return 1 - now; }
+    INLINE int now() const { return iteration & 1; }
+    INLINE int later() const { return 1 - now(); }
     INLINE int matrix() const { return matrices > 1 ? color : 0; }
     INLINE F* vector(int k) const {
-        const Size cells = grids.at(0, NZ) * grids.at(0, NY) * grids.at(0, NX);
-        return vectors + first_vector + k * vector_size + color * cells;
+        return vectors + first_vector + k * vector_size + color * grids.cells(0);
     }
     INLINE double& sum(int row) const { return sums[(row * colors + color) * shares + part]; }
     INLINE double total(int row) const {
@@ -148,10 +155,14 @@ template <class F> struct Solve {
         for (int k = 0; k < shares; ++k) total += sums[(row * colors + color) * shares + k];
         return total;
     }
+    // Where this share of the slices of a stage begins (0), or ends (1).
+    INLINE int divide(int stage, int end) const {
+        return (int)(grids.at(stage, NZ) * (part + end) / shares);
+    }
     INLINE double above(double a) const { return a > tiny ? a : tiny; }
     // Whether this color is as exact as asked for; so is, for good, what is not a number.
     INLINE bool is_done() const {
-        return !(root(total(RESIDUAL + now)) / above(root(total(SOURCE_NORM))) > tolerance);
+        return !(root(total(RESIDUAL + now())) / above(root(total(SOURCE_NORM))) > tolerance);
     }
 };
 
