@@ -7,25 +7,105 @@ precision; the whole error is against path tracing by Mitsuba 3.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.bench.report import Row, with_best
-from ddrecon.bench.variants import QUICK, Sweep, exact_scene, model_of, variants_of
+from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.progress import Progress
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings
 from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
+
+Change = Callable[[Scene], Scene]
+EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
+EXACT_LIMITED = 1e-5
+"""The tolerance in place of that for `flux_limited`.
+
+Its damped iteration gains a digit in many minutes.
+"""
+EXACT_STEPS = 3
+
+
+def variants_of(scene: Scene, is_quick: bool) -> dict[str, Change]:
+    """What makes the variants of `scene`, by name: itself first, then all that differ from it."""
+    base, known = {"base": lambda scene: scene}, _settings(scene)
+    return base | {
+        name: change for name, change in _changes(is_quick) if _settings(change(scene)) != known
+    }
+
+
+def exact_scene(scene: Scene) -> Scene:
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows.
+
+    It is marched in finer steps, ray by ray.
+    """
+    steps = max(EXACT_STEPS, scene.render.steps)
+    render = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
+    diffusion = replace(scene.diffusion, **EXACT)
+    if diffusion.model == "flux_limited":
+        diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
+    return replace(scene, render=render, diffusion=diffusion)
+
+
+def model_of(scene: Scene) -> tuple[object, ...]:
+    """What two scenes must share for their exact images to be the same."""
+    shape, _, diffusion = _settings(replace(scene, diffusion=replace(scene.diffusion, **EXACT)))
+    return shape, diffusion
+
+
+def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
+    """What is tried, one setting at a time; a quick bench tries less."""
+    for name, values in (
+        ("solver", SOLVERS),
+        ("tolerance", (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)),
+        ("closure", CLOSURES),
+        ("model", ("p1",) if is_quick else ("p1", "flux_limited")),
+    ):
+        # Rounds are as many as the model has by default.
+        more = {"transport_rounds": None} if name == "model" else {}
+        for value in values:
+            yield f"{name} {value}", _vary("diffusion", **{name: value, **more})
+    for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
+        change = _vary("diffusion", transport_rounds=rounds, degree=degree)
+        yield f"rounds {rounds}, degree {degree}", change
+    for steps in (1, 2):
+        yield f"steps {steps}", _vary("render", steps_per_voxel=steps)
+    for tolerance in (0, 0.05) if is_quick else (0, 0.01, 0.05, 1):
+        yield f"pixels {tolerance}", _vary("render", tolerance=tolerance)
+    for factor in (2,) if is_quick else (2, 4):
+        yield f"grid {factor} times coarser", functools.partial(_coarsen, factor)
+
+
+def _vary(section: str, **changes: Any) -> Change:
+    return lambda scene: replace(scene, **{section: replace(getattr(scene, section), **changes)})
+
+
+def _coarsen(factor: int, scene: Scene) -> Scene:
+    return replace(scene_at_level(scene, factor), views=scene.views)
+
+
+def _settings(scene: Scene) -> tuple[object, ...]:
+    """What is varied; without the degree where there are no rounds that it could matter to."""
+    diffusion = scene.diffusion
+    if not diffusion.rounds:
+        diffusion = replace(diffusion, degree=DiffusionSettings.degree)
+    return scene.volume.grid.shape, scene.render, diffusion
+
 
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
@@ -79,16 +159,16 @@ def run_bench(
 
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
-    variants = variants_of(scene, QUICK if is_quick else Sweep())
+    variants = variants_of(scene, is_quick)
     exact = dict[str, Shot]()  # alike models are solved once
     solved = dict[tuple[object, ...], Shot]()
-    for variant in progress(variants, "exact solutions"):
-        changed = variant.change(double)
+    for name, change in progress(list(variants.items()), "exact solutions"):
+        changed = change(double)
         if (model := model_of(changed)) not in solved:
             solved[model] = shoot(exact_scene(changed))
-        exact[variant.name] = solved[model]
+        exact[name] = solved[model]
     contestants: dict[str, Callable[[], Shot]] = {
-        variant.name: functools.partial(shoot, variant.change(scene)) for variant in variants
+        name: functools.partial(shoot, change(scene)) for name, change in variants.items()
     }
     truth = None
     if tracer is not None:

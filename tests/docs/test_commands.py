@@ -17,7 +17,7 @@ from ddrecon.bench import plume
 from ddrecon.cli.commands import main
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
-from ddrecon.validate.hard_cases import CASES
+from ddrecon.validate.hard import CASES
 
 pytestmark = pytest.mark.slow
 

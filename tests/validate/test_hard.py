@@ -15,8 +15,16 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light.moments import Moments
 from ddrecon.renderer import render, solve_light
 from ddrecon.validate.balance import Balance, balance_of
-from ddrecon.validate.hard import HardResult, describe, run_case, table
-from ddrecon.validate.hard_cases import CASES, TOLERANCE, HardCase, full
+from ddrecon.validate.hard import (
+    CASES,
+    TOLERANCE,
+    HardCase,
+    HardResult,
+    describe,
+    full,
+    run_case,
+    table,
+)
 
 CPU = torch.device("cpu")
 SMALL = HardCase(full, shape=(4, 5, 6), g=0.4)
