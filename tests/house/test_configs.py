@@ -40,10 +40,6 @@ def small(config: Path) -> Scene:
     )
 
 
-def test_there_are_configs() -> None:
-    assert {"ball", "plume"} <= {config.stem for config in CONFIGS}
-
-
 @pytest.mark.parametrize("config", KINDS, ids=lambda config: config.stem)
 def test_a_kind_of_scene_renders(config: Path) -> None:
     if "mie" in config.read_text():

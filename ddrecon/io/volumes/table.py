@@ -11,12 +11,18 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, Field, Fields
-from ddrecon.io.volumes.mitsuba import read_vol, write_vol
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf, write_netcdf
-from ddrecon.io.volumes.npz import npz_names, read_npz, write_npz
+from ddrecon.io.volumes.plain import (
+    npz_names,
+    read_npz,
+    read_vol,
+    refuse_vti,
+    write_npz,
+    write_vol,
+    write_vti,
+)
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
 from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
-from ddrecon.io.volumes.vti import refuse_vti, write_vti
 
 
 @dataclass(frozen=True)
