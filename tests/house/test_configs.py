@@ -58,6 +58,7 @@ def test_every_phase_function_and_model_has_a_config() -> None:
         assert any(f"type: {name}" in text or f"model: {name}" in text for text in texts), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:
