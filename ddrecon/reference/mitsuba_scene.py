@@ -245,6 +245,8 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
 def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
     """`lights` as Mitsuba's emitters, by names of their own.
 
+    Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels
+    of an environment map.
     Raises SceneError for more than one environment map.
     """
     emitters: dict[str, dict[str, Any]] = {}

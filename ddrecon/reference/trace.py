@@ -139,6 +139,10 @@ def _power(image: np.ndarray) -> float:
 def pick_color(scene: Scene, color: int) -> Scene:
     """`scene` as seen in `color` alone: 0, 1, 2 for red, green, blue.
 
+    Paths that colors share are chosen by the extinction of one of them and weighted for the others.
+    Where extinctions differ that makes five times the noise, and Mitsuba 3.9 drops samples whose
+    weight comes out a rounding below zero, so there each color is traced by itself.
+
     Views keep their cameras only.
     """
     volume = scene.volume
