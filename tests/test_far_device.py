@@ -30,7 +30,7 @@ CAPTURE = (
     " lights.0.irradiance: {}, views.cam_0.exposure: {init: [1, 1, 1]}, views.cam_0.offset: {},"
     " views.cam_0.camera: {}}"
 )
-RUNS = {"plume": (8, ()), "paper/fig10": (8, ()), "capture": (16, (CAPTURE,))}
+RUNS = {"plume": (8, ()), "capture": (16, (CAPTURE,))}
 Operation = Callable[[Tensor, Tensor], Any]
 OPERATIONS: dict[str, Operation] = {
     "sum": lambda far, near: far + near,
@@ -137,7 +137,7 @@ def run(name: str, device: torch.device) -> Result:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "engine"),
-    [("plume", "warp"), ("paper/fig10", "torch"), ("capture", "torch"), ("capture", "warp")],
+    [("plume", "warp"), ("capture", "torch"), ("capture", "warp")],
 )
 def test_iterations_there_find_what_they_find_on_the_processor(name: str, engine: str) -> None:
     if engine == "warp":

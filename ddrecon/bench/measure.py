@@ -7,25 +7,239 @@ precision; the whole error is against path tracing by Mitsuba 3.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.bench.report import Row, with_best
-from ddrecon.bench.variants import QUICK, Sweep, exact_scene, model_of, variants_of
+from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
+from ddrecon.extras import load_extra
+from ddrecon.io.files.atomic import write_json
 from ddrecon.progress import Progress
-from ddrecon.reference.trace import Traced, Tracer
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings
 from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
+
+FLOOR = 1e-8
+"""Errors below this are drawn here."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One variant, or path tracing; errors are relative RMS, None where nothing is to compare with.
+
+    Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
+    `gradient_numerical` are against the same model solved exactly. `image_error` is against path
+    tracing, whose `image_noise` is subtracted in quadrature. `iterations` are the first solve's, or
+    samples a pixel. `is_best`: no other row is faster and as close to the truth, as far as that can
+    be told.
+    """
+
+    name: str
+    image_seconds: float
+    both_seconds: float
+    iterations: int
+    image_numerical: float | None = None
+    gradient_numerical: float | None = None
+    image_error: float | None = None
+    image_noise: float = 0.0
+    is_best: bool = False
+
+    @property
+    def error(self) -> float:
+        """The error against path tracing, or else against the exact solution; or else infinity.
+
+        What path tracing cannot tell from none counts as the least that it can.
+        """
+        if self.image_error is not None:
+            return max(self.image_error, least_error(self.image_noise))
+        return math.inf if self.image_numerical is None else self.image_numerical
+
+
+def with_best(rows: Sequence[Row]) -> list[Row]:
+    """The same rows, those marked that no other beats in both time of an image and error."""
+    return [
+        replace(
+            row,
+            is_best=not any(
+                other.image_seconds < row.image_seconds and other.error <= row.error
+                for other in rows
+            ),
+        )
+        for row in rows
+    ]
+
+
+HEAD = (
+    "| variant | image s | + gradient s | times base | iterations | image num. error "
+    "| gradient num. error | image error |  |"
+)
+
+
+def bench_lines(rows: Sequence[Row]) -> list[str]:
+    """The rows as a Markdown table, with times as multiples of the first's, and Mitsuba's time."""
+    base, last = rows[0], rows[-1]
+    lines = [HEAD, "|" + " --- |" * (HEAD.count("|") - 1)]
+    for row in rows:
+        numerical = (row.image_numerical, row.gradient_numerical)
+        cells = [
+            row.name,
+            f"{row.image_seconds:.3f}",
+            f"{row.both_seconds:.3f}",
+            f"{row.both_seconds / base.both_seconds:.2f}",
+            str(row.iterations),
+            *("" if error is None else f"{error:.1e}" for error in numerical),
+            "" if row.image_error is None else error_text(row.image_error, row.image_noise),
+            "best" if row.is_best else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    if last.image_error is not None:
+        lines.append(
+            f"image error is against path tracing, whose noise, {last.image_noise:.2g}, is "
+            f"subtracted; {last.name} take {last.image_seconds / base.image_seconds:.3g} times as "
+            "long as base"
+        )
+    return lines
+
+
+def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
+    """The bench as plain values."""
+    height, width = scene.views[0].camera.size
+    has_truth = rows[0].image_error is not None
+    return {
+        "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
+        "truth_noise": {"image": rows[0].image_noise} if has_truth else None,
+        "environment": environment,
+        "rows": [asdict(row) for row in rows],
+    }
+
+
+def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> None:
+    """Writes `report`, which `describe` gives of the `rows`, to bench.json, and draws bench.png.
+
+    Raises MissingExtraError where matplotlib is not installed.
+    """
+    write_json(folder / "bench.json", report)
+    draw(rows, folder / "bench.png")
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Writes a PNG of times against errors: of the image, and of image and gradient.
+
+    Dots have the numbers of their rows, and a color for each kind of variant.
+    """
+    load_extra("matplotlib", "a plot").use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
+    kinds = list(dict.fromkeys(row.name.split(" ")[0] for row in rows))
+    for number, row in enumerate(rows, 1):
+        color, label = f"C{kinds.index(row.name.split(' ')[0]) % 10}", f"{number}  {row.name}"
+        dots = (row.image_seconds, row.error), (row.both_seconds, row.gradient_numerical)
+        for axis, (seconds, error) in zip(axes, dots, strict=True):
+            if error is not None:
+                place = seconds, max(error, FLOOR)
+                axis.plot(*place, "o", color=color, label=label)
+                axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
+    front = sorted((row.image_seconds, max(row.error, FLOOR)) for row in rows if row.is_best)
+    axes[0].step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
+    for axis, what in zip(axes, ("an image", "an image and its gradient"), strict=True):
+        axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")
+        axis.grid(which="major", alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+Change = Callable[[Scene], Scene]
+EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
+EXACT_LIMITED = 1e-5
+"""The tolerance in place of that for `flux_limited`.
+
+Its damped iteration gains a digit in many minutes.
+"""
+EXACT_STEPS = 3
+
+
+def variants_of(scene: Scene, is_quick: bool) -> dict[str, Change]:
+    """What makes the variants of `scene`, by name: itself first, then all that differ from it."""
+    base, known = {"base": lambda scene: scene}, _settings(scene)
+    return base | {
+        name: change for name, change in _changes(is_quick) if _settings(change(scene)) != known
+    }
+
+
+def exact_scene(scene: Scene) -> Scene:
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows.
+
+    It is marched in finer steps, ray by ray.
+    """
+    steps = max(EXACT_STEPS, scene.render.steps)
+    render = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
+    diffusion = replace(scene.diffusion, **EXACT)
+    if diffusion.model == "flux_limited":
+        diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
+    return replace(scene, render=render, diffusion=diffusion)
+
+
+def model_of(scene: Scene) -> tuple[object, ...]:
+    """What two scenes must share for their exact images to be the same."""
+    shape, _, diffusion = _settings(replace(scene, diffusion=replace(scene.diffusion, **EXACT)))
+    return shape, diffusion
+
+
+def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
+    """What is tried, one setting at a time; a quick bench tries less."""
+    for name, values in (
+        ("solver", SOLVERS),
+        ("tolerance", (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)),
+        ("closure", CLOSURES),
+        ("model", ("p1",) if is_quick else ("p1", "flux_limited")),
+    ):
+        # Rounds are as many as the model has by default.
+        more = {"transport_rounds": None} if name == "model" else {}
+        for value in values:
+            yield f"{name} {value}", _vary("diffusion", **{name: value, **more})
+    for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
+        change = _vary("diffusion", transport_rounds=rounds, degree=degree)
+        yield f"rounds {rounds}, degree {degree}", change
+    for steps in (1, 2):
+        yield f"steps {steps}", _vary("render", steps_per_voxel=steps)
+    for tolerance in (0, 0.05) if is_quick else (0, 0.01, 0.05, 1):
+        yield f"pixels {tolerance}", _vary("render", tolerance=tolerance)
+    for factor in (2,) if is_quick else (2, 4):
+        yield f"grid {factor} times coarser", functools.partial(_coarsen, factor)
+
+
+def _vary(section: str, **changes: Any) -> Change:
+    return lambda scene: replace(scene, **{section: replace(getattr(scene, section), **changes)})
+
+
+def _coarsen(factor: int, scene: Scene) -> Scene:
+    return replace(scene_at_level(scene, factor), views=scene.views)
+
+
+def _settings(scene: Scene) -> tuple[object, ...]:
+    """What is varied; without the degree where there are no rounds that it could matter to."""
+    diffusion = scene.diffusion
+    if not diffusion.rounds:
+        diffusion = replace(diffusion, degree=DiffusionSettings.degree)
+    return scene.volume.grid.shape, scene.render, diffusion
+
 
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
@@ -79,16 +293,16 @@ def run_bench(
 
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
-    variants = variants_of(scene, QUICK if is_quick else Sweep())
+    variants = variants_of(scene, is_quick)
     exact = dict[str, Shot]()  # alike models are solved once
     solved = dict[tuple[object, ...], Shot]()
-    for variant in progress(variants, "exact solutions"):
-        changed = variant.change(double)
+    for name, change in progress(list(variants.items()), "exact solutions"):
+        changed = change(double)
         if (model := model_of(changed)) not in solved:
             solved[model] = shoot(exact_scene(changed))
-        exact[variant.name] = solved[model]
+        exact[name] = solved[model]
     contestants: dict[str, Callable[[], Shot]] = {
-        variant.name: functools.partial(shoot, variant.change(scene)) for variant in variants
+        name: functools.partial(shoot, change(scene)) for name, change in variants.items()
     }
     truth = None
     if tracer is not None:

@@ -54,8 +54,7 @@ def export(
     as its volumes.
     """
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
-    from ddrecon.io.volumes.convert import read_together
-    from ddrecon.io.volumes.table import FORMATS
+    from ddrecon.io.volumes.table import FORMATS, read_together
     from ddrecon.reference.export import export_scene
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
@@ -90,8 +89,7 @@ def _write_fields(
 ) -> None:
     """Writes a volume to `output`, and prints what is the same everywhere in it."""
     from ddrecon.io.files.folders import require_free_files
-    from ddrecon.io.volumes.convert import raise_z
-    from ddrecon.io.volumes.table import keeps_constants, write_fields
+    from ddrecon.io.volumes.table import keeps_constants, raise_z, write_fields
 
     require_free_files([output], may_exist=overwrite)
     if up == "z":

@@ -145,9 +145,8 @@ def _bench_speed(
     session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
 ) -> None:
     """Measures the scene, or the plume, and writes what was asked for."""
-    from ddrecon.bench.measure import run_bench
+    from ddrecon.bench.measure import bench_lines, describe, run_bench, write_bench
     from ddrecon.bench.plume import load_pair
-    from ddrecon.bench.report import bench_lines, describe, write_bench
     from ddrecon.errors import MissingExtraError, SceneError
     from ddrecon.reference.trace import open_tracer
 

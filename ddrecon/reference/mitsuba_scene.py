@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,11 @@ from torch.nn.functional import interpolate
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
+from ddrecon.light.environment import rotate_directions
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Mixture
-from ddrecon.reference.mitsuba_lights import mitsuba_lights
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024
@@ -238,3 +240,55 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     half_width = float(camera.half_width)
     scale = np.diag([half_width, half_width * camera.pixel_aspect, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
+
+
+def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
+    """`lights` as Mitsuba's emitters, by names of their own.
+
+    Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels
+    of an environment map.
+    Raises SceneError for more than one environment map.
+    """
+    emitters: dict[str, dict[str, Any]] = {}
+    ambient, maps = np.zeros(3), list[EnvironmentLight]()
+    for index, light in enumerate(lights):
+        if isinstance(light, DirectionalLight):
+            emitters[f"light_{index}"] = {
+                "type": "directional",
+                "direction": light.direction.tolist(),
+                "irradiance": _color(light.irradiance),
+            }
+        elif isinstance(light, PointLight):
+            emitters[f"light_{index}"] = {
+                "type": "point",
+                "position": light.position.tolist(),
+                "intensity": _color(light.intensity),
+            }
+        elif isinstance(light, AmbientLight):
+            ambient = ambient + _color(light.radiance)
+        else:
+            maps.append(light)
+    if len(maps) > 1:
+        raise SceneError(
+            f"the scene has {len(maps)} environment maps, and Mitsuba takes one; "
+            "give it the one they sum to"
+        )
+    if maps:
+        emitters["around"] = _environment(maps[0], ambient)
+    elif ambient.any():
+        emitters["around"] = {"type": "constant", "radiance": tuple(ambient.tolist())}
+    return emitters
+
+
+def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:
+    """The map turned as `ddrecon.light.environment` says, which holds `ambient` [3] as well."""
+    radiance = (light.scale * light.radiance).detach().cpu().double().numpy()
+    pixels = np.broadcast_to(radiance.transpose(1, 2, 0), (*radiance.shape[1:], 3)) + ambient
+    turn = np.eye(4)
+    turned = replace(light, rotation=light.rotation.detach().cpu().double())
+    turn[:3, :3] = rotate_directions(torch.eye(3, dtype=torch.float64), turned).T
+    return {"type": "envmap", "bitmap": np.ascontiguousarray(pixels, np.float32), "to_world": turn}
+
+
+def _color(value: Tensor) -> tuple[float, ...]:
+    return tuple(value.detach().cpu().expand(3).tolist())

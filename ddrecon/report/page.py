@@ -136,4 +136,4 @@ def _captioned(element: str, caption: str) -> str:
 
 def fold(summary: str, text: str) -> str:
     """`text` as it stands, shown when `summary` is clicked."""
-    return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>"
+    return unfolded(summary, f"<pre>{escape(text)}</pre>", is_open=False)

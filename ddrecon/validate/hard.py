@@ -1,25 +1,169 @@
-"""The hard cases of `hard_cases`, run and judged.
+"""Small scenes at the edges of what is allowed, run and judged: `CASES` is the table.
 
-Results must be finite, the same in single and double precision, solved as far as rounding allows,
-lose no light and have no radiance below zero.
+Scenes are written in double precision and rounded once, as the scene loader does it; shapes and
+sides are in array order (z, y, x). Results must be finite, the same in single and double precision,
+solved as far as rounding allows, lose no light and have no radiance below zero.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.closures import Closure
+from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxes
 from ddrecon.errors import SolveError
+from ddrecon.grid import Grid, Triple
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.sky import decompose_lights
+from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.remaining import has_backward_peak
 from ddrecon.progress import Progress
 from ddrecon.renderer import render
-from ddrecon.validate.balance import Balance, balance_of
-from ddrecon.validate.hard_cases import CASES, TOLERANCE, HardCase
+from ddrecon.scene import Scene, View
+from ddrecon.settings import DiffusionSettings, RenderSettings
+
+Shape = tuple[int, int, int]
+TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
+"""Relative residual asked of the solves: small against the bounds of a case, and within what each
+precision can reach.
+"""
+
+
+def empty(shape: Shape) -> Tensor:
+    """No medium."""
+    return torch.zeros(shape, dtype=torch.float64)
+
+
+def full(shape: Shape) -> Tensor:
+    """The same density everywhere, up to the faces of the box."""
+    return torch.ones(shape, dtype=torch.float64)
+
+
+def ball(shape: Shape) -> Tensor:
+    """A soft ball, or what it becomes in a box that is no cube, with vacuum around it."""
+    lines = [(2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1 for n in shape]
+    z, y, x = torch.meshgrid(*lines, indexing="ij")
+    return (1 - (z**2 + y**2 + x**2) / 0.8).clamp(min=0)
+
+
+def layer(shape: Shape) -> Tensor:
+    """A layer across y amid a haze a million times thinner."""
+    density = torch.full(shape, 1e-6, dtype=torch.float64)
+    density[:, shape[1] // 4 : shape[1] - shape[1] // 4] = 1
+    return density
+
+
+@dataclass(frozen=True)
+class HardCase:
+    """A scene in words: a medium in a box about the origin, a beam, and a camera of 16 x 16 pixels.
+
+    The box has `shape` cells and `sides` [u].
+
+    `depth`: optical depth of a cell of density 1 along its shortest side. `travel`, `eye` and
+    `target` are (x, y, z).
+    """
+
+    density: Callable[[Shape], Tensor] = ball
+    depth: float = 1.0
+    albedo: float = 0.9
+    g: float = 0.0
+    shape: Shape = (16, 16, 16)
+    sides: Triple = (1.0, 1.0, 1.0)
+    travel: Triple = (-2.0, -2.0, -1.0)
+    ambient: float = 0.0
+    eye: Triple = (0.8, 0.9, 2.5)
+    target: Triple = (0.0, 0.0, 0.0)
+    half_width: float = 0.35
+    is_perspective: bool = True
+
+    def scene(self, dtype: torch.dtype, device: torch.device) -> Scene:
+        """The scene in `dtype` on `device`, to be solved as closely as `TOLERANCE` says."""
+
+        def tensor(values: float | Triple | list[float]) -> Tensor:
+            return torch.tensor(values, dtype=torch.float64).to(device, dtype)
+
+        z, y, x = (side / 2 for side in self.sides)
+        grid = Grid(self.shape, (-z, -y, -x), (z, y, x))
+        sigma_t = self.depth / min(grid.spacing)
+        volume = Volume(
+            grid,
+            self.density(self.shape).to(device, dtype),
+            tensor([sigma_t * (1 - self.albedo)]),
+            tensor([sigma_t * self.albedo]),
+            tensor(self.g),
+        )
+        lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([3.0]))]
+        if self.ambient:
+            lights.append(AmbientLight(tensor([self.ambient])))
+        pose = look_at(tensor(self.eye), tensor(self.target), tensor((0.0, 1.0, 0.0)))
+        views = [View("view", Camera(pose, (16, 16), self.half_width, self.is_perspective))]
+        return Scene(
+            volume, lights, views, RenderSettings(), DiffusionSettings(tolerance=TOLERANCE[dtype])
+        )
+
+
+SLAB = 1 / 24
+BAR = 1 / 32
+
+CASES: dict[str, HardCase] = {
+    "vacuum": HardCase(empty),
+    "vacuum, g 0.9, ambient light": HardCase(empty, g=0.9, ambient=0.5),
+    "density jumps by 1e6": HardCase(layer, depth=10),
+    "density jumps by 1e6, albedo 1, g 0.7": HardCase(layer, depth=10, albedo=1, g=0.7),
+    **{
+        f"optical depth 1e{power:+d} a cell": HardCase(full, depth=10.0**power)
+        for power in (-8, -4, -2, 0, 1, 2, 4)
+    },
+    "optical depth 1e+4 a cell, albedo 1": HardCase(full, depth=1e4, albedo=1),
+    "optical depth 1e+4 a cell, ball in vacuum": HardCase(ball, depth=1e4),
+    "albedo 0": HardCase(depth=3, albedo=0, ambient=0.5, shape=(8, 8, 8)),
+    "albedo 1": HardCase(depth=3, albedo=1),
+    "albedo 1 - 1e-7": HardCase(depth=3, albedo=1 - 1e-7),
+    "g 0.99": HardCase(depth=3, g=0.99),
+    "g -0.99": HardCase(depth=3, g=-0.99),
+    "g 0.99, albedo 1, full box": HardCase(full, depth=10, albedo=1, g=0.99),
+    "g 0.99, density jumps by 1e6": HardCase(layer, depth=100, albedo=0.5, g=0.99),
+    "g -0.99, density jumps by 1e6": HardCase(
+        layer, depth=0.2, albedo=0.5, g=-0.99, eye=(0.1, 2.5, 0.3)
+    ),
+    "thin slab, 1 cell along x": HardCase(shape=(24, 24, 1), sides=(1, 1, SLAB), g=0.4),
+    "thin slab, 1 cell along z": HardCase(shape=(1, 24, 24), sides=(SLAB, 1, 1), depth=40, g=0.4),
+    "long box, 256 x 8 x 8": HardCase(
+        full, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999, eye=(0.3, 0.5, 1.5)
+    ),
+    "long box, light and view along it": HardCase(
+        full,
+        shape=(8, 8, 256),
+        sides=(BAR, BAR, 1),
+        albedo=0.999,
+        travel=(-1, 0, 0),
+        eye=(1.5, 0, 0),
+        half_width=0.03,
+    ),
+    "voxels 1 : 5 : 0.2": HardCase(sides=(1, 5, 0.2), depth=0.3, g=0.4),
+    "voxels 1 : 10 : 0.1": HardCase(sides=(1, 10, 0.1), depth=0.3, g=0.4),
+    "light along +x": HardCase(travel=(1, 0, 0), g=0.4),
+    "light along -y": HardCase(travel=(0, -1, 0), g=0.4),
+    "light a millionth off -z": HardCase(travel=(1e-6, 0, -1), g=0.4),
+    "camera inside the medium": HardCase(eye=(0.1, 0.12, 0.11), half_width=1, g=0.4),
+    "camera at a grazing angle": HardCase(
+        full, eye=(3, 0.505, 0), target=(0, 0.499, 0), half_width=0.2, g=0.4
+    ),
+    "camera in the plane of a face": HardCase(
+        full, eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False
+    ),
+}
+
 
 SINGLE_FROM_DOUBLE = 1e-4
 """Relative RMS error of images, and of gradients, in float32 against float64."""
@@ -130,9 +274,7 @@ def _render(
     image = render(scene, memory=memory)[0]
     (gradient,) = torch.autograd.grad(image.mean(), density)
     density.requires_grad_(False)
-    balance = Balance(0.0, 0.0, 0.0)
-    if memory.records:
-        balance = balance_of(scene, memory.last["forward", 0])
+    balance = balance_of(scene, memory.last["forward", 0]) if memory.records else Balance()
     iterations = sum(record.iterations for record in memory.records)
     return image.detach(), gradient, iterations, balance
 
@@ -141,3 +283,64 @@ def relative_error(found: Tensor, exact: Tensor) -> float:
     """The relative RMS error of `found`, absolute where `exact`, of float64, is zero."""
     size = exact.norm()
     return float((found.double() - exact).norm() / torch.where(size > 0, size, 1))
+
+
+@dataclass(frozen=True)
+class Balance:
+    """How far a solution is from balance (E4, E6, E7); all are 0 where there is no source.
+
+    Iterations update their residual rather than compute it, so that rounding hides from them; here
+    it is b - A u itself.
+
+    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by;
+    `attainable`: what rounding u makes of it;
+    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
+    """
+
+    residual: float = 0.0
+    attainable: float = 0.0
+    energy: float = 0.0
+
+
+def balance_of(scene: Scene, solution: Tensor) -> Balance:
+    """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
+    grid, settings = scene.volume.grid, scene.diffusion
+    medium = scale_medium(scene.volume, settings.angles)
+    lights = decompose_lights(scene.lights)
+    problem = DiffusionProblem(
+        medium,
+        Closure(settings.closure, grid, settings.floor),
+        reduced_light(medium, lights, medium.degree, has_backward_peak(medium)).source,
+        ambient_radiance(lights, solution),
+        medium.degree > 0,
+    )
+    operator, right = problem.system
+    if not right.any():
+        return Balance()
+    # What Q1 takes out of one cell it brings to the next, so it is no part of what is injected.
+    escape = boundary_loss(problem.diffusion, grid)
+    injected = medium.remaining_scattering * problem.source.mean + escape * problem.outside
+    total = injected.double().sum()
+    absorbed = (medium.absorption.value.double() * solution.double()).sum()
+    energy = float((total - (absorbed + _leak(problem, solution))).abs() / total)
+    return Balance(*_residual(operator, right, solution), energy)
+
+
+def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
+    """What flows out through the faces of the box (E6), as for dark surroundings."""
+    grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
+    leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
+    for axis, flux in zip(AXES, problem.source.flux or (None,) * 3, strict=True):
+        scattered = None if flux is None else scattering * flux
+        faces = face_fluxes(solution, scattered, problem.diffusion, grid, axis).double()
+        outflow = (faces.select(axis, -1) - faces.select(axis, 0)).sum()
+        leaked = leaked + outflow / grid.spacing[axis - 1]
+    return leaked
+
+
+def _residual(operator: Operator, right: Tensor, u: Tensor) -> tuple[float, float]:
+    """The relative residual, and what rounding every entry of `u` by one unit in the last adds."""
+    scale = operator.diagonal.rsqrt()
+    size = (scale * right).norm()
+    rounding = torch.finfo(u.dtype).eps * (scale * operator.diagonal * u).norm()
+    return float((scale * (right - operator.apply(u))).norm() / size), float(rounding / size)

@@ -8,9 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ddrecon.bench.measure import Shot, measure, row_of, shoot
+from ddrecon.bench.measure import Row, Shot, bench_lines, measure, row_of, shoot, with_best
 from ddrecon.bench.plume import plume_scene
-from ddrecon.bench.report import Row, bench_lines, with_best
 from ddrecon.errors import SolveError
 from ddrecon.reference.trace import Traced
 from ddrecon.scene import Scene

@@ -11,7 +11,7 @@ from click.testing import Result
 
 from ddrecon.errors import MissingExtraError
 from ddrecon.validate import hard
-from ddrecon.validate.hard_cases import CASES, HardCase, empty, full
+from ddrecon.validate.hard import CASES, HardCase, empty, full
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from click.testing import Result
 from torch import Tensor
 
 from ddrecon.diffusion import implicit
-from ddrecon.validate import point
+from ddrecon.validate import gradcheck
 
 Run = Callable[..., Result]
 SMALL = ["-D", "volume.resolution=[4, 3, 3]"]
@@ -38,7 +38,7 @@ def detaching_part(right: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(point, "image_loss", detaching_part(point.image_loss))
+    monkeypatch.setattr(gradcheck, "image_loss", detaching_part(gradcheck.image_loss))
     result = run(*GRADCHECK, *SMALL, *SIMPLE, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (1, "")
     assert result.stdout.splitlines()[-1].startswith("| density | FAIL |")

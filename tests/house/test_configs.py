@@ -40,10 +40,6 @@ def small(config: Path) -> Scene:
     )
 
 
-def test_there_are_configs() -> None:
-    assert {"ball", "plume"} <= {config.stem for config in CONFIGS}
-
-
 @pytest.mark.parametrize("config", KINDS, ids=lambda config: config.stem)
 def test_a_kind_of_scene_renders(config: Path) -> None:
     if "mie" in config.read_text():
@@ -62,6 +58,7 @@ def test_every_phase_function_and_model_has_a_config() -> None:
         assert any(f"type: {name}" in text or f"model: {name}" in text for text in texts), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:

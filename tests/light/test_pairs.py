@@ -14,7 +14,7 @@ from ddrecon.light.pairs import follow_pair
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.remaining import backward_fraction
 from ddrecon.renderer import solve_light
-from ddrecon.validate.balance import balance_of
+from ddrecon.validate.hard import balance_of
 
 IRRADIANCE = 3.0
 

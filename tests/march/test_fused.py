@@ -24,8 +24,7 @@ from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.validate.hard import run_case
-from ddrecon.validate.hard_cases import CASES
+from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")

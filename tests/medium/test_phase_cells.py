@@ -17,7 +17,7 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import angle_of
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
-from ddrecon.validate.balance import balance_of
+from ddrecon.validate.hard import balance_of
 
 SHAPE = (5, 4, 6)
 LOBES = torch.tensor([0.8, -0.4], dtype=torch.float64)

@@ -8,6 +8,7 @@ from shared_runs import RENDER, TESTS, VIEWS, Runs, job, run_jobs
 
 from ddrecon.run.checkpoint import load_checkpoint
 
+pytestmark = pytest.mark.slow
 JOBS = {
     "one": job(1, "one"),
     "four": job(4, "four", seeds=True),

@@ -13,51 +13,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from media import box_grid
-from slab_cases import GROUPS
+from slab_cases import CASES_OF
 
 from ddrecon.slabs.slab import HALO, THINNEST, Slab, cut_evenly
 
-Errors = dict[str, dict[str, float]]
+Errors = dict[str, dict[str, dict[str, float]]]
+LIMITS = {"torch": 1e-12, "warp": 1e-11}
 
 
 @pytest.fixture(scope="module")
-def errors(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Errors:
-    """Those of a group of cases."""
-    return find_errors(tmp_path_factory.mktemp("slabs") / "errors.json", request.param)
-
-
-def find_errors(file: Path, group: str) -> Errors:
+def errors(tmp_path_factory: pytest.TempPathFactory) -> Errors:
+    """Those of all cases, by engine; one process forks all ranks."""
+    file = tmp_path_factory.mktemp("slabs") / "errors.json"
     script = Path(__file__).with_name("slab_cases.py")
     paths = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
-    subprocess.run([sys.executable, str(script), str(file), group], env=environment, check=True)
+    subprocess.run([sys.executable, str(script), str(file)], env=environment, check=True)
     found: Errors = json.loads(file.read_text())
     return found
 
 
-def require_less(errors: dict[str, float], limit: float) -> None:
-    assert errors
-    assert {what: error for what, error in errors.items() if not error < limit} == {}
-
-
-@pytest.mark.parametrize("errors", ["few"], indirect=True)
-@pytest.mark.parametrize("case", GROUPS["few"])
-def test_slabs_find_what_one_process_finds(errors: Errors, case: str) -> None:
-    require_less(errors[case], 1e-12)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("errors", ["others"], indirect=True)
-@pytest.mark.parametrize("case", GROUPS["others"])
-def test_slabs_find_whatever_one_process_finds(errors: Errors, case: str) -> None:
-    require_less(errors[case], 1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("errors", ["fused"], indirect=True)
-@pytest.mark.parametrize("case", GROUPS["fused"])
-def test_fused_slabs_find_what_operations_of_one_process_find(errors: Errors, case: str) -> None:
-    require_less(errors[case], 1e-11)
+@pytest.mark.parametrize(
+    ("engine", "case"), [(engine, case) for engine in LIMITS for case in CASES_OF[engine]]
+)
+def test_slabs_find_what_one_process_finds(errors: Errors, engine: str, case: str) -> None:
+    """Fused slabs find what operations of one process find."""
+    found = errors[engine][case]
+    assert found and {what: e for what, e in found.items() if not e < LIMITS[engine]} == {}
 
 
 @given(st.integers(1, 9), st.integers(0, 400))

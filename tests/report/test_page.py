@@ -1,13 +1,32 @@
-"""A page needs nothing beside it, and text in it is text."""
+"""A page needs nothing beside it, and text in it is text; curves lie where their numbers are, and
+volumes are shown cell for cell, in notebooks too.
+"""
 
 from __future__ import annotations
 
 import base64
+import gzip
+import html
+import itertools
+import json
+import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
-from ddrecon.report.curve import draw_curve
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from media import make_scene, random_values
+
+from ddrecon.layer import VolumeRenderer
+from ddrecon.pictures import srgb
+from ddrecon.reconstruct.log import Result, Row
+from ddrecon.report import volumes
+from ddrecon.report.curve import MOST, draw_curve, logarithmic_ticks, ticks
 from ddrecon.report.page import (
     fold,
     items,
@@ -18,6 +37,8 @@ from ddrecon.report.page import (
     table,
     write_page,
 )
+from ddrecon.report.pictures import slices
+from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 
 NASTY = '<script>alert("&")</script>'
 VOID = {"meta", "img"}
@@ -70,3 +91,156 @@ def test_a_page_names_no_other_file(tmp_path: Path) -> None:
         base64.b64decode(source.removeprefix("data:image/png;base64,")) for source in sources
     ] == [b"\x89PNG..."]
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+FINITE = st.floats(-1e3, 1e3)
+
+
+def places(svg: str) -> list[list[tuple[float, float]]]:
+    """The points of every line."""
+    lines = re.findall(r'<polyline points="([^"]*)"', svg)
+    return [
+        [(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())]
+        for line in lines
+    ]
+
+
+@given(FINITE, st.floats(1e-2, 1e6))
+def test_ticks_are_round_and_within(low: float, span: float) -> None:
+    found = ticks(low, low + span)
+    slack = 1e-6 * span + 1e-9 * abs(low)
+    assert 2 <= len(found) <= 6
+    assert all(low - slack <= value <= low + span + slack for value in found)
+    steps = {round((b - a) / span, 6) for a, b in itertools.pairwise(found)}
+    mantissa = 10 ** (math.log10(found[1] - found[0]) % 1)
+    assert len(steps) == 1 and min(abs(mantissa - factor) for factor in (1, 2, 5, 10)) < 1e-3
+
+
+@given(st.floats(-12, 12), st.floats(1e-3, 20))
+def test_logarithmic_ticks_lie_within_and_ascend(low: float, span: float) -> None:
+    found = logarithmic_ticks(low, low + span)
+    assert 1 <= len(found) <= 8 and found == sorted(found)
+    assert all(low - 1e-6 <= value <= low + span + 1e-6 for value in found)
+
+
+def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
+    linear = places(draw_curve("a", {"": [(float(x), 3 * x - 1.0) for x in range(9)]}, "x"))
+    power = places(
+        draw_curve("a", {"": [(float(x), 10.0**-x) for x in range(9)]}, "x", is_logarithmic=True)
+    )
+    for (line,), sign in ((linear, -1), (power, 1)):
+        slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(line)]
+        assert all(
+            slope * sign > 0 and slope == pytest.approx(slopes[0], abs=0.01) for slope in slopes
+        )
+
+
+def test_what_cannot_be_drawn_is_left_out() -> None:
+    (line,) = places(
+        draw_curve(
+            "a",
+            {"": [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]},
+            "x",
+            is_logarithmic=True,
+        )
+    )
+    assert len(line) == 2
+    assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
+
+
+def test_a_long_log_is_thinned_and_keeps_its_ends() -> None:
+    points = [(float(x), float(x % 7)) for x in range(20_003)]
+    (line,), ends = (
+        places(draw_curve("a", {"": points}, "x")),
+        places(draw_curve("a", {"": [points[0], (points[-1][0], 6.0)]}, "x"))[0],
+    )
+    assert len(line) <= MOST + 20
+    assert (line[0][0], line[-1][0]) == (ends[0][0], ends[-1][0])
+
+
+def embedded(*fields: Shown) -> list[dict]:
+    """The fields in a page, decoded as its scripts do: [z, y, x, channels]."""
+    text = volume_viewer(fields, "", 1, (0.0, 0.0, 1.0))
+    found = re.findall(r'<script type="application/json" class="field">(.*?)</script>', text)
+    contents = [json.loads(content) for content in found]
+    for content in contents:
+        data = gzip.decompress(base64.b64decode(content["data"]))
+        shape = [*content["size"][::-1], content["channels"]]
+        content["cells"] = np.frombuffer(data, np.uint8).reshape(shape)
+    return contents
+
+
+@pytest.mark.parametrize("colors", [(), (3,)])
+def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None:
+    """x fastest, in 8 bits of sRGB, at most half a step of it off; above white it is white."""
+    values = torch.rand(*colors, 3, 4, 5, generator=torch.Generator().manual_seed(0)) * 2
+    (found,) = embedded(Shown("albedo", "truth", values, (1.0, 0.5, 2.0), white=1.5))
+    assert (found["name"], found["of"], found["size"]) == ("albedo", "truth", [5, 4, 3])
+    assert found["box"] == [0.5, 0.25, 1.0]
+    cells = values.permute(1, 2, 3, 0) if colors else values[..., None]
+    expected = 255 * srgb.encode(np.clip(cells.numpy() / 1.5, 0, 1))
+    assert np.abs(found["cells"] - expected).max() <= 0.501
+
+
+def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By means of blocks, those at the far ends of what is left over."""
+    monkeypatch.setattr(volumes, "MOST_CELLS", 20)
+    values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
+    (found,) = embedded(Shown("density", "result", values, (1.0, 1.0, 1.0), white=1.0))
+    assert found["size"] == [3, 2, 3]
+    expected = 255 * srgb.encode(float(values[4:, 2:, 2:4].mean()))
+    assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
+
+
+def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
+    """Blue below, red above, as strong as far from zero: in pages and in pictures alike."""
+    values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
+    (found,) = embedded(Shown("g", "result", values, (1.0, 1.0, 1.0), find_white_value(values)))
+    page = found["cells"][0, 0].astype(float)
+    picture = srgb.encode_bytes(slices(values)[0, :5]).astype(float)
+    for blue, light_blue, white, light_red, red in (page, picture):
+        assert (white == 255).all()
+        assert blue[2] > blue[0] and red[0] > red[2]
+        np.testing.assert_allclose(light_blue, (blue + white) / 2, atol=1)
+        np.testing.assert_allclose(light_red, (red + white) / 2, atol=1)
+
+
+def test_what_is_drawn_has_a_name_and_a_role() -> None:
+    page = volume_viewer([], "", 1, (0.0, 0.0, 1.0))
+    canvases = re.findall("<canvas[^>]*>", page)
+    assert len(canvases) == 6
+    assert all('role="img"' in one and 'aria-label="' in one for one in canvases)
+
+
+def framed(text: str) -> str:
+    """The page within the frame of `text`."""
+    (page,) = re.findall(r'<iframe sandbox="allow-scripts" srcdoc="([^"]*)"', text)
+    return html.unescape(page)
+
+
+def test_scene_volume_and_result_show_their_fields() -> None:
+    scene = make_scene(random_values(3, 4, 5, dtype=torch.float32).requires_grad_())
+    scene.volume.sigma_s = torch.rand(3, 3, 4, 5)
+    row = Row(7, 1.0, 0.1, 31.25, 28.5, 1, 1, 60, 0.1, 0.0)
+    for shown in (scene, scene.volume, Result(scene, [row])):
+        page = framed(shown._repr_html_())
+        data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)
+        fields = [json.loads(content) for content in data]
+        assert [field["name"] for field in fields] == ["density", "sigma_s"]
+        assert fields[0]["size"] == [5, 4, 3] and "5 x 4 x 3 cells, density up to" in page
+    assert "31.25 dB of views trained on, 28.50 dB of views held out" in (
+        Result(scene, [row])._repr_html_()
+    )
+
+
+def test_what_is_printed_is_as_short_for_a_large_scene() -> None:
+    """Shapes, the device and ranges, and no more of many views than of some."""
+    density = torch.linspace(0, 3, 8000).view(20, 20, 20)
+    scene = make_scene(density.requires_grad_())
+    scene = replace(scene, views=9 * scene.views)
+    rows = 500 * [Row(7, 1.0, 0.1, 31.25, 28.5, 1, 1, 60, 0.1, 0.0)]
+    for shown in (scene, scene.volume, Result(scene, rows), VolumeRenderer(scene)):
+        text = str(shown)
+        assert "density=<[20, 20, 20] float32 on cpu, 0 to 3>" in text and len(text) < 2000
+        assert type(shown).__name__ in text and "tensor(" not in text
+    assert "... 9 in all" in str(scene)

@@ -73,11 +73,6 @@ def test_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ..
         read_image(tmp_path / "a.npy")
 
 
-def test_unknown_suffix_lists_the_known(tmp_path: Path):
-    with pytest.raises(FormatError, match=r"\.exr.*\.png"):
-        read_image(tmp_path / "a.bmp")
-
-
 def test_without_openimageio_linear_files_are_arrays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -102,10 +97,6 @@ def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
 def test_srgb_decodes_what_it_encodes(linear: float):
     value = np.array(linear)
     assert abs(srgb.decode(srgb.encode(value)) - value) < 1e-7
-
-
-def test_srgb_of_middle_gray():
-    assert srgb.encode(np.array([0.0, 0.18, 1.0])) == pytest.approx([0, 0.46136, 1], abs=1e-5)
 
 
 def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
