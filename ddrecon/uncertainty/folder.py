@@ -14,6 +14,7 @@ from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
 from ddrecon.run.run_folder import write_values
+from ddrecon.uncertainty.next_view import rank_views
 from ddrecon.uncertainty.samples import Uncertainty
 from ddrecon.variables.kinds import kind_of
 
@@ -52,6 +53,7 @@ def write_found(found: Uncertainty, path: Path, seconds: float) -> dict[str, Any
         "fields": fields,
         "numbers": found.described_numbers(),
         "correlations": found.correlations().tolist() if found.tabled else [],
+        "next_views": rank_views(found),
     }
     write_json(path / RECORD, record)
     write_uncertainty_report(path / "report.html", stated, record)
@@ -91,6 +93,11 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
             f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
             for name, number in record["numbers"].items()
         ),
+        *(
+            f"{'  then ' if place else 'next view: '}{view['name']}, whose picture takes at least "
+            f"{100 * view['gain']:.1f} % of the variance (+- {100 * view['error']:.1f})"
+            for place, view in enumerate(record["next_views"])
+        ),
         f"deviations and report written to {path}",
     ]
 
@@ -112,6 +119,13 @@ def write_uncertainty_report(
     ]
     if record["numbers"]:
         sections.append(section("Numbers", *_numbers(record)))
+    if record["next_views"]:
+        rows = [
+            (view["name"], f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %")
+            for view in record["next_views"]
+        ]
+        head = ["picture", "of the variance of all cells, at least"]
+        sections.append(section("Next picture", table(head, rows)))
     sections.append(section("How", *_how(record)))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
     write_page(path, title, _lead(record), sections, is_alive=False)
