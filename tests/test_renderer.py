@@ -33,6 +33,8 @@ def components(scene: Scene) -> Components:
 
 
 def volume_with(scene: Scene, **fields: Any) -> Scene:
+    if "g" in fields:
+        fields["phase"] = fields.pop("g")
     return replace(scene, volume=replace(scene.volume, **fields))
 
 

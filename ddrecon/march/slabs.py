@@ -75,14 +75,15 @@ def clip_to_slab(
     direction, origin = rays.direction[:, slab.axis], rays.origin[:, slab.axis]
     tiny = torch.finfo(direction.dtype).tiny
     direction = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
-    faces = slab.whole.lower[slab.axis], slab.whole.upper[slab.axis]
-    one, other = (
-        (face - origin) / direction
+    is_upwards = direction > 0
+    beyond = torch.full_like(direction, torch.inf)
+    low, high = (
+        torch.where(is_upwards, outside, -outside)
         if end is None
         else _next_node(slab, rays, (end - origin) / direction, sampler)
-        for end, face in zip(slab.ends, faces, strict=True)
+        for end, outside in zip(slab.ends, (-beyond, beyond), strict=True)
     )
-    enter, leave = torch.minimum(one, other), torch.maximum(one, other)
+    enter, leave = torch.where(is_upwards, low, high), torch.where(is_upwards, high, low)
     near, far = (torch.minimum(torch.maximum(end, near), far) for end in (enter, leave))
     return near, far
 

@@ -78,7 +78,6 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delitem(CASES, name)
     monkeypatch.setattr(plume, "load_pair", coarse(plume.load_pair))
     monkeypatch.setattr("ddrecon.bench.measure.QUICK_PATHS", (1, 2))
-    monkeypatch.setattr("ddrecon.run.report_volume.FRAMES", 2)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -156,7 +156,7 @@ def test_a_phase_function_that_scatters_backward() -> None:
         cloud(12),
         sigma_a=torch.full((3,), 0.1),
         sigma_s=torch.full((3,), 40.0),
-        g=torch.tensor(-0.802),
+        phase=torch.tensor(-0.802),
     )
     scene = photographed(scene_of(volume, 3, 16))
     assert (

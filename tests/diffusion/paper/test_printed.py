@@ -288,7 +288,9 @@ def test_both_derivatives_of_an_image_agree_with_differences(wanted: str):
             else scene.lights
         )
         volume = (
-            scene.volume if wanted == "irradiance" else replace(scene.volume, **{wanted: value})
+            scene.volume
+            if wanted == "irradiance"
+            else replace(scene.volume, **{"phase" if wanted == "g" else wanted: value})
         )
         return render(replace(scene, volume=volume, lights=lights))[0, :, 1:3, 1:4]
 
