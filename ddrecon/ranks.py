@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
-from time import monotonic, perf_counter, sleep
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ddrecon.errors import RanksError, UsageError, one_line
@@ -26,15 +26,13 @@ MEET_SECONDS = 120.0
 MEET_VARIABLE = "DDRECON_MEET_SECONDS"
 EXCHANGE_SECONDS = 1800.0
 """So long they wait in an exchange. A rank that has ended is noticed at once."""
-TOLD_SECONDS = 3.0
-"""So long a rank that fails waits whether the first fails of the same."""
 
 T = TypeVar("T")
 
 
 @dataclass
 class _Group:
-    """This process's place among `count` ranks, and where they leave each other notes, `store`.
+    """This process's place among `count` ranks.
 
     `has_slabs`: they share out the cells of a scene, not its views. `bytes` were handed to
     exchanges so far, which took `seconds`. One rank exchanges nothing.
@@ -42,7 +40,6 @@ class _Group:
 
     rank: int = 0
     count: int = 1
-    store: Any = None
     has_slabs: bool = False
     bytes: int = 0
     seconds: float = 0.0
@@ -90,7 +87,7 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
             f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
             "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
         ) from error
-    _group = _Group(rank, count, store, has_slabs)
+    _group = _Group(rank, count, has_slabs)
 
 
 def _meet(store: Any, rank: int, count: int, wait: timedelta) -> None:
@@ -259,52 +256,18 @@ def _exchange(count: int) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise RanksError(_told() or f"another rank has ended ({_reason(error)})") from error
+        raise RanksError(f"another rank has ended ({_reason(error)})") from error
     _group.bytes += count
     _group.seconds += perf_counter() - begun
 
 
 def tell_failure(error: BaseException) -> str | None:
-    """What this rank is to print as it ends by `error`; None where another says the same.
-
-    The others learn of it, as the reason why this rank has ended.
-    """
+    """What this rank is to print as it ends by `error`; None where another says the same."""
     text = str(error)
-    if _group.count == 1:
-        return text
-    if isinstance(error, RanksError):
+    if _group.count > 1 and isinstance(error, RanksError):
         # All ranks have lost the one that failed: it is told once a machine.
         return text if os.environ.get("LOCAL_RANK", "0") == "0" else None
-    try:
-        _group.store.set(f"ddrecon/failed/{_group.rank}", one_line(text))
-        if _group.rank == 0:
-            return text
-        end = monotonic() + TOLD_SECONDS
-        while monotonic() < end and not _note(0):
-            sleep(0.05)
-        # The first adds where it has kept the state.
-        if _note(0).startswith(one_line(text)):
-            return None
-    except RuntimeError:
-        pass  # as in `_told`
-    return f"rank {_group.rank}: {text}"
-
-
-def _told() -> str | None:
-    """What a rank that failed has said of it."""
-    try:
-        for rank in range(_group.count):
-            if note := _note(rank):
-                return f"rank {rank} has failed: {note}"
-    except RuntimeError:
-        pass  # the first rank has ended, and has taken the notes with it
-    return None
-
-
-def _note(rank: int) -> str:
-    """What `rank` has said of its failure; empty where nothing."""
-    key = f"ddrecon/failed/{rank}"
-    return str(_group.store.get(key).decode()) if _group.store.check([key]) else ""
+    return f"rank {_group.rank}: {text}" if _group.rank else text
 
 
 def _reason(error: BaseException) -> str:

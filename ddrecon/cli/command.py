@@ -104,9 +104,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             sys.exit(error.exit_code)
         except (MemoryError, RuntimeError) as error:
             from ddrecon.memory import is_shortage
-            from ddrecon.ranks import tell_failure
 
-            tell_failure(error)
             if debug or not is_shortage(error):
                 raise
             reason = str(error).partition("\n")[0] or "no more is given"

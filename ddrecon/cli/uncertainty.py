@@ -46,6 +46,12 @@ SAMPLES = 16
     help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
 )
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
+@click.option(
+    "--next-view",
+    type=click.Choice(["ring", "lights"]),
+    help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
+    "(ring), or in directional lights that are (lights).",
+)
 @click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
 @REPORT
 @in_session
@@ -58,6 +64,7 @@ def uncertainty(
     read: float | None,
     tolerance: float | None,
     has_samples: bool,
+    next_view: str | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -69,7 +76,10 @@ def uncertainty(
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
+    from ddrecon.uncertainty.next_view import FEWEST
 
+    if next_view and samples < FEWEST:
+        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
 
@@ -83,7 +93,7 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, noise, tolerance)
+    request = Request(session.seed, noise, tolerance, next_view)
     if not is_first():
         follow_uncertainty(taken, samples, request)
         return

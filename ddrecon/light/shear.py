@@ -23,7 +23,7 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
-from ddrecon.slabs.exchange import renew_halo, sum_before
+from ddrecon.slabs.exchange import add_halo, sum_before
 from ddrecon.slabs.slab import Slab, whole_of
 
 MARGIN = 2
@@ -99,7 +99,7 @@ def _sum_mass(
     third_order = ThirdOrder(0, 1, bound)
     mass = passed * step + third_order.bounded(bent * (0.5 * step))
     entered = rays.to_cells(mass, third_order)
-    return renew_halo(entered, grid) if isinstance(grid, Slab) else entered, step
+    return add_halo(grid.own(entered), grid) if isinstance(grid, Slab) else entered, step
 
 
 def _sum_before(field: Tensor, slab: Slab, rays: Part, count: int, is_upwards: bool) -> Tensor:

@@ -94,16 +94,21 @@ class Curvature:
         parts = self.split(vector)
         return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
-    def tangents(self, vector: Tensor) -> dict[str, Tensor]:
-        """J times `vector`: how the picture [3, h, w] of each training view changes, by name."""
-        changes = self.split(vector)
-        derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
+    def tangents(self, vector: Tensor, scene: Scene | None = None) -> dict[str, Tensor]:
+        """J times `vector`: how the picture [3, h, w] of each training view changes, by name.
+
+        Or those of the views of a `scene` of the same volume, whose own views and lights are known.
+        """
+        changes, scene = self.split(vector), scene or self.scene
+        known = [k for k in ("lights", "views") if getattr(scene, k) is not getattr(self.scene, k)]
+        derivatives = scene.optimize.derivatives if scene.optimize else "all"
         with torch.no_grad(), forward_ad.dual_level():
             duals = {
                 name: forward_ad.make_dual(value, changes[name])
                 for name, value in self.values.items()
+                if name.partition(".")[0] not in known
             }
-            world = with_values(self.scene, duals)
+            world = with_values(scene, duals)
             light_field = solve_light(world, self.new_memory())
 
             def change_of(view: View) -> Tensor:
@@ -111,7 +116,7 @@ class Curvature:
                 tangent = forward_ad.unpack_dual(picture).tangent
                 return torch.zeros_like(picture) if tangent is None else tangent.clone()
 
-            return share_pictures(self.scene, change_of)
+            return share_pictures(scene, change_of)
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

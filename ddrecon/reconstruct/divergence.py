@@ -40,16 +40,18 @@ def explain_divergence(
             what, advice = what.partition(";")[0], f"{error.advice}, or "
         else:
             what = "the light is not finite"
-    largest = "; ".join(
-        describe_largest(parameter.name, parameter.value, parameter.is_field)
-        for parameter in parameters
-    )
+    largest = list[str]()
+    for parameter in parameters:
+        values = parameter.value.detach()
+        index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
+        place = _name_entry(parameter.name, index, parameter.is_field)
+        largest.append(f"{place} is {float(values[tuple(index)]):.4g}")
     rates = " and ".join(
         f"optimize.parameters.{parameter.name}.lr (now {parameter.largest_rate:.3g})"
         for parameter in parameters
     )
     return DivergenceError(
-        iteration, f"{what}; at most, {largest}", residual, f"{advice}lower {rates}"
+        iteration, f"{what}; at most, {'; '.join(largest)}", residual, f"{advice}lower {rates}"
     )
 
 
@@ -60,13 +62,6 @@ def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:
     """
     flaws = torch.nonzero(~torch.isfinite(values.detach()))
     return _name_entry(name, flaws[0].tolist(), is_field) if len(flaws) else None
-
-
-def describe_largest(name: str, values: Tensor, is_field: bool) -> str:
-    """The entry of the parameter `name` of largest magnitude, and its value."""
-    values = values.detach()
-    index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
-    return f"{_name_entry(name, index, is_field)} is {float(values[tuple(index)]):.4g}"
 
 
 def _name_entry(name: str, index: list[int], is_field: bool) -> str:

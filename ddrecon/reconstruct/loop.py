@@ -121,23 +121,22 @@ class Reconstruction:
         objective = self._differentiate(values, compared)
         loss, gradients = add_penalties(objective, self.parameters, power)
         # Check: a derivative that is not finite would spoil the parameters for good.
-        numbers = compared.read(objective, loss, gradients, self.parameters)
+        read = compared.read(objective, loss, gradients, self.parameters)
+        total, of_images, of_views = read
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         # Solutions are not in it: solves only begin there.
         self.before_step = None
         self.before_step = self.state()
         del self.before_step["solutions"]
         # Step: every parameter against its derivative.
-        self.misfit = math.sqrt(numbers.of_images / power) if power else 1.0
+        self.misfit = math.sqrt(of_images / power) if power else 1.0
         self._step(values, gradients, compared)
         # Judge: is there more to be done, here or at all?
-        penalty, means = numbers.loss - numbers.of_images, numbers.means
         names = [view.name for view in compared.views]
-        losses, chi_squares = (
-            dict(zip(names, numbers.of_views.get(kind, ()), strict=False))
-            for kind in ("loss", "chi_square")
-        )
-        self.schedule.note(self.iteration, losses, chi_squares, penalty)
+        by_view = {kind: dict(zip(names, row, strict=True)) for kind, row in of_views.items()}
+        losses, chi_squares = by_view["loss"], by_view.get("chi_square", {})
+        self.schedule.note(self.iteration, losses, chi_squares, total - of_images)
+        means = {kind: sum(row) / len(row) for kind, row in of_views.items()}
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim = None, None
@@ -149,9 +148,9 @@ class Reconstruction:
         row = Row(
             iteration=self.iteration + 1,
             seconds=self.total.seconds + perf_counter() - start,
-            loss=numbers.loss,
-            data_loss=numbers.of_images,
-            penalty=penalty,
+            loss=total,
+            data_loss=of_images,
+            penalty=total - of_images,
             psnr=means["psnr"],
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),

@@ -295,19 +295,15 @@ def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
         return found if len(found) == len(views) > 1 else []
 
     if exposures := of_all("exposure"):
-        gauges.append(Gauge(exposures, _common_gain(exposures), is_relative=True))
+        # The same gain of all, of each color by itself where all have three.
+        sizes, like = [p.value.numel() for p in exposures], exposures[0].value.detach()
+        colors = sizes[0] if len(set(sizes)) == 1 else 1
+        gain = torch.eye(colors).to(like).repeat(sum(sizes) // colors, 1)
+        gauges.append(Gauge(exposures, gain, is_relative=True))
     if cameras := of_all("camera"):
         directions = torch.cat([_common_motion(view, train) for view in views])
         gauges.append(Gauge(cameras, directions, is_relative=False))
     return gauges
-
-
-def _common_gain(exposures: Sequence[Parameter]) -> Tensor:
-    """The same gain of all, [n, C]: of each color by itself where all have three."""
-    like = exposures[0].value.detach()
-    if all(len(parameter.value) == len(like) for parameter in exposures):
-        return torch.eye(len(like), dtype=like.dtype, device=like.device).repeat(len(exposures), 1)
-    return like.new_ones(sum(len(parameter.value) for parameter in exposures), 1)
 
 
 def _common_motion(view: View, scene: Scene) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 
 import torch
@@ -28,24 +27,6 @@ def target_of(view: View) -> Tensor:
     if view.image is None:
         raise ValueError(f"view {view.name} has no image")
     return view.image
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """What Python knows of an iteration: the `loss`, and its part of the images.
-
-    `of_views` are numbers of each view that was compared: its loss, "psnr" [dB], "ssim" where that
-    was looked at, and "chi_square" per pixel where noise is known.
-    """
-
-    loss: float
-    of_images: float
-    of_views: Mapping[str, Sequence[float]]
-
-    @property
-    def means(self) -> dict[str, float]:
-        """Their means over views, by kind."""
-        return {kind: sum(row) / len(row) for kind, row in self.of_views.items()}
 
 
 class Comparison:
@@ -104,11 +85,12 @@ class Comparison:
         loss: Tensor,
         gradients: Mapping[str, Tensor],
         parameters: Sequence[Parameter],
-    ) -> Numbers:
-        """The numbers of an iteration, all read at once, with `loss` and `gradients` of all.
+    ) -> tuple[float, float, dict[str, list[float]]]:
+        """The `loss` of an iteration, its part of the images, and numbers of each view by kind.
 
-        Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not
-        finite.
+        They are its loss, "psnr" [dB], "ssim" where that was looked at, and "chi_square" per pixel
+        where noise is known; all are read at once, with the extremes of `gradients`. Raises
+        NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
         """
         self.gather()
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
@@ -121,7 +103,7 @@ class Comparison:
             require_finite(parameters, gradients)
         shares = map(self.share, self.views)
         losses = [x / share for x, share in zip(of_views["loss"], shares, strict=True)]
-        return Numbers(total, of_images, of_views | {"loss": losses})
+        return total, of_images, of_views | {"loss": losses}
 
 
 def add_penalties(

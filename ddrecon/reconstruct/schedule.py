@@ -11,7 +11,7 @@ the last part only by one of the first two, or after `MOST` iterations in all.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -106,7 +106,12 @@ class Schedule:
         """Ends the run, or `part` of it, where that is done after `iteration`."""
         now, ends, place = self.progress, self._part_ends, self.place(iteration + 1)
         is_noise = self.chi_square is not None and self.chi_square <= 1
-        is_at_rest = _is_at_rest(now.recent, self.window)
+        # The last window of losses is hardly lower than the one before, in the mean.
+        before, after = (
+            sum(part) for part in (now.recent[: -self.window], now.recent[-self.window :])
+        )
+        is_whole = len(now.recent) == 2 * self.window
+        is_at_rest = is_whole and after > (1 - tuning.FALL) * before
         if is_noise and part >= len(self.refine_at):
             now.ended = "noise"
         elif is_at_rest and part == len(ends):
@@ -143,14 +148,6 @@ class Schedule:
         return sum(self.place(iteration) >= end for end in self._part_ends)
 
 
-def _is_at_rest(losses: Sequence[float], window: int) -> bool:
-    """Whether the last `window` of `losses` are hardly lower than those before, in the mean."""
-    if len(losses) < 2 * window:
-        return False
-    before, after = sum(losses[-2 * window : -window]), sum(losses[-window:])
-    return after > (1 - tuning.FALL) * before
-
-
 def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
     """The part of their value that learning rates have in an iteration, in (0, 1].
 
@@ -173,12 +170,8 @@ def pick_views(count: int, drawn: int, iteration: int, seed: int) -> list[int]:
         return list(range(count))
     # Over a run, views are taken from shuffled passes over all of them, one after another.
     places = range(iteration * drawn, (iteration + 1) * drawn)
-    orders = {number: _shuffle(count, seed, number) for number in {i // count for i in places}}
+    orders = dict[int, list[int]]()
+    for number in {place // count for place in places}:
+        generator = torch.Generator().manual_seed(seed % 2**32 * 1_000_003 + number)
+        orders[number] = torch.randperm(count, generator=generator).tolist()
     return [orders[place // count][place % count] for place in places]
-
-
-def _shuffle(count: int, seed: int, number: int) -> list[int]:
-    """The order of `count` views in pass `number` over them."""
-    generator = torch.Generator().manual_seed(seed % 2**32 * 1_000_003 + number)
-    order: list[int] = torch.randperm(count, generator=generator).tolist()
-    return order

@@ -108,12 +108,10 @@ def listen(port: int | None) -> socket:
     taken.
     """
     if port is None:
-        try:
+        with suppress(OSError):
             return create_server((HOST, PORT))
-        except OSError:
-            port = 0
     try:
-        return create_server((HOST, port))
+        return create_server((HOST, port or 0))
     except OSError as error:
         reason = error.strerror or error
         raise UsageError(f"--port {port}: {reason}; leave it out for a free one") from error

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,9 @@ class LossLog:
 
     def cut(self, iteration: int) -> None:
         """Removes the rows after `iteration`, where a resumed run goes on, and what is no row."""
-        self._write(row for row in self.rows() if row.iteration <= iteration)
+        rows = [_cells(row) for row in self.rows() if row.iteration <= iteration]
+        with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
+            csv.writer(stream).writerows([COLUMNS, *rows])
 
     def add(self, row: Row) -> None:
         """Adds one row."""
@@ -56,10 +57,6 @@ class LossLog:
                 f"{self.path}: has {len(rows)} of the {made} iterations made", DataWarning, 2
             )
         return rows
-
-    def _write(self, rows: Iterable[Row]) -> None:
-        with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
-            csv.writer(stream).writerows([COLUMNS, *map(_cells, rows)])
 
 
 def _row(line: str) -> Row | None:

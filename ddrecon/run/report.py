@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -50,15 +50,6 @@ PIXELS = 1_200_000
 """So many pixels all pictures of views have together, at most."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
-TIMING_HEAD = [
-    "cells",
-    "iterations",
-    "seconds each (median)",
-    "seconds",
-    "forward solve, iterations",
-    "adjoint solve, iterations",
-]
-"""The columns of the table of timings."""
 
 
 def write_run_report(
@@ -79,7 +70,6 @@ def write_run_report(
         section("Volume", volume_section(findings, summary)),
         section("Loss", side_by_side(*curves(rows))),
         section("Views", *view_section(findings)),
-        section("Timings", _timings(rows)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", settings)),
         section("Versions", versions(known)),
@@ -162,23 +152,6 @@ def curves(rows: Sequence[Row]) -> list[str]:
         draw_curve("loss", losses, "iteration", is_logarithmic=True),
         draw_curve("PSNR [dB]", quality, "iteration"),
     ]
-
-
-def _timings(rows: Sequence[Row]) -> str:
-    """What an iteration took at each resolution."""
-    stages: dict[int, list[tuple[Row, float]]] = {}
-    for row, before in zip(rows, [0.0, *(row.seconds for row in rows)], strict=False):
-        stages.setdefault(row.cells, []).append((row, row.seconds - before))
-    lines = []
-    for cells, timed in stages.items():
-        seconds = [taken for _, taken in timed]
-        solves = [
-            mean(row.forward_iterations for row, _ in timed),
-            mean(row.adjoint_iterations for row, _ in timed),
-        ]
-        times = f"{median(seconds):.3f}", f"{sum(seconds):.1f}"
-        lines.append((f"{cells:,}", len(timed), *times, *(f"{count:.1f}" for count in solves)))
-    return table(TIMING_HEAD, lines)
 
 
 def view_section(findings: Findings) -> list[str]:

@@ -76,11 +76,6 @@ def add_halo(own: Tensor, slab: Slab) -> Tensor:
     return _exchange(give, back, own)
 
 
-def renew_halo(field: Tensor, slab: Slab) -> Tensor:
-    """`field` [..., z, y, x] of `slab` with its neighbors' cells as they have them (E40)."""
-    return add_halo(slab.own(field), slab)
-
-
 def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
     """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E40).
 
@@ -91,15 +86,10 @@ def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
 
 def gather_own(own: Tensor, slab: Slab) -> Tensor:
     """The same from the `own` layers of a slab, of any shape across its axis."""
-    return _gather(own, slab.axis - 3, slab.sizes)
-
-
-def _gather(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
-    """All ranks' `own` parts along `axis` < 0, of `sizes`."""
-    begin, size = sum(sizes[: own_rank()]), sizes[own_rank()]
+    axis, begin = slab.axis - 3, slab.cuts[slab.rank]
     return _exchange(
-        lambda own: join_parts(own, axis, sizes),
-        lambda whole_bar: _sum(whole_bar).narrow(axis, begin, size),
+        lambda own: join_parts(own, axis, slab.sizes),
+        lambda whole_bar: _sum(whole_bar).narrow(axis, begin, slab.size),
         own,
     )
 

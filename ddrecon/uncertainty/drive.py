@@ -19,6 +19,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoint
 from ddrecon.run.run_folder import CHECKPOINTS, remove_samples
 from ddrecon.uncertainty.folder import write_found, write_sample
+from ddrecon.uncertainty.next_view import candidates_of
 from ddrecon.uncertainty.posterior import Sample
 from ddrecon.uncertainty.samples import PictureErrors, Uncertainty
 
@@ -30,6 +31,7 @@ class Request:
     seed: int
     noise: Noise | None = None
     tolerance: float | None = None
+    next_view: str | None = None
 
 
 def drive_uncertainty(
@@ -82,7 +84,9 @@ def follow_uncertainty(run: Reconstruction, samples: int, request: Request) -> N
 def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) -> Uncertainty:
     """The samples of `run` so far, as `state` has them."""
     errors = None if state is None else PictureErrors(**state["errors"])
-    found = Uncertainty(run, request.seed, request.noise, request.tolerance, errors)
+    # Before anything takes long: there may be nothing to rank.
+    shots = candidates_of(run.level.train, request.next_view) if request.next_view else []
+    found = Uncertainty(run, request.seed, request.noise, request.tolerance, errors, shots)
     if state is not None:
         found.restore(state)
     return found

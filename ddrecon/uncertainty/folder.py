@@ -14,6 +14,7 @@ from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
 from ddrecon.run.run_folder import write_values
+from ddrecon.uncertainty.next_view import rank_views
 from ddrecon.uncertainty.samples import Uncertainty
 from ddrecon.variables.kinds import kind_of
 
@@ -52,6 +53,7 @@ def write_found(found: Uncertainty, path: Path, seconds: float) -> dict[str, Any
         "fields": fields,
         "numbers": found.described_numbers(),
         "correlations": found.correlations().tolist() if found.tabled else [],
+        "next_views": rank_views(found),
     }
     write_json(path / RECORD, record)
     write_uncertainty_report(path / "report.html", stated, record)
@@ -91,12 +93,13 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
             f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
             for name, number in record["numbers"].items()
         ),
+        *(
+            f"{'  then ' if place else 'next view: '}{view['name']}, whose picture takes at least "
+            f"{100 * view['gain']:.1f} % of the variance (+- {100 * view['error']:.1f})"
+            for place, view in enumerate(record["next_views"])
+        ),
         f"deviations and report written to {path}",
     ]
-
-
-STRONG = 0.5
-"""Correlations above this are told of."""
 
 
 def write_uncertainty_report(
@@ -104,35 +107,42 @@ def write_uncertainty_report(
 ) -> None:
     """Writes the page about the fields `stated` by kind and name, and what `record` has of them."""
     sections = [
-        section(
-            name.capitalize(),
-            *_field(name, {kind: values[name] for kind, values in stated.items()}, numbers),
-        )
+        section(name.capitalize(), *_field(name, stated, numbers))
         for name, numbers in record["fields"].items()
     ]
     if record["numbers"]:
-        sections.append(section("Numbers", *_numbers(record)))
+        rows = [
+            (name, f"{number['value']:.5g} ± {number['deviation']:.2g}")
+            for name, number in record["numbers"].items()
+        ]
+        sections.append(section("Numbers", table(["number", "value ± deviation"], rows)))
+    if record["next_views"]:
+        rows = [
+            (view["name"], f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %")
+            for view in record["next_views"]
+        ]
+        head = ["picture", "of the variance of all cells, at least"]
+        sections.append(section("Next picture", table(head, rows)))
     sections.append(section("How", *_how(record)))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
-    write_page(path, title, _lead(record), sections, is_alive=False)
-
-
-def _lead(record: Mapping[str, Any]) -> str:
     noise = record["noise"]
-    source = "what the reconstruction leaves" if noise["told"] is not None else "the scene"
-    return (
-        f"{record['samples']} samples in {record['seconds']:.1f} s. "
-        f"Pictures err by {noise['deviation']:.3g} of radiance, by {source}."
+    lead = (
+        f"{record['samples']} samples in {record['seconds']:.1f} s. Pictures err by"
+        f" {noise['deviation']:.3g} of radiance, by {noise['from']}."
     )
+    write_page(path, title, lead, sections, is_alive=False)
 
 
-def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]) -> list[str]:
+def _field(
+    name: str, stated: Mapping[str, Mapping[str, Tensor]], numbers: Mapping[str, float]
+) -> list[str]:
     """Slices of a field."""
-    white, strongest = (find_white_value(stated[kind]) for kind in ("mean", "std"))
+    mean, deviation, told = (stated[kind][name] for kind in ("mean", "std", "told"))
+    white, strongest = find_white_value(mean), find_white_value(deviation)
     pictures = [
-        (stated["mean"], white, f"{name}, mean of the samples: white is {white:.3g}"),
-        (stated["std"], strongest, f"standard deviation: white is {strongest:.3g}"),
-        (stated["told"], 1.0, "told by pictures: black is nothing, white is all"),
+        (mean, white, f"{name}, mean of the samples: white is {white:.3g}"),
+        (deviation, strongest, f"standard deviation: white is {strongest:.3g}"),
+        (told, 1.0, "told by pictures: black is nothing, white is all"),
     ]
     shown = "".join(
         picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
@@ -147,38 +157,9 @@ def _field(name: str, stated: Mapping[str, Tensor], numbers: Mapping[str, float]
     ]
 
 
-def _numbers(record: Mapping[str, Any]) -> list[str]:
-    """The table of numbers with their deviations, and of those that hang together."""
-    names = list(record["numbers"])
-    rows = [
-        (name, f"{number['value']:.5g} ± {number['deviation']:.2g}")
-        for name, number in record["numbers"].items()
-    ]
-    parts = [table(["number", "value ± deviation"], rows)]
-    pairs = [
-        (names[i], names[j], f"{row[j]:+.2f}")
-        for i, row in enumerate(record["correlations"])
-        for j in range(i)
-        if abs(row[j]) > STRONG
-    ]
-    if pairs:
-        parts += [
-            paragraph(f"Numbers that hang together (correlation above {STRONG} by these samples):"),
-            table(["", "", "correlation"], pairs),
-        ]
-    return parts
-
-
 def _how(record: Mapping[str, Any]) -> list[str]:
     """What stands behind the numbers."""
-    noise, error = record["noise"], 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
-    rows = [
-        ("deviation of a pixel, in radiance", f"{noise['deviation']:.3g}"),
-        ("known from", str(noise["from"])),
-        ("numbers in all pictures", str(noise["count"])),
-    ]
-    if noise["told"] is not None:
-        rows.append(("of these spent on telling the volume", f"{noise['told']:.0f}"))
+    error = 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
     return [
         paragraph(
             f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
@@ -189,5 +170,4 @@ def _how(record: Mapping[str, Any]) -> list[str]:
             "All this is about the optimum that was found, for pictures that err by noise alone:"
             " what the model of light lacks is not in it."
         ),
-        table(["pictures", ""], rows),
     ]

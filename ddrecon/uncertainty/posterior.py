@@ -322,9 +322,10 @@ class Information:
             squares[name] = mean_around(squares[name])
         self.diagonal = curvature.join(squares)
         self.roots = {name: squares[name].sqrt() for name in fields}
+        tiny = torch.finfo(self.diagonal.dtype).tiny
         self.spectra = {
-            name: _find_spectrum([_over(probe[name], self.roots[name]) for probe in probes])
-            for name in fields
+            name: _find_spectrum([probe[name] / root.clamp(min=tiny) for probe in probes])
+            for name, root in self.roots.items()
         }
 
     def product(self, vector: Tensor) -> Tensor:
@@ -354,8 +355,3 @@ def _find_spectrum(fields: list[Tensor]) -> Tensor:
         power = (power.roll(1, axis) + power + power.roll(-1, axis)) / 3
     cells = power.shape[-3] * power.shape[-2] * power.shape[-1]
     return power[..., : power.shape[-1] // 2 + 1] / cells
-
-
-def _over(field: Tensor, root: Tensor) -> Tensor:
-    """`field` over `root`; 0 where that is."""
-    return torch.where(root > 0, field / root.clamp(min=torch.finfo(root.dtype).tiny), 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
+from ddrecon.scene import Scene
 from ddrecon.uncertainty.posterior import (
     NUMBERS,
     PROBED,
@@ -29,7 +30,7 @@ from ddrecon.uncertainty.posterior import (
 )
 from ddrecon.variables.values import component_names
 
-SUMS = ("count", "products", "residual", "sums", "numbers")
+SUMS = ("count", "products", "residual", "sums", "numbers", "changes", "pictures")
 """What samples leave in an `Uncertainty`."""
 LEAST_LEFT = 0.1
 """At least this part of all numbers is taken for noise: a run that fits all else shows none."""
@@ -60,7 +61,8 @@ class Uncertainty:
 
     A sample is drawn with `step`; which one depends on `seed` and on how many there were. `noise`
     is that of all pictures, where their scene is not to say. `errors` is what was found before.
-    `tolerance` is that of samples; None is what density or numbers deserve.
+    `tolerance` is that of samples; None is what density or numbers deserve. How samples change the
+    views of `candidates`, scenes of the same volume, is kept for `rank_views`.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Uncertainty:
         noise: Noise | None = None,
         tolerance: float | None = None,
         errors: PictureErrors | None = None,
+        candidates: Sequence[Scene] = (),
     ):
         train, targets, power = run.level.train, run.level.targets, run.problem.power
         self.parameters = run.parameters
@@ -100,6 +103,8 @@ class Uncertainty:
         self.count, self.products, self.residual = 0, 0, 0.0
         self.sums = {key: nothing.clone() for key in ("post", "post2", "prior", "prior2")}
         self.numbers: list[Tensor] = []
+        self.candidates, self.changes = candidates, list[Tensor]()
+        self.pictures: list[dict[str, Tensor]] = []
 
     def step(self) -> Sample:
         """One more sample."""
@@ -109,6 +114,10 @@ class Uncertainty:
             self.sums[key] += part
             self.sums[f"{key}2"] += part.square()
         self.numbers.append(self._numbers_in(post))
+        if self.candidates:
+            found = [self.curvature.tangents(sample.change, scene) for scene in self.candidates]
+            self.changes.append(sample.change.cpu())
+            self.pictures.append({n: p.cpu() for each in found for n, p in each.items()})
         self.count += 1
         self.products += sample.products
         self.residual = max(self.residual, sample.residual)

@@ -54,11 +54,6 @@ STEEPEST_G = 0.99
 XYZ = ("x", "y", "z")
 
 
-def density_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """What has an optical depth of `DENSITY_STEP`."""
-    return DENSITY_STEP * unit_of(scene, name)
-
-
 def cross_section_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the mean [1/u], which counts as at least what has an optical depth of 1."""
     return RELATIVE_STEP * max(float(start.mean()), unit_of(scene, name))
@@ -68,11 +63,6 @@ def brightness_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the mean, which counts as at least `RELATIVE_STEP`, seen from the box's side."""
     unit = _side(scene) ** 2 if name.endswith(".intensity") else 1.0
     return RELATIVE_STEP * max(float(start.mean()), RELATIVE_STEP * unit)
-
-
-def position_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the box's shortest side [u]."""
-    return RELATIVE_STEP * _side(scene)
 
 
 def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
@@ -89,20 +79,10 @@ def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
     return PIXELS * start.new_tensor([turn, turn, turn, pixel, pixel, pixel * depth])
 
 
-def exposure_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the exposure."""
-    return EXPOSURE_STEP * float(start.mean())
-
-
 def offset_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the root mean square of the view's picture, or of 1 where there is none."""
     image = _view_of(scene, name).image
     return OFFSET_STEP * (1.0 if image is None else float(image.square().mean().sqrt()))
-
-
-def direction_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the direction's length: a turn by some 3 degrees."""
-    return RELATIVE_STEP / 2 * float(start.norm())
 
 
 def unit_of(scene: Scene, name: str) -> float:
@@ -173,7 +153,13 @@ _LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, release=0.3)
 
 KINDS: Mapping[str, Kind] = {
-    "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3, is_compressed=True),
+    "density": Kind(
+        lambda scene, name, start: DENSITY_STEP * unit_of(scene, name),
+        low=0,
+        is_cellwise=True,
+        tv=3e-3,
+        is_compressed=True,
+    ),
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
@@ -189,10 +175,18 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.scale": Kind(brightness_rate, low=0, release=0.3),
     # in degrees
     "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
+    # a turn by some 3 degrees
     "lights.N.direction": Kind(
-        direction_rate, components=XYZ, is_direction=True, difference_steps=SHORT_STEPS
+        lambda scene, name, start: RELATIVE_STEP / 2 * float(start.norm()),
+        components=XYZ,
+        is_direction=True,
+        difference_steps=SHORT_STEPS,
     ),
-    "lights.N.position": Kind(position_rate, components=XYZ, difference_steps=SHORT_STEPS),
+    "lights.N.position": Kind(
+        lambda scene, name, start: RELATIVE_STEP * _side(scene),
+        components=XYZ,
+        difference_steps=SHORT_STEPS,
+    ),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
         pose_rate,
@@ -200,7 +194,9 @@ KINDS: Mapping[str, Kind] = {
         difference_steps=SHORT_STEPS,
     ),
     # what a camera does to radiance: a factor, and what is added to it
-    "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True),
+    "views.NAME.exposure": Kind(
+        lambda scene, name, start: EXPOSURE_STEP * float(start.mean()), low=1e-3, is_color=True
+    ),
     "views.NAME.offset": Kind(offset_rate, is_color=True),
     # of a perspective camera: its focal length in widths of the image, and the rest of its lens
     "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),

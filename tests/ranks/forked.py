@@ -28,7 +28,6 @@ import torch._dynamo
 # pictures and derivatives in forward mode need.
 import ddrecon.cli.session
 import ddrecon.cli.uncertainty
-import ddrecon.ranks
 import ddrecon.run.render_folder
 import ddrecon.scene_file.build
 import ddrecon.scene_file.doubts
@@ -38,7 +37,6 @@ from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction
 
 PIL.Image.init()
-ddrecon.ranks.TOLD_SECONDS = 0.5
 
 LOADED = set(sys.modules)
 

@@ -23,12 +23,6 @@ def test_no_rank_has_much_more_than_it_must(costs: list[float], ranks: int) -> N
     assert sum(loads) == pytest.approx(sum(costs))
 
 
-@given(st.integers(1, 8), st.integers(1, 6))
-def test_like_jobs_are_shared_out_evenly(ranks: int, each: int) -> None:
-    owners = assign([2.5] * (ranks * each), ranks)
-    assert [owners.count(rank) for rank in range(ranks)] == [each] * ranks
-
-
 def test_one_rank_exchanges_nothing() -> None:
     tensor, value = torch.rand(3), object()
     assert sum_over_ranks([tensor])[0] is tensor

@@ -40,18 +40,6 @@ def test_the_scene_itself_is_left_alone(ball_scene: Scene) -> None:
     assert not ball_scene.volume.density.requires_grad
 
 
-def test_bounds_hold_at_every_step(ball_scene: Scene) -> None:
-    settings = replace(ball_scene.optimize.parameters["density"], min=0.01, max=0.3, lr=1.0)
-    scene = replace(
-        ball_scene, optimize=replace(ball_scene.optimize, parameters={"density": settings})
-    )
-    run = Reconstruction(scene)
-    for _ in range(3):
-        run.step()
-        assert run.parameters[0].value.min() >= 0.01
-        assert run.parameters[0].value.max() <= 0.3
-
-
 def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
     views = [
         replace(view, image=view.image * 0 if view.is_test else view.image)

@@ -59,17 +59,6 @@ def test_a_step_counts_the_curvature_of_smoothing_where_a_field_is_even() -> Non
     )
 
 
-@pytest.mark.parametrize("part, largest", [(1.0, 1.0), (0.5, 0.6)])
-def test_half_of_the_damping_is_where_steps_no_longer_fade(part: float, largest: float) -> None:
-    # A step of length 1 over the damping meets eigenvalues of smoothing over its diagonal up to 2.
-    keep, length = BETAS[0], part * 2 / (STIFFNESS / 2)
-    mean = torch.tensor([[1 - keep, keep]], dtype=torch.float64)
-    onward = keep * mean + torch.tensor([[1 - keep, 0.0]])
-    matrix = torch.cat([torch.tensor([[1.0, 0.0]]) - length * onward, mean])
-    radius = float(torch.linalg.eigvals(matrix).abs().max())
-    assert radius == pytest.approx(1) if part == 1 else radius < largest
-
-
 def descend(start: Tensor, target: Tensor, weight: float) -> Tensor:
     """The density after 30 steps towards `target`, with smoothing."""
     grid = box_grid(tuple(start.shape))

@@ -13,7 +13,7 @@ from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.kinds import KINDS, PAIRS, is_of_volume, kind_of, pattern_of
+from ddrecon.variables.kinds import KINDS, pattern_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
@@ -120,15 +120,3 @@ def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -
         field = torch.full((*([3] if kind.is_color else []), *cells), 0.5, dtype=torch.float64)
         changed = with_values(scene, {name: field})
         torch.testing.assert_close(value_of(changed, name), field, rtol=1e-14, atol=0)
-
-
-@pytest.mark.parametrize("pattern", KINDS)
-def test_differences_are_taken_by_ever_shorter_steps(pattern: str) -> None:
-    steps = KINDS[pattern].difference_steps
-    assert list(steps) == sorted(steps, reverse=True) and 0 < steps[-1] < steps[0] < 1
-
-
-def test_pairs_are_of_the_volume_and_of_the_same_axes() -> None:
-    for pair in PAIRS:
-        assert set(pair) <= set(filter(is_of_volume, KINDS))
-        assert len({(kind_of(name).is_color, kind_of(name).is_cellwise) for name in pair}) == 1

@@ -26,7 +26,7 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.slabs.exchange import renew_halo
+from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
 SPECTRUM = 0.9
@@ -60,7 +60,7 @@ def _renewed(light: Moments, grid: Grid) -> Moments:
     """`light`, whose flux is right where slabs end: there it was made of half of what is around."""
     if light.flux is None or not isinstance(grid, Slab):
         return light
-    z, y, x = (renew_halo(along, grid) for along in light.flux)
+    z, y, x = (add_halo(grid.own(along), grid) for along in light.flux)
     return replace(light, flux=(z, y, x))
 
 

@@ -1,0 +1,43 @@
+"""`ddrecon uncertainty --next-view`: what it ranks, also where it goes on after a stop."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+Run = Callable[..., Result]
+SCENE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0", "--iterations", "4"]
+RANK = ["-q", "--tolerance", "0.9", "--noise", "0.05", "--next-view"]
+
+
+def test_cameras_and_lights_are_ranked(
+    folder: Path, succeed: Run, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ddrecon.uncertainty.next_view.CANDIDATES", 4)
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", *SCENE)
+    found = {}
+    for kind in ("ring", "lights"):
+        sure = "uncertainty", "run", "-o", kind, *RANK, kind, "--samples"
+        assert "--next-view takes at least 5 samples" in run(*sure, "4").stderr
+        succeed(*sure, "5")
+        stdout = succeed(*sure, "6", "--resume").stdout
+        views = json.loads(Path(kind, "uncertainty.json").read_text())["next_views"]
+        gains = [view["gain"] for view in views]
+        assert gains == sorted(gains, reverse=True) and 0 <= gains[-1] < gains[0] <= 1
+        assert f"next view: {views[0]['name']}, " in stdout
+        assert views[0]["name"] in Path(kind, "report.html").read_text()
+        found[kind] = {view["name"]: view for view in views}
+    succeed("uncertainty", "run", "-o", "whole", *RANK, "lights", "--samples", "6")
+    assert json.loads(Path("whole/uncertainty.json").read_text())["next_views"] == views
+    # Each stands as far from the middle as the camera of the run, and looks another way.
+    away = [[row[3] for row in view["matrix"][:3]] for view in found["ring"].values()]
+    assert [sum(x * x for x in eye) for eye in away] == pytest.approx([2.5**2] * 4, rel=1e-4)
+    # All travel as far down as the first, which is the scene's.
+    ways = [view["light_directions"][0] for view in found["lights"].values()]
+    assert {round(way[1] - ways[0][1], 5) for way in ways} == {0}
+    for places in (away, ways):
+        assert len({(round(x, 4), round(z, 4)) for x, _, z in places}) == 4
