@@ -219,6 +219,11 @@ def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
             yield word, bool(star), one, int(count or 0)
 
 
+def names_of(given: str) -> str:
+    """The names that `given` declares, in order: arguments of a function, or a record of C++."""
+    return ", ".join(name for _, _, name, _ in declarations(given))
+
+
 def cut(total: int, length: int, like: Tensor) -> tuple[int, int]:
     """Items that do `total` numbers, and how many each: `length`, or one on a GPU."""
     length = 1 if like.is_cuda else length
