@@ -13,8 +13,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.directions import piece_numbers
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.kernels import shares
-from ddrecon.kernels.spare import LARGEST, give_freed_memory
+from ddrecon.kernels.spare import LARGEST, MOST_COPIED, count_shares, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.numerics.harmonics import count_harmonics
@@ -133,15 +132,15 @@ def count_threads(device: torch.device) -> int:
 
 
 def shared_memory(needs: Needs) -> int:
-    """Bytes of such copies at most, beyond those of two threads (`kernels.shares`)."""
+    """Bytes of such copies at most, beyond those of two threads."""
     if needs.threads <= 2:
         return 0
     x, y, z = needs.resolution
     # What view rays meet: fields of matter and light, and the mass to each light.
     of_cells = needs.size * needs.cells * needs.colors * (MATTER + needs.lights)
-    of_rays = min(shares.MOST_BYTES, (needs.threads - 2) * of_cells)
+    of_rays = min(MOST_COPIED, (needs.threads - 2) * of_cells)
     piece = needs.size * piece_numbers((z, y, x), needs.colors, needs.moments)
-    pieces = shares.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
+    pieces = count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
     return max(of_rays * (needs.varied is not None), pieces * piece * needs.has_rounds)
 
 

@@ -53,7 +53,7 @@ class DiffusionProblem:
             from ddrecon.diffusion.fused.closure import close_medium
 
             return close_medium(self.medium, self.closure)
-        return recompute(_diffusion, self.medium, self.closure)
+        return recompute(lambda: self.closure(self.medium.transport_extinction))
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
@@ -156,10 +156,6 @@ def _inner(slab: Slab, ghosts: Ghosts, u: Tensor) -> Tensor:
     """The part of `u` in `slab` that lies in its own cells, faces and `ghosts` (a view)."""
     first, last = (halo - layers for halo, layers in zip(slab.halo, ghosts.layers, strict=True))
     return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
-
-
-def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:
-    return closure(medium.transport_extinction)
 
 
 def _loss_and_source(
