@@ -121,7 +121,7 @@ class DiffusionProblem:
         )
         return right + (source - (z + y + x))
 
-    def solved(self, solve: SolverWithMemory[Operator], right: Tensor) -> Tensor:
+    def solved(self, solve: SolverWithMemory, right: Tensor) -> Tensor:
         """u of A u = `right`; in slabs by a solve in all ranks' own cells together."""
         slab, (operator, _) = self.medium.grid, self.system
         if not isinstance(slab, Slab):
@@ -146,7 +146,7 @@ class DiffusionProblem:
         return Operator((z, y, x), _inner(slab, ghosts, operator.loss), ghosts=ghosts)
 
 
-def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:
+def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = problem.solved(solve, problem.system[1])
     return Moments(mean, problem.flux(mean))

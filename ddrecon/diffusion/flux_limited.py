@@ -108,7 +108,7 @@ def solve_flux_limited(
     limiter: Limiter,
     source: Moments,
     outside: Tensor,
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     has_flux: bool,
 ) -> Moments:
     """L0 and, where `has_flux`, L1 in `medium`.
@@ -145,9 +145,7 @@ class ImplicitFixedPoint(torch.autograd.Function):
     """u with r(u, `coefficients`) = 0, in both modes."""
 
     @staticmethod
-    def forward(
-        solve: SolverWithMemory[Operator], balance: Balance, *coefficients: Tensor
-    ) -> Tensor:
+    def forward(solve: SolverWithMemory, balance: Balance, *coefficients: Tensor) -> Tensor:
         def defect(u: Tensor) -> tuple[Operator, Tensor]:
             operator, right = balance.system(u, *coefficients)
             return operator, right - operator.apply(u)
@@ -189,7 +187,7 @@ class ImplicitFixedPoint(torch.autograd.Function):
 
 
 def iterate_picard(
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     kind: str,
     like: Tensor,
     defect: Callable[[Tensor], tuple[Operator, Tensor]],

@@ -35,6 +35,9 @@ _TYPES = {
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
 }
+_PACKETS = Path(__file__).with_name("packets.h").read_text(encoding="utf-8")
+LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
+"""Items in a packet on a processor (`packets.h`)."""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;
