@@ -17,8 +17,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import ImplicitSolve, SolverWithMemory
-from ddrecon.diffusion.paper.operator import PrintedOperator
-from ddrecon.diffusion.paper.stencils import Stencils, convolve, divergence, extend, outward
+from ddrecon.diffusion.paper.operator import (
+    PrintedOperator,
+    Stencils,
+    convolve,
+    divergence,
+    extend,
+    outward,
+)
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 
@@ -28,7 +34,7 @@ def solve_printed(
     diffusion: Tensor,
     scattered: Moments,
     outside: Tensor,
-    solve: SolverWithMemory[PrintedOperator],
+    solve: SolverWithMemory,
     has_flux: bool,
 ) -> Moments:
     """L0 by Eq. 25 and, where it `has_flux`, L1 = kappa (-grad L0 + kappa_s Q1) by Eq. 5.
@@ -62,7 +68,7 @@ def solve_printed(
 
 
 def solve_printed_system(
-    solve: SolverWithMemory[PrintedOperator], operator: PrintedOperator, source: Tensor
+    solve: SolverWithMemory, operator: PrintedOperator, source: Tensor
 ) -> Tensor:
     """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
 

@@ -15,9 +15,8 @@ from printed_media import DARK, make_printed, smooth_scene, solving
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.paper.operator import PrintedOperator
+from ddrecon.diffusion.paper.operator import PrintedOperator, Stencils, extend
 from ddrecon.diffusion.paper.printed import Ghosts, solve_printed, solve_printed_system
-from ddrecon.diffusion.paper.stencils import Stencils, extend
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, keep_medium
