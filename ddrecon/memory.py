@@ -13,7 +13,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.directions import piece_numbers
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.kernels import shares
+from ddrecon.kernels import spare
 from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
 from ddrecon.medium.phase import PhaseFunction
@@ -133,15 +133,15 @@ def count_threads(device: torch.device) -> int:
 
 
 def shared_memory(needs: Needs) -> int:
-    """Bytes of such copies at most, beyond those of two threads (`kernels.shares`)."""
+    """Bytes of such copies at most, beyond those of two threads."""
     if needs.threads <= 2:
         return 0
     x, y, z = needs.resolution
     # What view rays meet: fields of matter and light, and the mass to each light.
     of_cells = needs.size * needs.cells * needs.colors * (MATTER + needs.lights)
-    of_rays = min(shares.MOST_BYTES, (needs.threads - 2) * of_cells)
+    of_rays = min(spare.MOST_COPIED, (needs.threads - 2) * of_cells)
     piece = needs.size * piece_numbers((z, y, x), needs.colors, needs.moments)
-    pieces = shares.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
+    pieces = spare.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
     return max(of_rays * (needs.varied is not None), pieces * piece * needs.has_rounds)
 
 
@@ -187,18 +187,12 @@ def _smaller(needs: Needs, free: int) -> Iterator[tuple[str, Needs]]:
         yield "-D diffusion.transport_rounds=0", replace(needs, has_rounds=False)
     if needs.is_limited:
         yield "-D diffusion.model=p1", replace(needs, is_limited=False)
-    part = 1.0
-    while (
-        memory_of(coarser := replace(needs, resolution=_scaled(needs.resolution, part))) > free
-        and part > 1e-3
-    ):
+    part, coarser = 1.0, needs
+    while memory_of(coarser) > free and part > 1e-3:
         part *= 0.95
+        x, y, z = (max(1, int(part * cells)) for cells in needs.resolution)
+        coarser = replace(needs, resolution=(x, y, z))
     yield f"volume.resolution: [{', '.join(map(str, coarser.resolution))}]", coarser
-
-
-def _scaled(resolution: tuple[int, int, int], part: float) -> tuple[int, int, int]:
-    x, y, z = (max(1, int(part * cells)) for cells in resolution)
-    return x, y, z
 
 
 def free_memory(device: torch.device) -> int | None:

@@ -53,7 +53,7 @@ class DiffusionProblem:
             from ddrecon.diffusion.fused.closure import close_medium
 
             return close_medium(self.medium, self.closure)
-        return recompute(_diffusion, self.medium, self.closure)
+        return recompute(lambda: self.closure(self.medium.transport_extinction))
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
@@ -121,7 +121,7 @@ class DiffusionProblem:
         )
         return right + (source - (z + y + x))
 
-    def solved(self, solve: SolverWithMemory[Operator], right: Tensor) -> Tensor:
+    def solved(self, solve: SolverWithMemory, right: Tensor) -> Tensor:
         """u of A u = `right`; in slabs by a solve in all ranks' own cells together."""
         slab, (operator, _) = self.medium.grid, self.system
         if not isinstance(slab, Slab):
@@ -146,7 +146,7 @@ class DiffusionProblem:
         return Operator((z, y, x), _inner(slab, ghosts, operator.loss), ghosts=ghosts)
 
 
-def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:
+def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = problem.solved(solve, problem.system[1])
     return Moments(mean, problem.flux(mean))
@@ -156,10 +156,6 @@ def _inner(slab: Slab, ghosts: Ghosts, u: Tensor) -> Tensor:
     """The part of `u` in `slab` that lies in its own cells, faces and `ghosts` (a view)."""
     first, last = (halo - layers for halo, layers in zip(slab.halo, ghosts.layers, strict=True))
     return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
-
-
-def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:
-    return closure(medium.transport_extinction)
 
 
 def _loss_and_source(

@@ -108,7 +108,7 @@ def solve_flux_limited(
     limiter: Limiter,
     source: Moments,
     outside: Tensor,
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     has_flux: bool,
 ) -> Moments:
     """L0 and, where `has_flux`, L1 in `medium`.
@@ -145,14 +145,12 @@ class ImplicitFixedPoint(torch.autograd.Function):
     """u with r(u, `coefficients`) = 0, in both modes."""
 
     @staticmethod
-    def forward(
-        solve: SolverWithMemory[Operator], balance: Balance, *coefficients: Tensor
-    ) -> Tensor:
-        def correction(u: Tensor) -> Tensor:
+    def forward(solve: SolverWithMemory, balance: Balance, *coefficients: Tensor) -> Tensor:
+        def defect(u: Tensor) -> tuple[Operator, Tensor]:
             operator, right = balance.system(u, *coefficients)
-            return _solve_loosely(solve, operator, right - operator.apply(u))
+            return operator, right - operator.apply(u)
 
-        return iterate_picard(solve, "forward", torch.zeros_like(coefficients[0]), correction)
+        return iterate_picard(solve, "forward", coefficients[0], defect)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -165,12 +163,10 @@ class ImplicitFixedPoint(torch.autograd.Function):
         operator, _ = ctx.balance.system(u, *coefficients)
         # pull(lambda) = (J^T lambda, (dr/dtheta)^T lambda)
         _, pull, *_ = torch.func.vjp(ctx.balance.residual, u, *coefficients)
-
-        def correction(adjoint: Tensor) -> Tensor:
-            return _solve_loosely(ctx.solve, operator, u_bar - pull(adjoint)[0])
-
         # E9: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda
-        adjoint = iterate_picard(ctx.solve, "adjoint", torch.zeros_like(u), correction)
+        adjoint = iterate_picard(
+            ctx.solve, "adjoint", u, lambda adjoint: (operator, u_bar - pull(adjoint)[0])
+        )
         return None, None, *pull(-adjoint)[1:]
 
     @staticmethod
@@ -184,36 +180,32 @@ class ImplicitFixedPoint(torch.autograd.Function):
         zeros = [torch.zeros_like(c) for c in coefficients]
         changes = [zero if d is None else d for zero, d in zip(zeros, d_coefficients, strict=True)]
         (right,) = push((torch.zeros_like(u), *changes))
-
-        def correction(d_u: Tensor) -> Tensor:
-            return _solve_loosely(ctx.solve, operator, -right - push((d_u, *zeros))[0])
-
         # E8: J du = -(dr/dtheta) dtheta
-        return iterate_picard(ctx.solve, "tangent", torch.zeros_like(u), correction)
-
-
-def _solve_loosely(solve: SolverWithMemory[Operator], operator: Operator, source: Tensor) -> Tensor:
-    return solve.solver(operator, source, None, INNER_TOLERANCE).value
+        return iterate_picard(
+            ctx.solve, "tangent", u, lambda d_u: (operator, -right - push((d_u, *zeros))[0])
+        )
 
 
 def iterate_picard(
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     kind: str,
-    start: Tensor,
-    correction: Callable[[Tensor], Tensor],
+    like: Tensor,
+    defect: Callable[[Tensor], tuple[Operator, Tensor]],
 ) -> Tensor:
-    """The u [C, z, y, x] whose `correction` vanishes, by damped steps.
+    """The u [C, z, y, x], as `like`, whose `defect` vanishes, by damped steps.
 
-    From the last solution of this `kind`, or from `start`. Stops when a step's norm is below the
+    That is r, after the operator A whose inverse makes a step of it. From the last solution of this
+    `kind`, or from zero. Stops when a step's norm is below the
     tolerance of `solve` times that of u, for every color, and records the steps and the last such
     change. Raises SolveError where that is not reached.
     """
     began, tolerance = perf_counter(), solve.tolerance_of(kind)
     guess = solve.last_solution(kind)
-    u = start if guess is None or guess.shape != start.shape else guess
+    u = torch.zeros_like(like) if guess is None or guess.shape != like.shape else guess
     iteration, change = 0, float("inf")
     while change > tolerance and iteration < MAX_ITERATIONS:
-        step = DAMPING * correction(u)
+        operator, lacking = defect(u)
+        step = DAMPING * solve.solver(operator, lacking, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
         change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:

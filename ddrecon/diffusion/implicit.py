@@ -13,10 +13,10 @@ function's own jvp.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,22 +24,6 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.numerics.autodiff import keep, run_plainly
-
-
-class DifferentiableOperator(Protocol):
-    """A matrix A made of tensors p, as `ImplicitSolve` needs to know it; lists follow p's order."""
-
-    def transposed(self) -> Self:
-        """A^T."""
-
-    def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        """p_bar for A_bar = -lambda u^T (E9), lambda being the `adjoint` light."""
-
-    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterable[Tensor]:
-        """The terms of dA u for the tangents of p (E8); None is a tangent of zero."""
-
-
-AnyOperator = TypeVar("AnyOperator", bound=DifferentiableOperator)
 
 
 @dataclass(frozen=True)
@@ -71,7 +55,7 @@ class SolveMemory:
 
 
 @dataclass(frozen=True)
-class SolverWithMemory(Generic[AnyOperator]):
+class SolverWithMemory:
     """A solver, its tolerance, and the memory that its solves share.
 
     `round_index` tells the solves of one render apart: 0 is diffusion's own, transport rounds count
@@ -79,13 +63,13 @@ class SolverWithMemory(Generic[AnyOperator]):
     negative of the next round's, since a round takes away what it begins with (E12).
     """
 
-    solver: Callable[[AnyOperator, Tensor, Tensor | None, float], Solution]
+    solver: Callable[[Any, Tensor, Tensor | None, float], Solution]
     tolerance: float
     memory: SolveMemory
     round_index: int = 0
     start: Tensor | None = None
 
-    def __call__(self, kind: str, operator: AnyOperator, source: Tensor) -> Tensor:
+    def __call__(self, kind: str, operator: Any, source: Tensor) -> Tensor:
         """u with `operator` u = `source` [C, z, y, x]."""
         began = perf_counter()
         guess = self.last_solution(kind)
@@ -126,13 +110,15 @@ class SolverWithMemory(Generic[AnyOperator]):
 class ImplicitSolve(torch.autograd.Function):
     """u with A u = `source`, where A is `assemble(prepared, *tensors)`, in both modes.
 
-    `prepared` is what solvers keep about A from one solve to the next.
+    `prepared` is what solvers keep about A from one solve to the next. A has its `transposed()`;
+    `cotangents(lambda, u)`, those of `tensors` for A_bar = -lambda u^T (E9); and, for their changes
+    or None, `change_terms(d_tensors, u)`, of which dA u is the sum (E8).
     """
 
     @staticmethod
     def forward(
-        solve: SolverWithMemory[AnyOperator],
-        assemble: Callable[..., AnyOperator],
+        solve: SolverWithMemory,
+        assemble: Callable[..., Any],
         prepared: dict[Any, Any],
         source: Tensor,
         *tensors: Tensor,
@@ -179,9 +165,7 @@ class ImplicitSolve(torch.autograd.Function):
         return d_u
 
 
-def solve_diffusion(
-    solve: SolverWithMemory[Operator], operator: Operator, source: Tensor
-) -> Tensor:
+def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor) -> Tensor:
     """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
 
     By `source` and by the operator. An operator of one color serves a source of several. What

@@ -19,9 +19,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import run_plainly
 from ddrecon.slabs.ghosts import Ghosts
 
 Prepared = TypeVar("Prepared")
@@ -94,28 +92,15 @@ class Operator:
         if self.ghosts is not None:
             # Each rank has the rows of its own cells: so a face that two have is counted once.
             adjoint = self.ghosts.without(adjoint)
-        if current_engine() == "warp":
-            from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
-
-            return find_cotangents((self.loss, *self.conductances), adjoint, u)
         conductance_bars = (
-            (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
-            for axis, conductance in zip(AXES, self.conductances, strict=True)
+            difference(adjoint, axis).mul_(difference(u, axis)).neg_().sum_to_size(c.shape)
+            for axis, c in zip(AXES, self.conductances, strict=True)
         )
-        return (-adjoint * u).sum_to_size(self.loss.shape), *conductance_bars
+        return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
 
     def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
         """dA u = dloss u + G^T (dc G u), term by term (E8)."""
         d_loss, *d_conductances = d_tensors
-        if (
-            current_engine() == "warp"
-            and d_loss is not None
-            and all(each is not None for each in d_conductances)
-        ):
-            from ddrecon.diffusion.fused.product import multiply  # imports Warp
-
-            yield run_plainly(multiply, u, d_loss, *d_conductances)
-            return
         if d_loss is not None:
             yield d_loss * u
         for axis, d_conductance in zip(AXES, d_conductances, strict=True):

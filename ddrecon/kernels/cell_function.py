@@ -148,20 +148,18 @@ def _kernel(
     kind: str, ins: int, bits: int, header: str, name: str, place: str, declared: str, outs: int
 ) -> TextKernel:
     """The kernel an item of which does a row."""
-    more, arguments, made = {
-        "values": (f"*made[{outs}]", "numbers, made", "made"),
-        "tangents": (
-            f"*d_fields[{ins}], *d_numbers, *made[{outs}]",
-            "d_fields, numbers, d_numbers, made",
-            "made",
-        ),
-        "cotangents": (
-            f"*bars[{outs}], *made[{ins}], *sums", "numbers, bars, made, sums", "made sums"
-        ),
-    }[kind]  # fmt: skip
     title = f"{name.split('<')[0].lower()}_{kind}"
-    text = "const Row row(item, width, rows, colors);"
-    text += f"find_{kind}<{name}>(row, {place}channels, fields, {arguments});"
+    at, made = f"row, {place}channels, fields", "made"
+    if kind == "values":
+        more = f"*made[{outs}]"
+        call = f"find_values<{name}, F, F>({at}, nullptr, numbers, nullptr, made);"
+    elif kind == "tangents":
+        more = f"*d_fields[{ins}], *d_numbers, *made[{outs}]"
+        call = f"find_values<{name}, Dual<F>, F>({at}, d_fields, numbers, d_numbers, made);"
+    else:
+        more, made = f"*bars[{outs}], *made[{ins}], *sums", "made sums"
+        call = f"find_cotangents<{name}>({at}, numbers, bars, made, sums);"
+    text = "const Row row(item, width, rows, colors);" + call
     given = (
         f"int width, rows, colors, channels[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"
     )

@@ -38,45 +38,39 @@ struct Row {
     }
 };
 
-template <class Cell, class F> INLINE void find_values(
-    const Row& row, const int* channels, const F* const* fields, const F* numbers, F* const* made) {
-    const F* in[Cell::INS];
-    F number[Cell::NUMBERS], *out[Cell::OUTS];
-    row.in_all<Cell::INS>(fields, channels, in);
-    row.of_color<Cell::NUMBERS>(numbers, number);
-    row.in_all<Cell::OUTS>(made, out);
-    INDEPENDENT
-    for (int i = 0; i < row.width; ++i) {
-        F x[Cell::INS], y[Cell::OUTS];
+// What an item reads as numbers N: of fields its row, and numbers of its color.
+template <class N, int INS, int NUMBERS, class F> struct Inputs {
+    decltype(readable<N>((const F*)0, (const F*)0)) in[INS];
+    N number[NUMBERS];
+    INLINE Inputs(
+        const Row& row, const int* channels, const F* const* fields, const F* const* d_fields,
+        const F* numbers, const F* d_numbers) {
         UNROLLED
-        for (int k = 0; k < Cell::INS; ++k) x[k] = in[k][i];
-        Cell::find(x, number, y);
+        for (int k = 0; k < INS; ++k)
+            in[k] = readable<N>(fields[k], IS_DUAL<N> ? d_fields[k] : nullptr) +
+                    (row.color % channels[k] * row.size + row.start);
         UNROLLED
-        for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = y[k];
+        for (int k = 0; k < NUMBERS; ++k)
+            number[k] = readable<N>(numbers, d_numbers)[k * row.colors + row.color];
     }
-}
+};
 
-template <class Cell, class F> INLINE void find_tangents(
+// What is found in a row; where N are dual numbers, its change.
+template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const int* channels, const F* const* fields, const F* const* d_fields,
     const F* numbers, const F* d_numbers, F* const* made) {
-    typedef Dual<F> N;
-    const F *in[Cell::INS], *d_in[Cell::INS];
-    F number[Cell::NUMBERS], d_number[Cell::NUMBERS], *out[Cell::OUTS];
-    row.in_all<Cell::INS>(fields, channels, in);
-    row.in_all<Cell::INS>(d_fields, channels, d_in);
-    row.of_color<Cell::NUMBERS>(numbers, number);
-    row.of_color<Cell::NUMBERS>(d_numbers, d_number);
+    const Inputs<N, Cell::INS, Cell::NUMBERS, F> given(
+        row, channels, fields, d_fields, numbers, d_numbers);
+    F* out[Cell::OUTS];
     row.in_all<Cell::OUTS>(made, out);
     INDEPENDENT
     for (int i = 0; i < row.width; ++i) {
-        N x[Cell::INS], own[Cell::NUMBERS], y[Cell::OUTS];
+        N x[Cell::INS], y[Cell::OUTS];
         UNROLLED
-        for (int k = 0; k < Cell::INS; ++k) x[k] = N(in[k][i], d_in[k][i]);
+        for (int k = 0; k < Cell::INS; ++k) x[k] = given.in[k][i];
+        Cell::find(x, given.number, y);
         UNROLLED
-        for (int k = 0; k < Cell::NUMBERS; ++k) own[k] = N(number[k], d_number[k]);
-        Cell::find(x, own, y);
-        UNROLLED
-        for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = y[k].by[0];
+        for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = change_of(y[k]);
     }
 }
 

@@ -135,6 +135,14 @@ template <class One, class Other> struct If<false, One, Other> {
 template <class N> constexpr bool IS_DUAL = false;
 template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;
 
+// What numbers N are read from: arrays of values and, where N are dual, of their changes.
+template <class N, class F> INLINE auto readable(const F* value, const F* change) {
+    if constexpr (IS_DUAL<N>)
+        return Changing<F>{value, change};
+    else
+        return value;
+}
+
 // What a function of one number, `found` with its slope at the value of `x`, is of x itself.
 template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }
 template <class F, int COUNT>

@@ -18,11 +18,18 @@ LARGEST, MOST_FREE = 2**28, 2**30
 
 GNU's C library itself has at most 32 and 64 MiB.
 """
+MOST_COPIED = 2**30
+"""Bytes that copies of numbers take at most, one for each thread, if there are more than a few."""
 GIVEN_BACK = 2**20
 """Bytes of arrays that the system gets back at once where memory is short."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """What GNU's mallopt calls the two."""
 _OWN_CHOICES = "GLIBC_TUNABLES", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"
+
+
+def count_shares(threads: int, size: int, least: int = 2) -> int:
+    """How many of `threads` add to numbers of `size` bytes: each adds to a copy of its own."""
+    return min(threads, max(least, MOST_COPIED // max(1, size)))
 
 
 @functools.cache

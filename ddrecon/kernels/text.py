@@ -35,6 +35,9 @@ _TYPES = {
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
 }
+_PACKETS = Path(__file__).with_name("packets.h").read_text(encoding="utf-8")
+LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
+"""Items in a packet on a processor (`packets.h`)."""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;
@@ -217,6 +220,11 @@ def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
         for name in names.split(","):
             star, one, count = re.fullmatch(r"(\*?)(\w+)(?:\[(\d+)\])?", name.strip()).groups()
             yield word, bool(star), one, int(count or 0)
+
+
+def names_of(given: str) -> str:
+    """The names that `given` declares, in order: arguments of a function, or a record of C++."""
+    return ", ".join(name for _, _, name, _ in declarations(given))
 
 
 def cut(total: int, length: int, like: Tensor) -> tuple[int, int]:

@@ -63,13 +63,11 @@ def norm(ell: int, m: int) -> float:
 
 
 @functools.cache
-def degrees_of_harmonics(degree: int) -> tuple[int, ...]:
-    """The degree l of each harmonic up to `degree`, by k."""
-    return tuple(ell for ell in range(degree + 1) for _ in range(2 * ell + 1))
-
-
-@functools.cache
 @torch.inference_mode(False)
 def degrees_on(device: torch.device, degree: int) -> Tensor:
-    """The same as a tensor on `device`, made once: for a copy a GPU would be waited for."""
-    return torch.tensor(degrees_of_harmonics(degree), device=device)
+    """The degree l of each harmonic up to `degree`, by k.
+
+    On `device`, made once: for a copy a GPU would be waited for.
+    """
+    degrees = [ell for ell in range(degree + 1) for _ in range(2 * ell + 1)]
+    return torch.tensor(degrees, device=device)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
-from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
@@ -42,18 +40,6 @@ def make():
 
 def make_solve(tolerance: float, memory: SolveMemory | None = None) -> SolverWithMemory:
     return SolverWithMemory(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
-
-
-def test_steepness_of_exponential_light_is_its_rate():
-    grid = Grid((1, 40, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    light = torch.exp(-2 * grid.centers(torch.zeros((), dtype=torch.float64))[1]).expand(
-        1, 1, 40, 1
-    )
-    step = 1 / 40
-    inside = steepness_square(light, grid)[:, :, 1:-1]
-    torch.testing.assert_close(
-        inside.sqrt(), torch.full_like(inside, math.sinh(2 * step) / step), rtol=1e-9, atol=0
-    )
 
 
 def test_steepness_is_that_of_central_differences_cell_by_cell():

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.autograd.forward_ad as forward
 from graphics_cards import assert_compiles
 from media import box_grid, half_empty, make_operator, random_values
 from torch import Tensor
 
-from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.engine import use_engine
 from ddrecon.light.moments import Moments
@@ -24,7 +22,7 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import faces
-from ddrecon.diffusion.fused.product import cotangents_kernel, multiply, product_kernel
+from ddrecon.diffusion.fused.product import product_kernel, subtract_product
 from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
@@ -113,59 +111,6 @@ def test_systems_and_fluxes_are_those_of_torch(shape: Shape, colors: tuple[int, 
     assert_equal(lambda e: problem_of(e, shape, colors, (False, True), torch.float32), 1e-5)
 
 
-@pytest.mark.parametrize("name", ["geometric", "smooth"])
-@pytest.mark.parametrize("shape", [(1, 4, 3), (35, 3, 70)], ids=str)
-@pytest.mark.parametrize("shift", [0.0, 0.05], ids=["positive", "negative"])
-def test_closures_are_those_of_torch(name: str, shape: Shape, shift: float):
-    """Also where density is negative, as only finite differences have it."""
-
-    def find(engine: str, colors: int, has_fields: bool, dtype: torch.dtype) -> Found:
-        use_engine(engine)
-        medium, leaves = make_medium(shape, colors, has_fields=has_fields, dtype=dtype, shift=shift)
-        nothing = Moments(torch.zeros(()))
-        closure = Closure(name, medium.grid)
-        problem = DiffusionProblem(medium, closure, nothing, nothing.mean, has_flux=True)
-        return weigh([problem.diffusion], leaves)
-
-    for colors, has_fields in itertools.product((1, 3), (False, True)):
-        kind = colors, has_fields
-        assert_equal(lambda e, k=kind: find(e, *k, torch.float64), 1e-12)
-    assert_equal(lambda e: find(e, 3, True, torch.float32), 1e-5 + 2e-3 * shift)
-
-
-def test_adjoints_are_the_transposes_of_tangents():
-    """Forward mode, which has the formulas in torch, and the kernels' backward pass."""
-    use_engine("warp")
-    density, change = half_empty(4, 5, 6), random_values(4, 5, 6, seed=9)
-    sections = random_values(2, 3)
-
-    def results(density: Tensor) -> list[Tensor]:
-        volume = Volume(box_grid((4, 5, 6)), density, *sections, sections.new_tensor(0.4))
-        medium = scale_medium(volume)
-        problem, _ = make_problem(medium, 3, True, torch.float64)
-        problem = DiffusionProblem(
-            medium, Closure("geometric", medium.grid), problem.source, problem.outside, True
-        )
-        operator, right = problem.system
-        flux = problem.flux(right)
-        assert flux is not None
-        z, y, x = flux
-        off = problem.flux(right, more=(y, x, z), begun=(x, z, y), sign=-1)
-        side = problem.right_side(z, flux)
-        return [*operator.conductances, operator.loss, right, *flux, *(off or ()), side]
-
-    with forward.dual_level():
-        tangents = [
-            forward.unpack_dual(result).tangent
-            for result in results(forward.make_dual(density, change))
-        ]
-    leaf = density.clone().requires_grad_()
-    found, (bar,) = weigh(results(leaf), [leaf])
-    bars = [bar_of(r, 20 + i) for i, r in enumerate(found)]
-    along = sum(float((d.detach() * b).sum()) for d, b in zip(tangents, bars, strict=True))
-    assert float((bar * change).sum()) == pytest.approx(along, rel=1e-10)
-
-
 def test_threads_change_no_bit():
     """Every item writes to cells of its own."""
     threads = torch.get_num_threads()
@@ -188,7 +133,6 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
         product_kernel(True, 32),
-        cotangents_kernel(32),
     ]
     assert_compiles(kernels, tmp_path)
 
@@ -203,5 +147,5 @@ def test_the_product_with_the_operator_is_torchs(shape: Shape, colors: tuple[int
         make_operator(box_grid(shape), diffusion + 0.1, absorption),
         random_values(of_light, *shape, seed=3),
     )
-    found = multiply(u, operator.loss, *operator.conductances)
-    torch.testing.assert_close(found, operator.apply(u), rtol=1e-13, atol=1e-13)
+    found = subtract_product(u, operator.loss, *operator.conductances)
+    torch.testing.assert_close(found, -operator.apply(u), rtol=1e-13, atol=1e-13)

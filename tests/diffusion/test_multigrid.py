@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import pytest
@@ -108,54 +107,6 @@ def patchy_box(shape: tuple[int, ...]) -> Operator:
         for axis in AXES
     ]
     return Operator((faces[0], faces[1], faces[2]), random_values(2, *shape, seed=9))
-
-
-def coarse_by_resistors(along: Tensor, across: Tensor) -> tuple[list[list[tuple]], Tensor]:
-    """Weights (below, above), and the coarse conductances [row, face], of faces between pairs.
-
-    By conductances `along` [row, face] the axis and `across` [face between rows, cell] it.
-    """
-    rows, faces = along.shape
-    weights, coarse = [], torch.zeros(rows, faces // 2, dtype=along.dtype)
-    for row in range(rows):
-        weights.append([])
-        for face in range(faces // 2):
-            first, between = 0.5 / along[row, 2 * face], 1 / along[row, 2 * face + 1]
-            second = 0.5 / along[row, 2 * face + 2] if 2 * face + 2 < faces else 0.0
-            total = first + between + second
-            weights[row].append((first / total, second / total))
-            coarse[row, face] += 1 / total
-    for row, face in itertools.product(range(rows - 1), range(faces // 2)):
-        here, beside = weights[row][face], weights[row + 1][face]
-        for side in (0, 1):
-            energy = across[row, 2 * face + 1 + side] * (here[side] - beside[side]) ** 2
-            coarse[row : row + 2, face] += energy / 2
-    return weights, coarse
-
-
-@pytest.mark.parametrize("cells", [4, 5, 6])
-@pytest.mark.parametrize("axis", [2, 3])
-def test_coarsening_is_that_of_resistors_one_by_one(axis: int, cells: int):
-    """In a layer of one cell: faces between pairs, what is interpolated there, and stiffening."""
-    shape = (1, 3, cells) if axis == 3 else (1, cells, 3)
-    operator = patchy_box(shape)
-
-    def layer(values: Tensor) -> Tensor:
-        """The first color as [row, place along the axis]."""
-        return values[0, 0] if axis == 3 else values[0, 0].T
-
-    weights, expected = coarse_by_resistors(
-        layer(operator.conductances[axis - 1]), layer(operator.conductances[4 - axis])
-    )
-    coarsening, coarse = coarsen(operator, axis)
-    torch.testing.assert_close(layer(coarse.conductances[axis - 1]), expected, rtol=1e-12, atol=0)
-    u = random_values(*coarse.loss.shape, seed=3)
-    fine = layer(coarsening.prolong(u))
-    for row, values in enumerate(layer(u)):
-        for face, (below, above) in enumerate(weights[row]):
-            low, high = values[face], values[face + 1]
-            assert fine[row, 2 * face + 1] == pytest.approx(float(low + below * (high - low)))
-            assert fine[row, 2 * face + 2] == pytest.approx(float(high - above * (high - low)))
 
 
 def test_few_cells_are_solved_directly():

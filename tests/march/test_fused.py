@@ -5,7 +5,6 @@ Values, derivatives in reverse and in forward mode, for all that an emission can
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -179,27 +178,6 @@ def test_tangents_are_those_of_torch(kind: str, view: dict, names: list[str]):
     """By all numbers together; by each alone they are transposes of the adjoint, below."""
     scene = scene_of(kind, view)
     assert_near(tangent(scene, names, "warp"), tangent(scene, names, "torch"), 1e-11)
-
-
-def test_forward_mode_of_torch_func():
-    scene = scene_of("peaked", OUTSIDE)
-    density, change = scene.volume.density, random_values(*SHAPE, seed=5)
-
-    def differentiate(engine: str) -> Tensor:
-        def image(values: Tensor) -> Tensor:
-            return images(scene, {"density": values}, engine)[0]
-
-        return torch.func.jvp(image, (density,), (change,))[1]
-
-    assert_near(differentiate("warp"), differentiate("torch"), 1e-11)
-
-
-@pytest.mark.parametrize("settings", [{"steps_per_voxel": 3}, {"samples_per_pixel": 4}], ids=str)
-def test_settings_of_the_march_mean_the_same(settings: dict):
-    scene = scene_of("peaked", OUTSIDE)
-    scene.render = replace(scene.render, **settings)
-    for one, other in zip(*(gradients(scene, LIGHT, e)[1] for e in ("warp", "torch")), strict=True):
-        assert_near(one, other, 1e-11)
 
 
 def test_lattices_of_rays_are_marched_as_well():

@@ -12,7 +12,6 @@ from torch import Tensor
 from ddrecon.cameras import Rays, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.march import integral as march_module
 from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
@@ -100,14 +99,6 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     )
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
-
-
-@each_camera
-def test_chunks_do_not_matter(view: dict, scene_of, monkeypatch):
-    scene = replace(scene_of(view), render=INTERPOLATED)
-    whole = render(scene)
-    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
-    torch.testing.assert_close(render(scene), whole, rtol=1e-12, atol=1e-15)
 
 
 @each_camera

@@ -21,7 +21,7 @@ from ddrecon.cli.check import memory_estimate
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import write_field
-from ddrecon.kernels import shares
+from ddrecon.kernels import spare
 from ddrecon.light.lights import PointLight
 from ddrecon.memory import Needs, is_shortage, memory_of
 from ddrecon.renderer import render_each
@@ -160,7 +160,7 @@ def test_copies_of_many_threads_are_predicted_and_bounded(
     needs = Needs((12, 10, 6), 1 if gray else 3, 4, 0, has_flux=True, has_rounds=rounds > 0)
     needs = replace(needs, moments=4, varied=1.0, lights=len(scene.lights), threads=64)
     assert of_two <= copies(64) <= of_two + memory.shared_memory(needs)
-    monkeypatch.setattr(shares, "MOST_BYTES", 4 * of_two)
+    monkeypatch.setattr(spare, "MOST_COPIED", 4 * of_two)
     assert copies(64) <= of_two + memory.shared_memory(needs) <= 5 * of_two
     assert memory.shared_memory(replace(needs, threads=2)) == 0
 

@@ -5,14 +5,6 @@
 
 namespace ddrecon {
 
-// Numbers and their changes, side by side.
-template <class F> struct Pairs {
-    const F *value, *change;
-    INLINE Dual<F> operator[](long long i) const { return {value[i], change[i]}; }
-};
-template <class F> INLINE void put(F* to, F x) { *to = x; }
-template <class F> INLINE void put(F* to, const Dual<F>& x) { *to = x.by[0]; }
-
 // What a face conducts, with its slopes: the harmonic mean of D here and there (E7), and on the box
 // 1 / (2 + h / (2 D)) (E6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
 template <class F> struct Conduction {
@@ -123,7 +115,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                     if constexpr (BEGUN > 0) along[a] += in[GIVEN + a][i];
                 }
                 UNROLLED
-                for (int a = 0; a < 3; ++a) put(out[a] + i, along[a]);
+                for (int a = 0; a < 3; ++a) out[a][i] = change_of(along[a]);
             } else {
                 N right = -lost;
                 UNROLLED
@@ -131,12 +123,12 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                 if constexpr (IS_SYSTEM) {
                     right += number[S] * in[SCATTERING][i] * in[MEAN][i];
                     const N loss = number[A] * in[ABSORBING][i] + escape;
-                    if (is_own) put(out[1] + i, loss);
+                    if (is_own) out[1][i] = change_of(loss);
                     UNROLLED
                     for (int a = 0; a < 3; ++a)
-                        if (is_own && mesh.inside(a, 1, i)) put(out[2 + a] + i, above[a]);
+                        if (is_own && mesh.inside(a, 1, i)) out[2 + a][i] = change_of(above[a]);
                 }
-                put(out[0] + i, right);
+                out[0][i] = change_of(right);
             }
         }
     }
@@ -202,36 +194,17 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     }
 };
 
-// What an item does: its row's values, changes, or cotangents.
-template <class Flow, class F> INLINE void find_values(
-    const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
-    const F* const* fields, const F* numbers, F* const* made) {
-    const F* in[Flow::INS];
-    F number[Flow::NUMBERS], *out[Flow::OUTS];
-    row.in_all<Flow::INS>(fields, channels, in);
-    row.of_color<Flow::NUMBERS>(numbers, number);
-    Flow::rows_of(row, mesh, made, out, own);
-    mesh.visit([&](const auto& mesh) HERE {
-        Flow::find(row, mesh, in, number, out, row.color < own, times);
-    });
-}
-template <class Flow, class F> INLINE void find_tangents(
+// What an item does: its row's values, or changes where N are dual numbers; or cotangents.
+template <class Flow, class N, class F> INLINE void find_values(
     const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
     const F* const* fields, const F* const* d_fields, const F* numbers, const F* d_numbers,
     F* const* made) {
-    const F *in[Flow::INS], *d_in[Flow::INS];
-    F number[Flow::NUMBERS], d_number[Flow::NUMBERS], *out[Flow::OUTS];
-    row.in_all<Flow::INS>(fields, channels, in);
-    row.in_all<Flow::INS>(d_fields, channels, d_in);
-    row.of_color<Flow::NUMBERS>(numbers, number);
-    row.of_color<Flow::NUMBERS>(d_numbers, d_number);
+    const Inputs<N, Flow::INS, Flow::NUMBERS, F> given(
+        row, channels, fields, d_fields, numbers, d_numbers);
+    F* out[Flow::OUTS];
     Flow::rows_of(row, mesh, made, out, own);
-    Pairs<F> pairs[Flow::INS];
-    Dual<F> duals[Flow::NUMBERS];
-    for (int k = 0; k < Flow::INS; ++k) pairs[k] = {in[k], d_in[k]};
-    for (int k = 0; k < Flow::NUMBERS; ++k) duals[k] = {number[k], d_number[k]};
     mesh.visit([&](const auto& mesh) HERE {
-        Flow::find(row, mesh, pairs, duals, out, row.color < own, times);
+        Flow::find(row, mesh, given.in, given.number, out, row.color < own, times);
     });
 }
 template <class Flow, class F> INLINE void find_cotangents(

@@ -34,7 +34,12 @@ def iterate_jacobi(
     size = (source / operator.diagonal).abs().amax((1, 2, 3), keepdim=True)
     size = torch.where(size > 0, size, 1)
     first = source / operator.diagonal / size
-    start = _random_values(first) if guess is None or guess.shape != source.shape else guess / size
+    if guess is None or guess.shape != source.shape:
+        # The same random values in [0, 1) in every run.
+        generator = torch.Generator().manual_seed(SEED)
+        start = torch.rand(first.shape, generator=generator, dtype=torch.float64).to(first)
+    else:
+        start = guess / size
     # A color without source is dark, whatever it starts from.
     u = start * (first != 0).any(-1).any(-1).any(-1)[:, None, None, None]
     goal, rounding = tolerance**2 * _mean_square(first), (ROUNDING * torch.finfo(u.dtype).eps) ** 2
@@ -51,12 +56,6 @@ def iterate_jacobi(
             raise _divergence_error(operator, iteration, relative)
     message = "Jacobi on the printed scheme did not reach its tolerance"
     raise SolveError(message, iteration, relative, "raise diffusion.tolerance")
-
-
-def _random_values(like: Tensor) -> Tensor:
-    """Random values in [0, 1), the same in every run."""
-    generator = torch.Generator().manual_seed(SEED)
-    return torch.rand(like.shape, generator=generator, dtype=torch.float64).to(like)
 
 
 def _mean_square(u: Tensor) -> Tensor:

@@ -17,9 +17,15 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import ImplicitSolve, SolverWithMemory
-from ddrecon.diffusion.paper.operator import PrintedOperator
-from ddrecon.diffusion.paper.stencils import Stencils, convolve, divergence, extend, outward
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.diffusion.paper.operator import (
+    PrintedOperator,
+    Stencils,
+    convolve,
+    divergence,
+    extend,
+    outward,
+)
+from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 
 
@@ -28,7 +34,7 @@ def solve_printed(
     diffusion: Tensor,
     scattered: Moments,
     outside: Tensor,
-    solve: SolverWithMemory[PrintedOperator],
+    solve: SolverWithMemory,
     has_flux: bool,
 ) -> Moments:
     """L0 by Eq. 25 and, where it `has_flux`, L1 = kappa (-grad L0 + kappa_s Q1) by Eq. 5.
@@ -48,16 +54,21 @@ def solve_printed(
     )
     # What ghost cells hold by themselves is known, so it stands on the right side.
     entering = (operator.coefficients * convolve(ghosts.inflow, stencils.terms)).sum(1)
-    source = _source(kappa, scattered, stencils) + entering
+    # S = 3 kappa_s Q0 - div(kappa kappa_s Q1)
+    source, flux = 3 * scattered.mean + entering, scattered.flux
+    if flux is not None:
+        source = source - divergence([kappa * component for component in flux], stencils)
     mean = solve_printed_system(solve, operator, source)
     if not has_flux:
         return Moments(mean)
     gradient = convolve(ghosts.echo * extend(mean) + ghosts.inflow, stencils.gradient)
-    return Moments(mean, _flux(kappa, gradient, scattered))
+    driving = -gradient if flux is None else torch.stack(flux, 1) - gradient
+    z, y, x = (kappa[:, None] * driving).unbind(1)
+    return Moments(mean, (z, y, x))
 
 
 def solve_printed_system(
-    solve: SolverWithMemory[PrintedOperator], operator: PrintedOperator, source: Tensor
+    solve: SolverWithMemory, operator: PrintedOperator, source: Tensor
 ) -> Tensor:
     """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
 
@@ -108,19 +119,3 @@ class Ghosts:
         return Ghosts(
             (4 * kappa - 3 * step) / (4 * kappa + 3 * step), step * drive / (4 * kappa + 3 * step)
         )
-
-
-def _source(kappa: Tensor, scattered: Moments, stencils: Stencils) -> Tensor:
-    """S = 3 kappa_s Q0 - div(kappa kappa_s Q1)."""
-    if scattered.flux is None:
-        return 3 * scattered.mean
-    return 3 * scattered.mean - divergence(
-        [kappa * component for component in scattered.flux], stencils
-    )
-
-
-def _flux(kappa: Tensor, gradient: Tensor, scattered: Moments) -> Vector:
-    """L1 = kappa (-grad L0 + kappa_s Q1)."""
-    driving = -gradient if scattered.flux is None else torch.stack(scattered.flux, 1) - gradient
-    z, y, x = (kappa[:, None] * driving).unbind(1)
-    return z, y, x

@@ -55,9 +55,13 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
 
     def add(number: int, entering: Tensor) -> Tensor:
         row = values[number]
-        radiance = recompute(
-            _follow_direction, medium, source, inflow, row, directions[number], entering
-        )
+
+        def follow() -> Tensor:
+            # I (E11), of the sum over moments of this direction's harmonics
+            scatters = torch.tensordot(row, source, 1)
+            return radiance_along(medium, scatters, inflow, directions[number], entering)
+
+        radiance = recompute(follow)
         moments.addr_(weights[number] * row, radiance.flatten())
         leaving = radiance.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
         return leaving if inflow is None else leaving - inflow
@@ -65,19 +69,6 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     rest = _pass_on(ways, nothing, add)
     found = moments.view(count, colors, *shape)
     return add_halo(found + 0 * rest.sum(), grid) if isinstance(grid, Slab) else found
-
-
-def _follow_direction(
-    medium: Medium,
-    source: Tensor,
-    inflow: Tensor | None,
-    row: Tensor,
-    direction: Direction,
-    entering: Tensor,
-) -> Tensor:
-    """I along `direction` (E11), of the sum over moments of its harmonics `row` times `source`."""
-    scatters = torch.tensordot(row, source, 1)
-    return radiance_along(medium, scatters, inflow, direction, entering)
 
 
 def _pass_on(

@@ -36,7 +36,7 @@ SPECTRUM = 0.9
 def run_rounds(
     problem: DiffusionProblem,
     light: Moments,
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     rounds: int,
     degree: int,
 ) -> Moments:
@@ -67,7 +67,7 @@ def _renewed(light: Moments, grid: Grid) -> Moments:
 def _round(
     problem: DiffusionProblem,
     light: Moments,
-    solve: SolverWithMemory[Operator],
+    solve: SolverWithMemory,
     degree: int,
     round_index: int,
     cosine: Tensor,

@@ -54,9 +54,9 @@ class Coarsest:
         """
         shape = operator.loss.shape[1:]
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
-        matrix = torch.diag_embed(
-            Operator(_double(operator.conductances), operator.loss.double()).diagonal.flatten(1)
-        )
+        given = operator.loss, *operator.conductances
+        diagonal = Operator.of({}, *(tensor.double() for tensor in given)).diagonal
+        matrix = torch.diag_embed(diagonal.flatten(1))
         for axis, conductance in zip(AXES, operator.conductances, strict=True):
             low, high = lower_cells(number, axis).flatten(), upper_cells(number, axis).flatten()
             matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
@@ -164,8 +164,3 @@ def _strong_axes(matrix: ScaledMatrix) -> list[int]:
         for axis, strength in zip(axes, strengths, strict=True)
         if not strength < STRONG * max(strengths)
     ]
-
-
-def _double(conductances: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    z, y, x = conductances
-    return z.double(), y.double(), x.double()

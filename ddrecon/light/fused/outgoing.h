@@ -172,32 +172,12 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
     }
 };
 
-template <class Cell, class F> INLINE void find_values(
-    const Row& row, const View<F>& view, const int* channels, const F* const* fields,
-    const F* numbers, F* const* made) {
-    const F* in[Cell::INS];
-    F number[Cell::NUMBERS];
-    row.in_all<Cell::INS>(fields, channels, in);
-    row.of_color<Cell::NUMBERS>(numbers, number);
-    Cell::scatter(row, view, in, number, made[0]);
-}
-
-template <class Cell, class F> INLINE void find_tangents(
+template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
     const F* const* d_fields, const F* numbers, const F* d_numbers, F* const* made) {
-    const F *values[Cell::INS], *changes[Cell::INS];
-    F number[Cell::NUMBERS], d_number[Cell::NUMBERS];
-    Changing<F> in[Cell::INS];
-    Dual<F> own[Cell::NUMBERS];
-    row.in_all<Cell::INS>(fields, channels, values);
-    row.in_all<Cell::INS>(d_fields, channels, changes);
-    row.of_color<Cell::NUMBERS>(numbers, number);
-    row.of_color<Cell::NUMBERS>(d_numbers, d_number);
-    UNROLLED
-    for (int k = 0; k < Cell::INS; ++k) in[k] = {values[k], changes[k]};
-    UNROLLED
-    for (int k = 0; k < Cell::NUMBERS; ++k) own[k] = {number[k], d_number[k]};
-    Cell::scatter(row, view, in, own, made[0]);
+    const Inputs<N, Cell::INS, Cell::NUMBERS, F> given(
+        row, channels, fields, d_fields, numbers, d_numbers);
+    Cell::scatter(row, view, given.in, given.number, made[0]);
 }
 
 template <class Cell, class F> INLINE void find_cotangents(

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.shares import count_shares
-from ddrecon.kernels.text import TextKernel, cut
-from ddrecon.march.fused.kernels import names_of
+from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.text import TextKernel, cut, names_of
 from ddrecon.march.lattice import interpolate
 from ddrecon.numerics.autodiff import differentiate_once, keep
 

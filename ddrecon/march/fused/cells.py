@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import MOST, too_many
-from ddrecon.kernels.packets import LANES
-from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.kernels.text import LANES, TextKernel, cut
 from ddrecon.march.samplers import Sampler, order_of_slices, support_of_planes
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across

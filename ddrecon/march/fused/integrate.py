@@ -15,9 +15,8 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.packets import LANES
-from ddrecon.kernels.shares import count_shares
-from ddrecon.kernels.text import cut
+from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
 from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of

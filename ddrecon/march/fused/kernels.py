@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.kernels.text import TextKernel, names_of
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
 from ddrecon.medium.phase_cells import count_tables, is_steep
@@ -155,11 +155,6 @@ def _kernel(
     record = f"const Given<F> of_all = {{{names_of(all_given)}}};"
     path = f"march/fused/{header}.h"
     return TextKernel(name, layout.bits, record + text, all_given + given, made, path)
-
-
-def names_of(given: str) -> str:
-    """The names that `given` declares, in order: they make a record of C++."""
-    return ", ".join(name for _, _, name, _ in declarations(given))
 
 
 def _written(layout: Layout, case: Case) -> str:

@@ -9,9 +9,8 @@ from media import make_scene, random_values
 
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.paper.iteration import iterate_jacobi
-from ddrecon.diffusion.paper.operator import PrintedOperator
+from ddrecon.diffusion.paper.operator import PrintedOperator, Stencils, convolve, extend
 from ddrecon.diffusion.paper.printed import Ghosts
-from ddrecon.diffusion.paper.stencils import Stencils, convolve, extend
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.scene import Scene
@@ -19,9 +18,7 @@ from ddrecon.scene import Scene
 DARK = torch.zeros(1, 1, 1, 1, dtype=torch.float64)
 
 
-def solving(
-    tolerance: float = 1e-14, memory: SolveMemory | None = None
-) -> SolverWithMemory[PrintedOperator]:
+def solving(tolerance: float = 1e-14, memory: SolveMemory | None = None) -> SolverWithMemory:
     return SolverWithMemory(iterate_jacobi, tolerance, memory or SolveMemory())
 
 

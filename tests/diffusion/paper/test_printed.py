@@ -15,13 +15,13 @@ from printed_media import DARK, make_printed, smooth_scene, solving
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.paper.operator import PrintedOperator
+from ddrecon.diffusion.paper.operator import PrintedOperator, Stencils, extend
 from ddrecon.diffusion.paper.printed import Ghosts, solve_printed, solve_printed_system
-from ddrecon.diffusion.paper.stencils import Stencils, extend
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, keep_medium
 from ddrecon.renderer import render, solve_light
+from ddrecon.variables.values import value_of, with_values
 
 SHAPES = [(3, 2, 4), (1, 2, 3), (1, 1, 1)]
 TO_ROUNDING: dict[str, Any] = {
@@ -270,8 +270,8 @@ def test_both_derivatives_of_a_solve_agree_with_differences(
     assert torch.autograd.gradcheck(solution, arguments, **TO_ROUNDING)
 
 
-@pytest.mark.parametrize("wanted", ["density", "sigma_s", "g", "irradiance"])
-def test_both_derivatives_of_an_image_agree_with_differences(wanted: str):
+@pytest.mark.parametrize("name", ["density", "sigma_s", "g", "lights.0.irradiance"])
+def test_both_derivatives_of_an_image_agree_with_differences(name: str):
     scene = make_scene(
         1 + 0.5 * random_values(2, 2, 3),
         g=0.3,
@@ -282,17 +282,7 @@ def test_both_derivatives_of_an_image_agree_with_differences(wanted: str):
     )
 
     def image(value: Tensor) -> Tensor:
-        lights = (
-            [replace(scene.lights[0], irradiance=value), scene.lights[1]]
-            if wanted == "irradiance"
-            else scene.lights
-        )
-        volume = (
-            scene.volume
-            if wanted == "irradiance"
-            else replace(scene.volume, **{"phase" if wanted == "g" else wanted: value})
-        )
-        return render(replace(scene, volume=volume, lights=lights))[0, :, 1:3, 1:4]
+        return render(with_values(scene, {name: value}))[0, :, 1:3, 1:4]
 
-    value = scene.lights[0].irradiance if wanted == "irradiance" else getattr(scene.volume, wanted)
-    assert torch.autograd.gradcheck(image, value.clone().requires_grad_(), **TO_ROUNDING)
+    value = value_of(scene, name).detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(image, value, **TO_ROUNDING)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
 from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.kernels.shares import count_shares
-from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.text import TextKernel, declarations, names_of
 
 _ROOM = "diffusion/rounds/fused"
 MARGIN = 16
@@ -152,38 +152,38 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
     the first field that steps to these cells meet.
     """
     _, depth, height, width = fields[0].shape
-    larger, rows = list[Tensor](), fields[0].new_empty(3, depth, height)
+    rows, like = depth * height, fields[0]
+    occupied = like.new_empty(rows, 2, dtype=torch.int32)
+    ranges = like.new_empty(rows, 4, dtype=torch.int32)
+    tops, densest, larger = like.new_empty(rows), like.new_empty(rows), list[Tensor]()
+    sizes = {"depth": depth, "height": height, "width": width}
+    found, reached = {"occupied": occupied, "tops": tops}, {"ranges": ranges, "densest": densest}
+    surround_row, reach_row = _surround_kernels(torch.finfo(like.dtype).bits)
     for field in fields:
         flat = field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch)
-        given = {
-            "field": field.detach(), "channels": len(field), "is_first": not larger,
-            "depth": depth, "height": height, "width": width, "pitch": pitch,
-        }  # fmt: skip
-        made = {"inner": flat[MARGIN + (height + 3) * pitch :], "rows": rows}
-        _surround_kernel(torch.finfo(field.dtype).bits).launch(depth * height, given, made)
+        given = {"field": field.detach(), "channels": len(field), "is_first": not larger}
+        inner = flat[MARGIN + (height + 3) * pitch :]
+        surround_row.launch(rows, given | sizes | {"pitch": pitch}, found | {"inner": inner})
         larger.append(flat)
-    # Light at the ends of a step is a cell away at most, along each axis.
-    reached = []
-    for _ in range(2):
-        for dim in (1, 2):
-            longer = torch.cat([rows.narrow(dim, 0, 1), rows, rows.narrow(dim, -1, 1)], dim)
-            for start in (0, 2):
-                rows = rows.maximum(longer.narrow(dim, start, rows.shape[dim]))
-        reached.append(rows)
-    low, high, top = torch.stack(reached, -1)
-    cells = torch.arange(1.0, 3.0)
-    first = (width - low - cells).clamp(min=0).div(MARGIN, rounding_mode="floor")
-    last = ((high + cells) / MARGIN).ceil()
-    ranges = torch.stack([first, last], -1).mul(MARGIN).clamp(max=width) * (high > 0)[..., None]
-    return larger, ranges.flatten(2).int(), top[..., 0].contiguous()
+    reach_row.launch(rows, found | sizes | {"margin": MARGIN}, reached)
+    return larger, ranges, densest
 
 
 @functools.cache
-def _surround_kernel(bits: int) -> TextKernel:
-    names = "field, channels, depth, height, width, pitch, is_first, inner, rows"
-    given = "F *field, *inner, *rows; int channels, depth, height, width, pitch; bool is_first"
-    text, header = f"surround_row(item, {names});", f"{_ROOM}/surround.h"
-    return TextKernel("surround_row", bits, text, given, "inner rows", header)
+def _surround_kernels(bits: int) -> tuple[TextKernel, TextKernel]:
+    size, path = "int depth, height, width,", f"{_ROOM}/surround.h"
+    of_row = (
+        f"F *field; int channels; {size} pitch; bool is_first; F *inner; int *occupied; F *tops"
+    )
+    around = f"int *occupied; F *tops; {size} margin; int *ranges; F *densest"
+    one, other = (
+        TextKernel(name, bits, f"{name}(item, {names_of(given)});", given, made, path)
+        for name, given, made in (
+            ("surround_row", of_row, "inner occupied tops"),
+            ("reach_row", around, "ranges densest"),
+        )
+    )
+    return one, other
 
 
 @functools.cache

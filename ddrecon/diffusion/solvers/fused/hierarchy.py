@@ -96,10 +96,6 @@ class _Arrays:
         return memory[begin : begin + math.prod(shape)].view(shape)
 
 
-def _halved(shape: Sequence[int], axis: int) -> tuple[int, ...]:
-    return tuple((n + 1) // 2 if other == axis else n for other, n in enumerate(shape))
-
-
 class _Making:
     """A hierarchy that is being made, down to a `stage` of this `shape`."""
 
@@ -140,7 +136,8 @@ class _Making:
         """The stages of a level that coarsens these `axes`, down to the next level."""
         shapes = [self.shape]
         for axis in axes:
-            shapes.append(_halved(shapes[-1], axis))
+            last = enumerate(shapes[-1])
+            shapes.append(tuple((n + 1) // 2 if other == axis else n for other, n in last))
         counts = [self.colors * math.prod(shape) for shape in shapes[1:]]
         cells = counts[-1] // self.colors
         scaled = SCALED if cells > FEW_CELLS else []
