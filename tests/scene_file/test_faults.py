@@ -163,7 +163,7 @@ volume.g=*x => -D volume.g=*x: volume.g: *x stands for nothing: no &x before
 """Overrides of the small scene, and what its one line says: the user mends the scene."""
 
 FILES = """
-volume.density={file: junk.npz} => junk.npz: not a complete .npz archive
+volume.density={file: junk.npz} => junk.npz: is damaged
 volume.density={file: cells.npz, name: rain} => cells.npz: has no field 'rain'; it has
 volume.density={file: cells.npz, name: colors} => colors belong to the cross sections
 volume.density={file: cells.npz, name: below} => below is
