@@ -71,16 +71,6 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-for command in (
-    check,
-    render,
-    optimize,
-    uncertainty,
-    watch,
-    gradcheck,
-    reference,
-    bench,
-    export,
-    info,
-):
+ALL = check, render, optimize, uncertainty, watch, gradcheck, reference, bench, export, info
+for command in ALL:
     main.add_command(command)

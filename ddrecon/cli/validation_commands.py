@@ -144,7 +144,6 @@ def bench(
 def _bench_speed(
     session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
 ) -> None:
-    """Measures the scene, or the plume, and writes what was asked for."""
     from ddrecon.bench.measure import run_bench
     from ddrecon.bench.plume import load_pair
     from ddrecon.bench.report import bench_lines, describe, write_bench
