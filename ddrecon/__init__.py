@@ -8,7 +8,7 @@ so that `import ddrecon` costs nothing.
 from importlib import import_module
 from typing import Any
 
-from ddrecon.display import draw_by
+from ddrecon.display import Displayed
 
 __version__ = "0.1.0"
 _HOMES = {
@@ -45,4 +45,4 @@ def _draw(record: Any) -> str:
     return html_of(record)
 
 
-draw_by(_draw)
+Displayed._repr_html_ = _draw

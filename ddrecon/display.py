@@ -1,6 +1,6 @@
 """How records show themselves: briefly as text, and in a notebook as what a room above draws.
 
-The package itself says who that is (`draw_by`), so that no record knows of pages.
+The package itself puts that there (`Displayed._repr_html_`), so that no record knows of pages.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,25 +18,16 @@ FIRST = 2
 SMALL = 4
 """Tensors of so many numbers are shown by these, larger ones by their range."""
 
-_drawers: list[Callable[[Any], str]] = []
-
-
-def draw_by(draw: Callable[[Any], str]) -> None:
-    """Has `draw` make the HTML of every record from now on."""
-    _drawers[:] = [draw]
-
 
 class Displayed:
-    """A record of few words, which notebooks show as HTML."""
+    """A record of few words, which notebooks show as the HTML that `_repr_html_` makes."""
+
+    _repr_html_: ClassVar[Callable[[Any], str]]
 
     def __repr__(self) -> str:
         """What differs from its default, a line each; of tensors shape, device and range."""
         lines = "".join(f"  {part},\n" for part in _parts(self))
         return f"{type(self).__name__}(\n{lines})"
-
-    def _repr_html_(self) -> str | None:
-        """The record as HTML; None, for its plain text, where nobody draws it."""
-        return _drawers[0](self) if _drawers else None
 
 
 def _parts(record: Any) -> list[str]:

@@ -22,8 +22,6 @@ CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
 PARTS = "view rays", "light", "diffusion", "transport rounds"
 """The parts of the renderer, which every engine has."""
-VARIABLE = "DDRECON_ENGINE"
-"""The environment variable that chooses where `use_engine` was not called; `auto` without it."""
 LOG = "ddrecon.engine"
 """The logger that is told when kernels are compiled, which happens once, or warp is missing."""
 
@@ -49,8 +47,8 @@ def current_engine() -> str:
     """
     global _engine
     if _engine is None:
-        name = os.environ.get(VARIABLE) or "auto"
-        _engine = _resolve(name, f"{VARIABLE}={name}")
+        name = os.environ.get("DDRECON_ENGINE") or "auto"
+        _engine = _resolve(name, f"DDRECON_ENGINE={name}")
     return _engine
 
 
@@ -105,6 +103,6 @@ def _resolve(name: str, asked: str) -> str:
         raise MissingExtraError(f"{asked} {advice('warp')}")
     if is_installed:
         return "warp"
-    log = logging.getLogger(LOG)
-    log.info('engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast')
+    missing = 'engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast'
+    logging.getLogger(LOG).info(missing)
     return "torch"

@@ -6,6 +6,7 @@ Where one is absent, the user is told the extra of ddrecon that brings it.
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from types import ModuleType
 
 from ddrecon.errors import FormatError, MissingExtraError
@@ -30,11 +31,7 @@ def advice(package: str) -> str:
 
 def is_there(package: str) -> bool:
     """Whether `package` is installed."""
-    try:
-        import_module(package)
-    except ImportError:
-        return False
-    return True
+    return find_spec(package) is not None
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:

@@ -14,10 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypedDict, Unpack
 
-DERIVATIVES = ("all", "single", "diffusion")
-"""Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the
-diffusion (the paper's Fig. 9).
-"""
 FLOOR = 3.3
 """Optical thickness across the box's shortest side that the closure `smooth` gives empty space.
 
@@ -227,8 +223,9 @@ class OptimizeSettings:
     `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
-    that scattered more often. `loss`: None is what the kind of pictures deserves. `noise` is that
-    of all pictures that have none of their own, for the loss `photon` and to know when it is left.
+    that of the diffusion (the paper's Fig. 9). `loss`: None is what the kind of pictures deserves.
+    `noise` is that of all pictures that have none of their own, for the loss `photon` and to know
+    when it is left.
     """
 
     parameters: Mapping[str, ParameterSettings]
@@ -236,7 +233,7 @@ class OptimizeSettings:
     loss: str | None = one_of(None, ("l2", "l1", "huber", "relative_l2", "display", "photon"))
     noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)
-    derivatives: str = one_of("all", DERIVATIVES, expert=True)
+    derivatives: str = one_of("all", ("all", "single", "diffusion"), expert=True)
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
 
     def violations(self) -> Iterator[Violation]:

@@ -121,15 +121,6 @@ def test_a_twisted_pose_is_rigid(change: torch.Tensor):
     assert torch.linalg.det(turn) > 0
 
 
-def test_no_twist_changes_nothing():
-    torch.testing.assert_close(
-        twist(camera(), torch.zeros(6, dtype=torch.float64), PIVOT).pose,
-        camera().pose,
-        rtol=0,
-        atol=1e-14,
-    )
-
-
 @given(small_twists)
 def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change: torch.Tensor):
     """Only a shift moves the pivot in the camera's own frame, by just as much the other way."""

@@ -59,16 +59,8 @@ def test_anything_by_name_replaces_what_the_scene_has() -> None:
     )
 
 
-NAMES = [
-    "density",
-    "sigma_a",
-    "sigma_s",
-    "g",
-    "lights.0.irradiance",
-    "lights.0.direction",
-    "lights.1.radiance",
-    "views.view.camera",
-]
+LIGHTS = ["lights.0.irradiance", "lights.0.direction", "lights.1.radiance"]
+NAMES = ["density", "sigma_a", "sigma_s", "g", *LIGHTS, "views.view.camera"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -104,7 +96,7 @@ def test_the_scene_moves_with_the_layer() -> None:
     image = single()
     assert image.dtype == torch.float32 and single.scene.volume.density.requires_grad
     torch.testing.assert_close(image.double(), before, rtol=1e-4, atol=1e-5)
-    for name in (*NAMES[:4], "lights.0.direction", "lights.1.radiance"):
+    for name in (*NAMES[:4], *LIGHTS[1:]):
         assert value_of(single.scene, name).dtype == torch.float32
     assert single.scene.views[0].camera.pose.dtype == torch.float32
     assert single.scene.starts["density"].dtype == torch.float32
@@ -186,8 +178,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "problem"),
-    [(name, *case) for name, cases in WRONG.items() for case in cases],
+    ("name", "value", "problem"), [(name, *case) for name, cases in WRONG.items() for case in cases]
 )
 def test_what_no_scene_file_may_say_is_refused(name: str, value: Any, problem: str) -> None:
     """By the layer, by name, and where a scene's own tensor was replaced."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from itertools import pairwise
 
@@ -14,6 +15,9 @@ from ddrecon.cli.uncertainty import uncertainty
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
+
+DRIVERS = "/dev/nvidiactl", "/dev/dxg", "/dev/kfd"
+"""One is there where torch may see a GPU; elsewhere it is not loaded to look for one."""
 
 
 class Commands(click.Group):
@@ -39,13 +43,17 @@ def show_version(context: click.Context, parameter: click.Parameter, is_asked: b
     except DdreconError as error:
         click.echo(str(error), err=True)
         context.exit(error.exit_code)
-    import torch
+    from importlib.metadata import version  # here, so that help answers at once
 
-    brought = "".join(f" ({name} {version})" for name, version in packages)
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+    brought = "".join(f" ({name} {number})" for name, number in packages)
+    device = "cpu"
+    if any(map(os.path.exists, DRIVERS)):
+        import torch
+
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
     click.echo(
         f"ddrecon {__version__}, Python {platform.python_version()}, "
-        f"torch {torch.__version__}, engine {engine[1]}{brought}, device {device}"
+        f"torch {version('torch')}, engine {engine[1]}{brought}, device {device}"
     )
     context.exit()
 
@@ -63,16 +71,6 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-for command in (
-    check,
-    render,
-    optimize,
-    uncertainty,
-    watch,
-    gradcheck,
-    reference,
-    bench,
-    export,
-    info,
-):
+ALL = check, render, optimize, uncertainty, watch, gradcheck, reference, bench, export, info
+for command in ALL:
     main.add_command(command)

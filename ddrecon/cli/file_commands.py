@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import click
 
 from ddrecon.cli.command import REPORT, SCENE_SUFFIXES, in_session
 from ddrecon.errors import UsageError
+from ddrecon.io.files.reading import guard_reading
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,15 +56,17 @@ def export(
     as its volumes.
     """
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
+    _require_volumes(sources)
     from ddrecon.io.volumes.table import FORMATS, read_together
+
+    kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
+    if kind not in known:
+        raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
     from ddrecon.reference.export import export_scene
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
-    kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
-    if kind not in known:
-        raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
     is_of_scene = kind not in FORMATS or any(map(_is_scene, sources))
     if is_of_scene and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
@@ -134,6 +138,14 @@ def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
     return fields, constants, np.array(scene.volume.grid.bounds_xyz)
 
 
+def _require_volumes(sources: Sequence[Path]) -> None:
+    """Raises FormatError for a source that is no scene and is not there, before imports."""
+    for path in sources:
+        if path.suffix not in SCENE_SUFFIXES:
+            with guard_reading(path):
+                pass
+
+
 def _is_scene(source: Path) -> bool:
     """Whether `source` is a scene file or, perhaps, the folder of a run."""
     return source.is_dir() or source.suffix in SCENE_SUFFIXES
@@ -148,6 +160,7 @@ def info(session: Session, file: Path) -> None:
 
     Of a scene file or the folder of a finished run, it is its volume.
     """
+    _require_volumes([file])
     scene = session.load(file) if _is_scene(file) else None
     from ddrecon.io.info import describe, describe_medium, lines
 

@@ -100,23 +100,7 @@ def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:
     if any(set(pair) & set(values) for pair in PAIRS):
         for name in (*PAIRS[0], *PAIRS[1]):
             section.pop(name, None)
-    numbers = {name: values.pop(name) for name in [*values] if name == "g" or PHASE in name}
-    section.update(values)
-    _put_phase(section, numbers)
-
-
-def _put_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Puts reconstructed `numbers` of its phase function into the section `volume`."""
-    if "phase" not in volume:
-        volume.update(numbers)
-        return
-    for name, number in numbers.items():
-        *path, key = name.removeprefix(PHASE).split(".")
-        section = volume["phase"]
-        for step in path:
-            section = section[int(step)] if isinstance(section, list) else section[step]
-        section[key] = number
-        if key == "coefficients":
-            # They count from chi_1 on, and replace those of a file.
-            section[key] = [1.0, *number]
-            section.pop("file", None)
+    for name, value in values.items():
+        is_angular = name == "g" or name.startswith(PHASE)
+        owner = section.get("phase", section) if is_angular else section
+        owner[name.removeprefix(PHASE)] = value

@@ -121,7 +121,11 @@ def build_scene(
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
-    return replace(scene, starts=_build_starts(scene_file, scene))
+    for name, settings in optimize.parameters.items() if optimize else ():
+        with problems.collecting():
+            scene.starts[name] = _start(scene_file, scene, name, settings)
+    problems.raise_any()
+    return scene
 
 
 def _build_light(
@@ -293,20 +297,8 @@ def _colors_of(kind: type) -> set[str]:
     return {name for name, hint in hints if {float, Triple} <= set(get_args(hint))}
 
 
-def _build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
-    """The value each optimized parameter of `scene` starts from, by name.
-
-    Raises SceneError with all problems, or FormatError.
-    """
-    problems, starts = Problems(), {}
-    for name, settings in scene.optimize.parameters.items() if scene.optimize else ():
-        with problems.collecting():
-            starts[name] = _start(scene_file, scene, name, settings)
-    problems.raise_any()
-    return starts
-
-
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
+    """The value from which the parameter `name` of `scene` starts."""
     key = f"optimize.parameters.{name}"
     try:
         value = value_of(scene, name).clone()

@@ -70,7 +70,10 @@ def _build_view(
                 pixels = torch.from_numpy(stored.pixels).permute(2, 0, 1).contiguous()
                 pictures[name] = pixels.to(device, dtype)
                 step = stored.step if name == "image" else step
-    size = _size(section.camera, pictures.get("image"))
+    image, resolution = pictures.get("image"), section.camera.resolution
+    size = None if image is None else (image.shape[1], image.shape[2])
+    if resolution is not None:
+        size = resolution[1], resolution[0]
     for name, picture in pictures.items():
         if size is not None and tuple(picture.shape[1:]) != size:
             (height, width), (rows, columns) = picture.shape[1:], size
@@ -98,7 +101,7 @@ def _build_view(
             pose=camera.pose.to(device, dtype),
             distortion=None if lens is None else lens.to(device, dtype),
         ),
-        pictures.get("image"),
+        image,
         pictures["mask"][0] if "mask" in pictures else None,
         section.split == "test",
         section.weight,
@@ -108,13 +111,6 @@ def _build_view(
         step,
         None if section.noise is None else Noise(section.noise.read, section.noise.shot, step),
     )
-
-
-def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:
-    """(height, width): what the scene says, else the image's; None if that could not be read."""
-    if camera.resolution is not None:
-        return camera.resolution[1], camera.resolution[0]
-    return None if image is None else (image.shape[1], image.shape[2])
 
 
 def _build_camera(

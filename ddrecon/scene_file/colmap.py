@@ -11,7 +11,7 @@ import math
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
@@ -30,15 +30,10 @@ MODELS: dict[str, tuple[str, ...]] = {
 """The camera models that are read, in the order of their numbers in binary files, with their
 parameters in order.
 """
-MOST_VIEWS = 10**5
 
 
-class Posed(NamedTuple):
-    """An image of a model: its `name`, its camera's number, and the rotation and shift to it."""
-
-    name: str
-    camera: int
-    pose: Sequence[float]
+Posed = tuple[str, int, Sequence[float]]
+"""An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
 def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
@@ -56,41 +51,39 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
     with guard_reading(of_cameras):
         cameras = dict(READERS[suffix][0](of_cameras))
     with guard_reading(path):
-        posed = sorted(READERS[suffix][1](path), key=lambda image: image.name)
+        posed = sorted(READERS[suffix][1](path))
     if not posed:
         raise FormatError(path, "has no images")
     views = []
-    for image in posed:
-        if image.camera not in cameras:
-            raise FormatError(path, f"image {image.name!r}: there is no camera {image.camera}")
-        picture = Path(image.name)
+    for name, number, pose in posed:
+        if number not in cameras:
+            raise FormatError(path, f"image {name!r}: there is no camera {number}")
+        picture = Path(name)
         if picture.is_absolute() or ".." in picture.parts:
-            raise FormatError(
-                path, f"image {image.name!r} leaves the folder of pictures; rename it"
-            )
-        frame = cameras[image.camera] | {"transform_matrix": _matrix(path, image)}
+            raise FormatError(path, f"image {name!r} leaves the folder of pictures; rename it")
+        frame = cameras[number] | {"transform_matrix": _matrix(path, name, pose)}
         with in_file(of_cameras):
-            said = node_of(f"camera {image.camera}", str(of_cameras), frame)
+            said = node_of(f"camera {number}", str(of_cameras), frame)
             camera = read_camera(said, said.entries(), folder)
         views.append(ViewSection(camera=camera, image=images / picture))
     return views
 
 
-def _matrix(path: Path, image: Posed) -> list[list[float]]:
+def _matrix(path: Path, name: str, pose: Sequence[float]) -> list[list[float]]:
     """Camera to world with OpenGL axes."""
     import numpy as np
 
-    quaternion, shift = np.array(image.pose[:4]), np.array(image.pose[4:])
+    quaternion, shift = np.array(pose[:4]), np.array(pose[4:])
     norm = math.sqrt(float(quaternion @ quaternion))
     if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):
-        raise FormatError(path, f"image {image.name!r}: its pose is not finite, or no rotation")
+        raise FormatError(path, f"image {name!r}: its pose is not finite, or no rotation")
     w, x, y, z = quaternion / norm
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     to_world = np.eye(3) - 2 * w * cross + 2 * cross @ cross
-    pose = np.eye(4)
-    pose[:3, :3] = to_world * (1, -1, -1)
-    pose[:3, 3] = -to_world @ shift
-    return pose.tolist()
+    matrix = np.eye(4)
+    matrix[:3, :3] = to_world * (1, -1, -1)
+    matrix[:3, 3] = -to_world @ shift
+    return matrix.tolist()
 
 
 def _camera(
@@ -143,16 +136,15 @@ def _text_images(path: Path) -> Iterator[Posed]:
             pose, camera, name = [float(word) for word in numbers], int(words[8]), words[9]
         except (ValueError, IndexError) as error:
             raise FormatError(
-                path,
-                f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
+                path, f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
-        yield Posed(name, camera, pose)
+        yield name, camera, pose
         next(lines, None)
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     with path.open("rb") as stream:
-        for _ in range(_count(path, stream)):
+        for _ in range(*_unpack(path, stream, "<Q")):
             number, model, width, height = _unpack(path, stream, "<iiQQ")
             name = dict(enumerate(MODELS)).get(model, f"number {model}")
             parameters = _unpack(path, stream, f"<{len(MODELS.get(name, ()))}d")
@@ -161,21 +153,14 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 def _binary_images(path: Path) -> Iterator[Posed]:
     with path.open("rb") as stream:
-        for _ in range(_count(path, stream)):
+        for _ in range(*_unpack(path, stream, "<Q")):
             _, *pose, camera = _unpack(path, stream, "<i7di")
             name = bytearray()
             while (letter := _unpack(path, stream, "c")[0]) != b"\0":
                 name += letter
             (points,) = _unpack(path, stream, "<Q")
             stream.seek(24 * points, 1)
-            yield Posed(name.decode(), camera, pose)
-
-
-def _count(path: Path, stream: BinaryIO) -> int:
-    (count,) = _unpack(path, stream, "<Q")
-    if count > MOST_VIEWS:
-        raise FormatError(path, f"claims {count} entries; it is damaged, or no COLMAP model")
-    return int(count)
+            yield name.decode(), camera, pose
 
 
 def _unpack(path: Path, stream: BinaryIO, layout: str) -> tuple[Any, ...]:

@@ -251,7 +251,7 @@ def _rigidity(matrix: Matrix) -> Iterator[Violation]:
     """Why `matrix` is no rotation and shift, where it is not."""
     *rows, last = matrix
     x, y, z, _ = zip(*rows, strict=True)
-    lengths = [sum(map(mul, one, other)) for one, other in ((x, x), (y, y), (z, z))]
+    lengths = [sum(map(mul, one, one)) for one in (x, y, z)]
     across = [sum(map(mul, one, other)) for one, other in ((x, y), (y, z), (z, x))]
     volume = sum(x[i] * (y[i - 2] * z[i - 1] - y[i - 1] * z[i - 2]) for i in range(3))
     if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,9 +66,8 @@ def name_listed(
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
 
-def name_by_images(views: Iterable[ViewSection]) -> tuple[ViewSection, ...]:
+def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     """`views` with names, all different, by their images where they have some."""
-    views = tuple(views)
     paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
     stems = [_in_names(path.stem) for path in paths]
     folders = [_in_names(path.parent.name) for path in paths]

@@ -69,13 +69,6 @@ def test_check_names_it(succeed: Run, name: str, line: str) -> None:
     assert report["engine"] == dict.fromkeys(engine.PARTS, "torch" if name == "torch" else "warp")
 
 
-@pytest.mark.parametrize("change", ["solver=jacobi", "scheme=printed", "model=flux_limited"])
-def test_check_names_what_is_left_to_torch(succeed: Run, change: str) -> None:
-    found = succeed("check", "scene.yaml", "--engine", "warp", "-D", f"diffusion.{change}")
-    line = "engine: warp (view rays, light, transport rounds); diffusion in torch"
-    assert line in found.stdout.splitlines()
-
-
 def test_check_names_what_slabs_leave_to_torch(succeed: Run) -> None:
     command = "check", "scene.yaml", "--engine", "warp", "--share", "cells"
     (line,) = (one for one in succeed(*command).stdout.splitlines() if one.startswith("engine:"))
@@ -88,6 +81,8 @@ LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
     ({"transport_rounds": 1}, [], False, ()),
     ({"transport_rounds": 1}, [], True, ("diffusion", "transport rounds")),
     ({"model": "flux_limited"}, [PointLight(PLACE, POWER)], False, ("diffusion", "point lights")),
+    ({"solver": "jacobi"}, [], False, ("diffusion",)),
+    ({"scheme": "printed"}, [], False, ("diffusion",)),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2}, [], False, ("pairs of beams",)),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2, "directional": None}, [], False, ()),
     ({"g": 0.4, "ambient": (0.3,), "model": "none"}, [], False, ("skies towards cameras",)),

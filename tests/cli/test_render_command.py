@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -51,15 +50,6 @@ def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run)
         assert np.abs(preview - encoded(image.astype(float))).max() <= 1
 
 
-def numbers(value: Any) -> list[float]:
-    """All numbers in nested mappings: of `seconds`, the light's and each view's."""
-    return (
-        [number for entry in value.values() for number in numbers(entry)]
-        if isinstance(value, dict)
-        else [value]
-    )
-
-
 @pytest.mark.parametrize("g", [-0.4, 0, 0.6])
 def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
     succeed(*RENDER, *ROUND, "--components", "-D", f"volume.g={g}")
@@ -76,7 +66,7 @@ def test_the_report(succeed: Run) -> None:
     result = succeed(*RENDER, *ROUND, "--json", "-D", "diffusion.tolerance=1e-5")
     report = json.loads(Path("out/render.json").read_text())
     assert json.loads(result.stdout) == report
-    assert len(numbers(report["seconds"])) == 3 and min(numbers(report["seconds"])) >= 0
+    assert report["seconds"]["light"] >= 0 and set(report["seconds"]["views"]) == {"front", "side"}
     assert [
         solve["iterations"] > 0 and solve["residual"] <= 1e-5 for solve in report["solves"]
     ] == [True, True]  # diffusion's own, and that of the round
@@ -96,21 +86,6 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert Path("out/front.npy").is_file() and Path("out/front.png").is_file()
     (line,) = [line for line in result.stdout.splitlines() if "OpenImageIO" in line]
     assert "no .exr" in line and "pip install" in line
-
-
-def test_overwrite_replaces_pictures_and_nothing_else(succeed: Run) -> None:
-    succeed(*RENDER)
-    first = pixels("front")
-    Path("out/notes.txt").write_text("mine")
-    succeed(*RENDER, "--overwrite", "-D", "volume.density=1")
-    assert Path("out/notes.txt").read_text() == "mine"
-    assert not np.array_equal(pixels("front"), first)
-
-
-def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
-    loud, quiet = run(*RENDER[:-1], "-v"), run(*RENDER, "--overwrite")
-    assert "2/2" in loud.stderr and quiet.stderr == ""
-    assert "render:" not in loud.stdout and "written to out" in quiet.stdout
 
 
 def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from click.testing import Result
 
-from ddrecon.reconstruct import loop, objective
+from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.parameters import Parameter
 
 Run = Callable[..., Result]
@@ -90,25 +89,6 @@ def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
     succeed("optimize", "out/scene.yaml", "-q", "--iterations", "5", "-o", "out", "--resume")
     assert iterations("out") == [1, 2, 3, 4, 5] and set(cells("out")[2:]) == {reached}
     assert Path("out/loss.csv").read_text().startswith(first)
-
-
-def test_overwriting_discards_the_old_checkpoint(
-    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A run killed before it could write a checkpoint must not be resumed from that of the run it
-    overwrote.
-    """
-    succeed("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out")
-
-    def killed(*_: Any) -> None:
-        raise MemoryError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(objective, "render_each", killed)
-        command = "optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out", "--overwrite"
-        assert run(*command).exit_code == 2
-    path = Path("out/checkpoints/last.pt")
-    assert torch.load(path, weights_only=True)["state"]["total"]["iteration"] == 0
 
 
 def wait_for_rows(process: subprocess.Popen[str], log: Path, count: int) -> None:

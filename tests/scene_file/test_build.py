@@ -170,19 +170,8 @@ def test_cameras(write: Write):
     )
     assert perspective.camera.pose[:, 3].tolist() == pytest.approx([0, 0.3, 3.2])
     matrix = [[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
-    (orthographic,) = load_scene(
-        write(
-            view(
-                {
-                    "type": "orthographic",
-                    "width": 3,
-                    "pixel_aspect": 1.25,
-                    "matrix": matrix,
-                    "resolution": [8, 6],
-                }
-            )
-        )
-    ).views
+    flat = {"type": "orthographic", "width": 3, "pixel_aspect": 1.25, "resolution": [8, 6]}
+    (orthographic,) = load_scene(write(view(flat | {"matrix": matrix}))).views
     assert orthographic.camera.half_width == 1.5 and not orthographic.camera.is_perspective
     assert orthographic.camera.pose.tolist() == matrix[:3]
     assert orthographic.camera.pixel_aspect == 1.25

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +14,11 @@ from example_scene import changed
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import FormatError, SceneError
+from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.colmap import MODELS
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.settings import LENSES
 
 Read = Callable[..., SceneFile]
 CAMERAS: dict[str, list[float]] = {
@@ -83,28 +84,17 @@ def test_points_are_seen_where_the_manual_says(
     tree = scene_file.tree.__class__(**{**vars(scene_file.tree), "views": tuple(views)})
     scene = build_scene(SceneFile(tree, scene_file.path, scene_file.marks), dtype=torch.float64)
     camera = scene.views[1].camera
-    for point in np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)):
-        x, y, z = rotation(QUATERNION) @ point + SHIFT
-        u, v = x / z, y / z
-        given = dict(zip(MODELS[model], CAMERAS[model], strict=True))
-        k1, k2, p1, p2 = (given.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
-        r2 = u * u + v * v
-        if model == "OPENCV_FISHEYE":
-            angle = math.atan(math.sqrt(r2))
-            bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + given["k3"] * angle**6)
-            du, dv = u * bent / math.sqrt(r2), v * bent / math.sqrt(r2)
-        else:
-            radial = 1 + k1 * r2 + k2 * r2 * r2
-            du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-            dv = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
-        focal = given.get("f", 0.0)
-        expected = [
-            given.get("fl_x", focal) * du + given["cx"],
-            given.get("fl_y", focal) * dv + given["cy"],
-        ]
-        (seen,), _ = project(camera, torch.tensor(point)[None])
-        if not bool(seen.isnan().any()):
-            torch.testing.assert_close(seen, torch.tensor(expected).double(), atol=1e-5, rtol=0)
+    given = dict(zip(MODELS[model], CAMERAS[model], strict=True))
+    lens = "fisheye" if model == "OPENCV_FISHEYE" else "opencv"
+    numbers = torch.tensor([given.get(name, 0.0) for name in LENSES[lens]]).double()
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)))
+    rays = points @ torch.from_numpy(rotation(QUATERNION).T) + torch.from_numpy(SHIFT)
+    focal = [given.get(name, given.get("f")) for name in ("fl_x", "fl_y")]
+    expected = distort(lens, numbers, rays) * torch.tensor(focal) + torch.tensor([4.2, 3.1])
+    seen, _ = project(camera, points)
+    is_seen = ~seen.isnan().any(1)
+    assert is_seen.any()
+    torch.testing.assert_close(seen[is_seen], expected[is_seen], atol=1e-5, rtol=0)
     center = -rotation(QUATERNION).T @ SHIFT
     torch.testing.assert_close(cast_rays(camera).eye.flip(0), torch.tensor(center))
 
