@@ -57,7 +57,10 @@ class RowFunction:
     alike: int = 0
 
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
-        """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives."""
+        """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
+
+        After the first a field may be several, [n, C or 1, z, y, x].
+        """
         found: Tensors = _Found.apply(self, numbers, *fields)
         return found
 
@@ -73,12 +76,16 @@ class RowFunction:
         width = 1 if like.is_cuda else self.width
         items = colors * math.prod(shape) // width
         made: dict[str, Any]
+        found: list[Tensor]
         if kind == "cotangents":
-            bars = [like.new_empty(colors, *shape) for _ in range(len(fields) - self.alike)]
-            made = {"made": bars + bars[len(bars) - self.alike :]}
-            made["sums"] = like.new_empty(len(numbers), items)
+            count = len(fields) - self.alike
+            found = [like.new_empty(*each.shape[:-4], colors, *shape) for each in fields[:count]]
+            found += found[count - self.alike :]
+            made = {"made": _one_by_one(found), "sums": like.new_empty(len(numbers), items)}
         else:
-            made = {"made": [like.new_empty(each) for each in self.shapes]}
+            found = [like.new_empty(each) for each in self.shapes]
+            made = {"made": found}
+        fields = _one_by_one(fields)
         own = {
             "width": width,
             "rows": items // colors,
@@ -90,7 +97,7 @@ class RowFunction:
         self.kernel(kind, len(fields), 8 * like.element_size()).launch(
             items, {**own, **self.more, **given}, made
         )
-        return tuple(made["made"]), made.get("sums", like)
+        return tuple(found), made.get("sums", like)
 
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
         """The kernel of "values", "tangents" or "cotangents", for so many fields."""
@@ -117,7 +124,9 @@ class _Found(torch.autograd.Function):
         (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
         found, sums = ctx.function.run("cotangents", numbers, fields, bars=bars)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
-        field_bars = (_sum_colors(bar, len(one)) for bar, one in zip(found, fields, strict=True))
+        field_bars = (
+            _sum_colors(bar, one.shape[-4]) for bar, one in zip(found, fields, strict=True)
+        )
         return None, numbers_bar, *field_bars, *(bars * added)[:added]
 
     @staticmethod
@@ -131,7 +140,7 @@ class _Found(torch.autograd.Function):
                 torch.zeros_like(value) if d_value is None else d_value.expand_as(value)
                 for value, d_value in zip(values, d_values, strict=True)
             )
-            given = {"d_numbers": d_numbers, "d_fields": d_fields}
+            given = {"d_numbers": d_numbers, "d_fields": _one_by_one(d_fields)}
             return ctx.function.run("tangents", values[0], values[1:], **given)[0]
 
         found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes)
@@ -139,8 +148,13 @@ class _Found(torch.autograd.Function):
 
 
 def _sum_colors(bar: Tensor, channels: int) -> Tensor:
-    """`bar` [C, ...] of a field that has but so many colors."""
-    return bar if len(bar) == channels else bar.unflatten(0, (-1, channels)).sum(0)
+    """`bar` [..., C, z, y, x] of a field that has but so many colors."""
+    return bar if bar.shape[-4] == channels else bar.unflatten(-4, (-1, channels)).sum(-5)
+
+
+def _one_by_one(fields: Sequence[Tensor]) -> list[Tensor]:
+    """`fields` as kernels have them."""
+    return [one for field in fields for one in (field if field.ndim > 4 else [field])]
 
 
 @functools.cache

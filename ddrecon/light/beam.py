@@ -18,7 +18,7 @@ from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import recompute, recompute_for
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
@@ -137,11 +137,7 @@ def attenuate(
     sums: Sequence[Tensor] = ()
     masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
-        # Of lights, which are few, kernels keep what their adjoint needs.
-        if has_mass and is_fused_whole(medium.grid, directions):
-            parts, more = attenuate_few(medium, *some, has_mass)
-        else:
-            parts, more = recompute(attenuate_few, medium, *some, has_mass)
+        parts, more = attenuate_few(medium, *some, has_mass)
         sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
         masses += more
     mean, *others = sums
@@ -154,20 +150,27 @@ def attenuate_few(
 ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
     """What is received of a few beams, for the mean, for each component of the flux, for all else.
 
-    And masses, as `attenuate` has them. To be recomputed.
+    And masses, as `attenuate` has them.
     """
-    extinction = medium.extinction
+    extinction, is_fused = medium.extinction, is_fused_whole(medium.grid, directions)
     field, scale = extinction.field, extinction.scale
-    entered, steps = sum_masses(field, medium.grid, directions, extinction.mass_bound)
-    if is_fused_whole(medium.grid, directions):
-        from ddrecon.light.fused.receive import receive
 
-        colors = max(weights.shape[2], len(scale))
-        weights = weights.expand(-1, -1, colors)
-        received = receive(field, scale.flatten().expand(colors), entered, steps, weights)
-    else:
-        tau = extinction.mean_transmittance(entered[0], steps[0])
-        sums = tau * weights[0][..., None, None, None]
-        received = *sums[:4], *([sums[4:]] if len(sums) > 4 else [])
-    masses = zip(entered, steps, strict=True) if has_mass else ()
-    return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
+    def use(entered: Tensor, steps: Tensor) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+        if is_fused:
+            from ddrecon.light.fused.receive import receive
+
+            colors = max(weights.shape[2], len(scale))
+            given = entered, steps, weights.expand(-1, -1, colors)
+            received = receive(field, scale.flatten().expand(colors), *given)
+        else:
+            tau = extinction.mean_transmittance(entered[0], steps[0])
+            sums = tau * weights[0][..., None, None, None]
+            received = *sums[:4], *([sums[4:]] if len(sums) > 4 else [])
+        masses = zip(entered, steps, strict=True) if has_mass else ()
+        return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
+
+    crossing = field, medium.grid, directions, extinction.mass_bound
+    if not is_fused:
+        return recompute(lambda: use(*sum_masses(*crossing)))
+    # Of lights, which are few, kernels keep what their adjoint needs.
+    return use(*sum_masses(*crossing)) if has_mass else recompute_for(use, sum_masses, *crossing)

@@ -24,10 +24,10 @@ def scatter_fused(
 
     `light` has a flux; `factors`: as of `Moments.weighted`, [L + 1, C or 1, 1, 1, 1].
     """
-    fields = [light.mean, *(light.flux or ()), *(() if light.higher is None else light.higher)]
-    degree = math.isqrt(len(fields)) - 1
-    fields += [] if more is None else [more]
-    colors = max(factors.shape[1], *map(len, fields))
+    higher = light.higher
+    degree = 1 if higher is None else math.isqrt(4 + len(higher)) - 1
+    fields = [one for one in (light.mean, *(light.flux or ()), higher, more) if one is not None]
+    colors = max(factors.shape[1], *(one.shape[-4] for one in fields))
     point = -rays.direction[0] if rays.eye is None else rays.eye
     each = point[:, None], factors[: degree + 1].reshape(degree + 1, -1)
     numbers = torch.cat([one.expand(-1, colors) for one in each])
@@ -35,8 +35,7 @@ def scatter_fused(
     given = {"ny": y, "nx": x, "is_eye": rays.eye is not None, "margin": MARGIN}
     given |= zip(("hz", "hy", "hx", "lz", "ly", "lx"), (*grid.spacing, *grid.lower), strict=True)
     given["least"] = 1e6 * torch.finfo(light.mean.dtype).tiny
-    has_more = len(fields) > (degree + 1) ** 2
-    name = f"Outgoing<{degree}, {int(has_more)}, {int(point.requires_grad)}>"
+    name = f"Outgoing<{degree}, {int(more is not None)}, {int(point.requires_grad)}>"
     shape = colors, *grid.shape
     (radiance,) = RowFunction(HEADER, name, (shape,), x, VIEW, GIVEN, given).apply(numbers, *fields)
     return radiance

@@ -69,7 +69,7 @@ template <class F, int CHUNK> struct Receiver {
     }
 
     // Adds the field's cotangent, and writes that of what `entered`; where it `varies`, `sums`
-    // [lights, 1 + (1 + moments) colors] of the step, scales and weights.
+    // [lights, 1 + (1 + moments) colors] of the step, scales and weights. Some of `bars` may be 0.
     INLINE void receive_back(
         int item, int first_item, bool varies, const F* field, const F* scale, const F* entered,
         const F* steps, const F* weights, const F* const* bars, F* field_bar, F* entered_bar,
@@ -90,6 +90,7 @@ template <class F, int CHUNK> struct Receiver {
                 F bar[CHUNK], seen[CHUNK], of_scale[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
+                    if (!bars[a < 4 ? a : 4]) continue;
                     const F own = weights[weight(one, a, c)];
                     const F* __restrict from = moment(bars, a, c) + begin;
                     for (int t = 0; t < count; ++t) bar[t] += own * from[t];
@@ -108,6 +109,7 @@ template <class F, int CHUNK> struct Receiver {
                 found[0] += total(of_step, count);
                 found[1 + c] = total(of_scale, count);
                 for (int a = 0; a < moments; ++a) {
+                    if (!bars[a < 4 ? a : 4]) continue;
                     const F* __restrict from = moment(bars, a, c) + begin;
                     for (int t = 0; t < count; ++t) of_scale[t] = from[t] * seen[t];
                     found[1 + (1 + a) * colors + c] = total(of_scale, count);

@@ -42,16 +42,18 @@ class _Received(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.set_materialize_grads(False)
         keep(ctx, *inputs)
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        field, _, entered, _, weights = ctx.saved_tensors
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+        # Once: each access may compute them again.
+        field, _, entered, _, weights = tensors = ctx.saved_tensors
         _, needs_scale, _, needs_steps, needs_weights = ctx.needs_input_grad
         varies = needs_scale or needs_steps or needs_weights
         lights, moments, colors = weights.shape
-        given = _given(ctx.saved_tensors) | {"varies": varies, "bars": _five(bars)}
+        given = _given(tensors) | {"varies": varies, "bars": _five(bars)}
         field_bar, entered_bar = field.new_zeros(field.shape), field.new_empty(entered.shape)
         made = {"field_bar": field_bar, "entered_bar": entered_bar}
         items, _ = cut(field[0].numel(), CHUNK, field)
@@ -108,7 +110,7 @@ def _receive(
     return tuple(made)
 
 
-def _five(moments: Sequence[Tensor]) -> list[Tensor | None]:
+def _five(moments: Sequence[Tensor | None]) -> list[Tensor | None]:
     """`moments` as kernels have them, None for those that are missing."""
     return [*moments, *[None] * (5 - len(moments))]
 

@@ -234,10 +234,10 @@ template <class F, int BLOCK> struct Shear : Slices {
         sums[3] = total(of[LIMIT], own.count);
     }
 
-    // Cotangents of the field on rays, on slices and midway, in place of masses and corrections.
+    // Cotangents of the field on rays, on slices and midway.
     INLINE void sum_back(
-        int item, bool varies, const F* entered_bar, const F* corrections_bar, F* masses,
-        F* corrections, double* sums) const {
+        int item, bool varies, const F* masses, const F* corrections, const F* entered_bar,
+        const F* corrections_bar, F* slices_bar, F* midways_bar, double* sums) const {
         Rays own = rays_of(item);
         F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
         F of_step[BLOCK], of_bound[BLOCK];
@@ -255,7 +255,7 @@ template <class F, int BLOCK> struct Shear : Slices {
             if (own.is_ghost || from < lo || to > hi)
                 for (int j = from; j < to; ++j)
                     if (own.is_ghost || j < 0 || j >= columns)
-                        masses[at + j - c.n + 1] = corrections[at + j - c.n + 1] = F(0);
+                        slices_bar[at + j - c.n + 1] = midways_bar[at + j - c.n + 1] = F(0);
             if (own.is_ghost) continue;
 
             // Of rays, by gathering from cells: rows first, then columns.
@@ -287,8 +287,11 @@ template <class F, int BLOCK> struct Shear : Slices {
             for (int j = hi; j < to; ++j) bar[hi - 1 - from] += bar[j - from];
 
             // Back along the sums.
-            F* __restrict mass = masses + at + lo - c.n + 1;
-            F* __restrict correction = corrections + at + lo - c.n + 1;
+            const long long first = at + lo - c.n + 1;
+            const F* __restrict mass = masses + first;
+            const F* __restrict correction = corrections + first;
+            F* __restrict of_slice = slices_bar + first;
+            F* __restrict of_midway = midways_bar + first;
             F* __restrict sum = passed + (lo - own.begin);
             F* __restrict bend = bends + (lo - own.begin);
             const F* __restrict of_mass = bar + (lo - from);
@@ -306,13 +309,13 @@ template <class F, int BLOCK> struct Shear : Slices {
                 const F of_bend = of_mass[t] * Bounded<F>(correction[t], bound).by_x;
                 // Nothing bends after the last slice.
                 const F bends_on = (k + 1 < slices ? F(2) : F(1)) * bend[t];
-                mass[t] = step * sum[t] - F(0.25) * step * (bends_on + of_bend);
-                correction[t] = F(0.5) * step * bend[t];
+                of_slice[t] = step * sum[t] - F(0.25) * step * (bends_on + of_bend);
+                of_midway[t] = F(0.5) * step * bend[t];
                 sum[t] += of_mass[t];
                 bend[t] += of_bend;
             }
             if (k == 0)
-                for (int t = 0; t < hi - lo; ++t) mass[t] += F(0.25) * step * bend[t];
+                for (int t = 0; t < hi - lo; ++t) of_slice[t] += F(0.25) * step * bend[t];
         }
         if (!varies) return;
         sums[4 * item + 2] = by_step / (double)step;
@@ -321,8 +324,8 @@ template <class F, int BLOCK> struct Shear : Slices {
 
     // Adds those of the field's cells, from what `sum_back` has left on rays.
     INLINE void look_back(
-        int item, bool varies, const F* field, const F* masses, const F* corrections, F* field_bar,
-        double* sums) const {
+        int item, bool varies, const F* field, const F* slices_bar, const F* midways_bar,
+        F* field_bar, double* sums) const {
         const Cells own = cells_of(item);
         F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];
         double by_row = 0, by_column = 0;
@@ -356,9 +359,9 @@ template <class F, int BLOCK> struct Shear : Slices {
             by_row -= (s + shift) * total(of_row, own.count);
             by_column -= (s + shift) * total(of_column, own.count);
         };
-        gather(masses, own.k, 0, F(1));
-        if (own.k + 1 < slices) gather(corrections, own.k, 0.5, F(0.5));
-        if (own.k > 0) gather(corrections, own.k - 1, 0.5, F(0.5));
+        gather(slices_bar, own.k, 0, F(1));
+        if (own.k + 1 < slices) gather(midways_bar, own.k, 0.5, F(0.5));
+        if (own.k > 0) gather(midways_bar, own.k - 1, 0.5, F(0.5));
         if (!varies) return;
         sums[4 * item] = by_row;
         sums[4 * item + 1] = by_column;

@@ -146,12 +146,14 @@ class _Masses(torch.autograd.Function):
         laid, varies = _lay(ctx.shears, field), ctx.needs_input_grad[3]
         bars = {key: torch.zeros_like(one) for key, one in laid.items()}
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
-        for light, (shear, own) in enumerate(zip(ctx.shears, kept, strict=True)):
-            windows = own.clone()
+        most = max(shear.window for shear in ctx.shears)
+        on_rays = field.new_empty(2, len(field) * most)
+        for light, (shear, windows) in enumerate(zip(ctx.shears, kept, strict=True)):
             key, bar = shear.is_across_x, shear.turn(entered_bar[light])
             given = {"light": light, "numbers": numbers, "field": laid[key]}
             given |= {"varies": varies, "entered_bar": bar}
-            made = {"masses": windows[0], "corrections": windows[1], "field_bar": bars[key]}
+            given |= {"masses": windows[0], "corrections": windows[1]}
+            made = {"slices_bar": on_rays[0], "midways_bar": on_rays[1], "field_bar": bars[key]}
             made["corrections_bar"] = torch.empty_like(bar)
             for name in ("carry_back", "sum_back", "look_back"):
                 numbers_bar[light] += shear.launch(name, given, made)
@@ -200,9 +202,9 @@ _SLICES = (
 """Members of `Slices`, and of a shear's record."""
 _GIVEN = f"""
 int {_SLICES}, light, varies; F *numbers, *field, *entered, *masses, *corrections;
-F *entered_bar, *corrections_bar, *field_bar; double *sums
+F *entered_bar, *corrections_bar, *slices_bar, *midways_bar, *field_bar; double *sums
 """
-_RETURNED = "masses corrections corrections_bar field_bar sums"
+_RETURNED = "corrections_bar slices_bar midways_bar field_bar sums"
 """What one adjoint after the other writes, and the next reads."""
 
 
@@ -216,8 +218,9 @@ def shear_kernels(bits: int) -> SimpleNamespace:
         "sum_along_rays": "number[3], (const N*)field, (N*)masses, (N*)corrections",
         "carry_to_cells": "number[3], (const N*)masses, (N*)entered",
         "carry_back": "varies, masses, entered_bar, corrections_bar, sums",
-        "sum_back": "varies, entered_bar, corrections_bar, masses, corrections, sums",
-        "look_back": "varies, field, masses, corrections, field_bar, sums",
+        "sum_back": "varies, masses, corrections, entered_bar, corrections_bar, slices_bar, "
+        "midways_bar, sums",
+        "look_back": "varies, field, slices_bar, midways_bar, field_bar, sums",
     }
     made = {"sum_along_rays": "masses corrections", "carry_to_cells": "entered"}
 
