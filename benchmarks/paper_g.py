@@ -67,7 +67,7 @@ def finish(overrides: list[str], iterations: int) -> Reconstruction:
 
 
 def deviation(run: Reconstruction) -> float:
-    """The posterior's standard deviation of g about where `run` is, all else free (E33)."""
+    """The posterior's standard deviation of g about where `run` is, all else free (E11.4)."""
     sure = Uncertainty(run, seed=0)
     curvature, posterior = sure.curvature, sure.posterior
     unit = curvature.join({"g": torch.ones_like(curvature.values["g"])})

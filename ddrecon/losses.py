@@ -18,7 +18,7 @@ ROUNDING = 1e-2
 rather than as total variation.
 """
 KNEE = 1.2
-"""Total variation is that of densities far below it, and of the logarithm of those above (E47).
+"""Total variation is that of densities far below it, and of the logarithm of those above (E11.3).
 
 It is in optical depths across the box's shortest side, whatever the unit of density is.
 """
@@ -66,7 +66,7 @@ def relative_l2(error: Tensor, target: Target) -> Tensor:
 
 
 def display(error: Tensor, target: Target) -> Tensor:
-    """The square of `error` in displayed values, by the slope of sRGB at the target (E27).
+    """The square of `error` in displayed values, by the slope of sRGB at the target (E9.3).
 
     So it is quadratic however far off an image is: the curve itself would be steep where an image
     is still black, and flat where it is too bright. What is brighter than a target that is white
@@ -77,7 +77,7 @@ def display(error: Tensor, target: Target) -> Tensor:
 
 
 def photon(error: Tensor, target: Target) -> Tensor:
-    """The square of `error` in units of the noise at the target (E26)."""
+    """The square of `error` in units of the noise at the target (E9.2)."""
     return (error * target.slope) ** 2
 
 
@@ -208,7 +208,7 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
 
 
 def compress(field: Tensor, knee: float) -> Tensor:
-    """What of the density `field` is penalized: log(1 + field / `knee`) / 3 (E47).
+    """What of the density `field` is penalized: log(1 + field / `knee`) / 3 (E11.3).
 
     `field` >= 0; `knee` > 0 is in its unit.
     """

@@ -54,9 +54,9 @@ from ddrecon.settings import DiffusionSettings
 class LightField:
     """All light inside a medium.
 
-    `beams` are those of directional and point lights (E2). `diffuse` is the other light, L0 and L1.
+    `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E20).
+    camera's rays anew. `turned` is light that backward peaks have turned (E8.11).
     """
 
     medium: Medium
@@ -67,13 +67,13 @@ class LightField:
 
     @property
     def outgoing(self) -> Moments:
-        """What one more scattering makes of `diffuse` (E3), as `scatter_once_more` has it."""
+        """What one more scattering makes of `diffuse` (E2.3), as `scatter_once_more` has it."""
         return scatter_once_more(self.medium, self.diffuse)
 
 
 @dataclass(frozen=True)
 class Components:
-    """The terms of E1, each [3, h, w], which sum to the image.
+    """The terms of E2.1, each [3, h, w], which sum to the image.
 
     Light scattered forward once more counts as `multiple`, as in path tracing.
     """
@@ -105,7 +105,7 @@ def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> lis
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
-    """The light inside the volume of `scene`: reduced light, and what is scattered often (E4, E5).
+    """The light inside the volume of `scene`: reduced, and scattered often (E2.4, E2.5).
 
     Reduced light alone where nothing scatters twice.
     """
@@ -113,7 +113,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     medium = scale_medium(volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(volume), scene.lights)
-    # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
+    # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
     lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, medium.degree, has_backward_peak(medium))
     sky = sum_unscattered_sky(medium, lights, medium.degree)
@@ -121,9 +121,9 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     if sky is not None:
         source = source.plus(sky.weighted(remaining_moments(medium)))
     outside = ambient_radiance(lights, medium.g)
-    # L0 and L1: E4 to E6.
+    # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
-    # Skies scatter by E3 as well; beams by E2 on each view ray.
+    # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
     return LightField(medium, reduced.beams, light, turned=reduced.turned)
 
@@ -162,7 +162,7 @@ def solve_diffuse(
     settings: DiffusionSettings,
     memory: SolveMemory,
 ) -> Moments:
-    """L0 and L1 (E4 to E6), by the scheme of `settings`.
+    """L0 and L1 (E2.4 to E2.6), by the scheme of `settings`.
 
     `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
     """
@@ -188,7 +188,7 @@ def view_picture(
 ) -> Tensor:
     """The picture `[3, h, w]` that the camera of `view` takes: exposure times radiance, and offset.
 
-    A background of the view is what its picture shows where nothing is before it (E28).
+    A background of the view is what its picture shows where nothing is before it (E9.1).
     `derivatives` is as in `view_image`.
     """
     exposure, offset, behind = view.exposure, view.offset, view.background
@@ -207,11 +207,11 @@ def view_image(
     derivatives: str = "all",
     behind: Tensor | None = None,
 ) -> Tensor:
-    """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
+    """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E2.1).
 
-    `derivatives` says which radiance passes derivatives on: `all`, `single` (E2 of beams, and what
-    is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is the same.
-    `behind` [C, h, w] is the radiance behind the volume, in place of that of lights.
+    `derivatives` says which radiance passes derivatives on: `all`, `single` (E2.2 of beams, and
+    what is seen unscattered) or `diffusion` (E2.3, with the ambient light in it). The image is the
+    same. `behind` [C, h, w] is the radiance behind the volume, in place of that of lights.
     """
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
@@ -245,7 +245,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
 
 
 def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor | None) -> Tensor:
-    """Radiance [3, h, w]: E1, averaged over the rays of each pixel.
+    """Radiance [3, h, w]: E2.1, averaged over the rays of each pixel.
 
     Behind the volume is what is `given` [C, h, w], else the lights.
     """
@@ -265,7 +265,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
+    """What the medium sends towards the camera that `bundle` belongs to (E2.2, E2.3)."""
     medium = light_field.medium
     diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:

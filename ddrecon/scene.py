@@ -31,7 +31,7 @@ class View:
     `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views
     are never optimized on; `weight` > 0 is how much a training view counts.
 
-    What its camera does to radiance (E28): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
+    What its camera does to radiance (E9.1): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
     0; `background` [C, h, w] or [C, 1, 1] is what the picture shows where the volume is empty, None
     for the light behind it. `step` and `noise` say how the picture errs, see `ddrecon.pictures`.
     """

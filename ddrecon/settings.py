@@ -168,7 +168,7 @@ class ParameterSettings:
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does).
 
-    `tv` weighs its total variation, of density by E47; 1 would weigh it as much as the whole
+    `tv` weighs its total variation, of density by E11.3; 1 would weigh it as much as the whole
     brightness of the targets.
 
     `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is

@@ -99,7 +99,7 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
 
 
 def _has_pairs(medium: Medium, scene: Scene) -> bool:
-    """Whether backward peaks turn beams back and forth (E20)."""
+    """Whether backward peaks turn beams back and forth (E8.11)."""
     return has_backward_peak(medium) and _has_beams(scene.lights)
 
 

@@ -402,7 +402,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density, of whose logarithm it is (E47), and 0 for others."
+                " density, of whose logarithm it is (E11.3), and 0 for others."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

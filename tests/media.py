@@ -159,7 +159,7 @@ def render_tangent(
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
-    """S(x, w) of E13, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`.
+    """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`.
 
     A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
     """

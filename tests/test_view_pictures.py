@@ -1,4 +1,4 @@
-"""What a camera does to radiance: exposure, offset and background (E28)."""
+"""What a camera does to radiance: exposure, offset and background (E9.1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light by the conservative scheme: balance E4 with boundary E6 on the operator of E7, and flux E5.
+"""Light by the conservative scheme: balance E2.4, boundary E2.6, operator E2.7, flux E2.5.
 
 D is kept for the backward pass, which makes conductances and right sides from it anew, one axis at
 a time: memory is what limits the size of a volume.
@@ -32,7 +32,7 @@ from ddrecon.slabs.slab import Slab
 
 @dataclass(frozen=True)
 class DiffusionProblem:
-    """E4 to E6 in `medium`, as a linear system for L0, and L1 of its solution.
+    """E2.4 to E2.6 in `medium`, as a linear system for L0, and L1 of its solution.
 
     `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside`
     [C, 1, 1, 1]: radiance that enters through the box's faces. L0 and L1 hold all of that,
@@ -57,7 +57,7 @@ class DiffusionProblem:
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
-        """A and the right side of E7."""
+        """A and the right side of E2.7."""
         if is_fused():
             from ddrecon.diffusion.fused.faces import assemble_system
 
@@ -107,7 +107,7 @@ class DiffusionProblem:
         return add_vectors(begun, (z, y, x) if sign > 0 else (-z, -y, -x))
 
     def right_side(self, source: Tensor, flux: Vector | None) -> Tensor:
-        """The right side of E7 with more in it: a `source`, and - div(D kappa_s `flux`)."""
+        """The right side of E2.7 with more in it: a `source`, and - div(D kappa_s `flux`)."""
         _, right = self.system
         if flux is None:
             return right + source
@@ -161,7 +161,7 @@ def _inner(slab: Slab, ghosts: Ghosts, u: Tensor) -> Tensor:
 def _loss_and_source(
     medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What cells lose, and what they gain but for Q1 (E4, E6, E7).
+    """What cells lose, and what they gain but for Q1 (E2.4, E2.6, E2.7).
 
     kappa_a + escape, and kappa_s Q0 + escape L, where escape is the part through the box's faces
     and L the radiance `outside`.
@@ -186,6 +186,6 @@ def axis_flux(
     mean: Tensor,
     axis: int,
 ) -> Tensor:
-    """L1 = 3 F along `axis` (E5), averaged over each cell's two faces."""
+    """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
     return 3 * cell_average(face_fluxes(mean, source, diffusion, medium.grid, axis, outside), axis)

@@ -1,11 +1,11 @@
-"""Flux-limited diffusion: D depends on the light it diffuses, so E4 is solved by Picard iteration.
+"""Flux-limited diffusion: D depends on the light it diffuses, so Picard iteration solves E2.4.
 
 With r(u) = A(D(u)) u - S(D(u)), an iteration is u <- u - `DAMPING` A(D(u))^-1 r(u), A being that of
-E7 with the D of the last light. Derivatives are those of the fixed point r(u, theta) = 0, by the
+E2.7 with the D of the last light. Derivatives are those of the fixed point r(u, theta) = 0, by the
 implicit function theorem, with J = dr/du, which is not symmetric:
 
-- E8: J du = -(dr/dtheta) dtheta;
-- E9: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda.
+- E3.1: J du = -(dr/dtheta) dtheta;
+- E3.2: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda.
 
 Both are solved by the same damped iteration with the same A. Linearized at the fixed point it is
 the Picard iteration, so one converges where the other does. Source: Koerner et al. 2014,
@@ -72,10 +72,10 @@ class Balance:
         """A and S with the D of the light `u`."""
         transport_extinction, absorption, gain, outside, *flux = coefficients
         diffusion = self.diffusion(u, transport_extinction)
-        # E6: what goes out through the faces of the box, and what comes in
+        # E2.6: what goes out through the faces of the box, and what comes in
         escape = boundary_loss(diffusion, self.grid)
         right = gain + escape * outside
-        # -div(D kappa_s Q1) of E4
+        # -div(D kappa_s Q1) of E2.4
         for axis, component in zip(AXES, flux, strict=bool(flux)):
             faces = face_fluxes(None, component, diffusion, self.grid, axis)
             right = right - faces.diff(dim=axis) / self.grid.spacing[axis - 1]
@@ -163,7 +163,7 @@ class ImplicitFixedPoint(torch.autograd.Function):
         operator, _ = ctx.balance.system(u, *coefficients)
         # pull(lambda) = (J^T lambda, (dr/dtheta)^T lambda)
         _, pull, *_ = torch.func.vjp(ctx.balance.residual, u, *coefficients)
-        # E9: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda
+        # E3.2: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda
         adjoint = iterate_picard(
             ctx.solve, "adjoint", u, lambda adjoint: (operator, u_bar - pull(adjoint)[0])
         )
@@ -180,7 +180,7 @@ class ImplicitFixedPoint(torch.autograd.Function):
         zeros = [torch.zeros_like(c) for c in coefficients]
         changes = [zero if d is None else d for zero, d in zip(zeros, d_coefficients, strict=True)]
         (right,) = push((torch.zeros_like(u), *changes))
-        # E8: J du = -(dr/dtheta) dtheta
+        # E3.1: J du = -(dr/dtheta) dtheta
         return iterate_picard(
             ctx.solve, "tangent", u, lambda d_u: (operator, -right - push((d_u, *zeros))[0])
         )

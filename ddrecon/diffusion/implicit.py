@@ -1,4 +1,4 @@
-"""Derivatives of a linear solve, by hand: the tangent (docs/theory.md E8) and the adjoint (E9).
+"""Derivatives of a linear solve, by hand: the tangent (docs/theory.md E3.1) and the adjoint (E3.2).
 
 A u = S, where the matrix A is made of some tensors p. Differentiating both sides gives
 A du = dS - dA u: one more solve for each direction in which S and p change. For a cotangent u_bar
@@ -60,7 +60,7 @@ class SolverWithMemory:
 
     `round_index` tells the solves of one render apart: 0 is diffusion's own, transport rounds count
     from 1. Forward solves that remember nothing begin at `start`, or at zero; adjoint ones at the
-    negative of the next round's, since a round takes away what it begins with (E12).
+    negative of the next round's, since a round takes away what it begins with (E2.10).
     """
 
     solver: Callable[[Any, Tensor, Tensor | None, float], Solution]
@@ -111,8 +111,8 @@ class ImplicitSolve(torch.autograd.Function):
     """u with A u = `source`, where A is `assemble(prepared, *tensors)`, in both modes.
 
     `prepared` is what solvers keep about A from one solve to the next. A has its `transposed()`;
-    `cotangents(lambda, u)`, those of `tensors` for A_bar = -lambda u^T (E9); and, for their changes
-    or None, `change_terms(d_tensors, u)`, of which dA u is the sum (E8).
+    `cotangents(lambda, u)`, those of `tensors` for A_bar = -lambda u^T (E3.2); and, for their
+    changes or None, `change_terms(d_tensors, u)`, of which dA u is the sum (E3.1).
     """
 
     @staticmethod
@@ -133,12 +133,12 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
-        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
+        # E3.2: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
         # several solves may share it, and with the last of them its memory is free again.
         prepared, ctx.prepared = ctx.prepared, {}
         adjoint = ctx.solve("adjoint", ctx.assemble(prepared, *tensors).transposed(), u_bar)
         del prepared
-        # E9: p_bar, the entries of A_bar = -lambda u^T that depend on p.
+        # E3.2: p_bar, the entries of A_bar = -lambda u^T that depend on p.
         tensor_bars = ctx.assemble({}, *tensors).cotangents(adjoint, u)
         return None, None, None, adjoint, *tensor_bars
 
@@ -153,7 +153,7 @@ class ImplicitSolve(torch.autograd.Function):
     ) -> Tensor:
         u, *tensors = ctx.saved_tensors
         operator = ctx.assemble(ctx.prepared, *tensors)
-        # E8: A du = dS - dA u.
+        # E3.1: A du = dS - dA u.
         right = torch.zeros_like(u) if d_source is None else d_source.clone()
         for term in operator.change_terms(d_tensors, u):
             right -= term
@@ -166,7 +166,7 @@ class ImplicitSolve(torch.autograd.Function):
 
 
 def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor) -> Tensor:
-    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
+    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E3.1, E3.2).
 
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.

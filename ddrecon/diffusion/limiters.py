@@ -33,7 +33,7 @@ def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
 def marshak(extinction: Tensor, steepness_square: Tensor) -> Tensor:
     """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows.
 
-    That is what E6 lets out of a surface.
+    That is what E2.6 lets out of a surface.
     """
     return 1 / torch.sqrt(9 * extinction**2 + 4 * steepness_square)
 

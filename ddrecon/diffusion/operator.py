@@ -1,4 +1,4 @@
-"""The conservative diffusion operator A = G^T c G + loss (docs/theory.md E7).
+"""The conservative diffusion operator A = G^T c G + loss (docs/theory.md E2.7).
 
 All arrays hold cell centers, `[C, z, y, x]`, or the faces between cells along one axis. G is the
 difference of neighboring cells across each interior face, c the conductance of that face; `loss` is
@@ -88,7 +88,7 @@ class Operator:
         return self
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E9)."""
+        """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E3.2)."""
         if self.ghosts is not None:
             # Each rank has the rows of its own cells: so a face that two have is counted once.
             adjoint = self.ghosts.without(adjoint)
@@ -99,7 +99,7 @@ class Operator:
         return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
 
     def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
-        """dA u = dloss u + G^T (dc G u), term by term (E8)."""
+        """dA u = dloss u + G^T (dc G u), term by term (E3.1)."""
         d_loss, *d_conductances = d_tensors
         if d_loss is not None:
             yield d_loss * u
@@ -143,7 +143,7 @@ def accumulate(faces: Tensor, axis: int) -> Tensor:
 
 
 def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
-    """c = (harmonic mean of D) / h^2 [1/u] on the interior faces along `axis` (E7).
+    """c = (harmonic mean of D) / h^2 [1/u] on the interior faces along `axis` (E2.7).
 
     `diffusion`: D [u], `[C, z, y, x]`, > 0.
     """
@@ -151,7 +151,7 @@ def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
 
 
 def harmonic_mean(u: Tensor, axis: int) -> Tensor:
-    """2 / (1/a + 1/b) of the two cells beside every interior face along `axis` (E7).
+    """2 / (1/a + 1/b) of the two cells beside every interior face along `axis` (E2.7).
 
     `u`: `[C, z, y, x]`, > 0, in any unit; the result has that unit, and one entry less along
     `axis`.
@@ -160,7 +160,7 @@ def harmonic_mean(u: Tensor, axis: int) -> Tensor:
 
 
 def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
-    """What a cell loses through the faces of the box, per unit L0 [1/u] (Marshak, E6).
+    """What a cell loses through the faces of the box, per unit L0 [1/u] (Marshak, E2.6).
 
     1 / (h (2 + h / (2 D))) for each such face; `diffusion`: D [u], `[C, z, y, x]`.
     """
@@ -179,7 +179,7 @@ def face_fluxes(
     axis: int,
     outside: Tensor | None = None,
 ) -> Tensor:
-    """F = D (-grad L0 + kappa_s Q1) along `axis` on all faces (E5 without its 3, and E6).
+    """F = D (-grad L0 + kappa_s Q1) along `axis` on all faces (E2.5 without its 3, and E2.6).
 
     F is linear in three terms; one that is None is zero. `radiance`: L0 [C, z, y, x];
     `source_flux`: the component of kappa_s Q1 along `axis`, same shape; `outside`: the radiance
@@ -196,15 +196,15 @@ def face_fluxes(
         inside = difference(radiance, axis) / -step
         high = _last(radiance, axis)
     if source_flux is not None:
-        # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E6's numerator
+        # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E2.6's numerator
         low, high = (
             side + step / 2 * end(source_flux, axis) for side, end in ((low, _first), (high, _last))
         )
         inside = inside + 0.5 * (lower_cells(source_flux, axis) + upper_cells(source_flux, axis))
     if outside is not None:
-        # E6 for L0 - outside in place of L0
+        # E2.6 for L0 - outside in place of L0
         low, high = low + outside, high - outside
-    # E6 divides by 2 + h / (2 D); inside, the drive is multiplied by the harmonic mean of D (E7)
+    # E2.6 divides by 2 + h / (2 D); inside, the drive is times the harmonic mean of D (E2.7)
     into, out = (escape(end(diffusion, axis), step) for end in (_first, _last))
     return torch.cat([into * low, harmonic_mean(diffusion, axis) * inside, out * high], axis)
 
@@ -215,7 +215,7 @@ def cell_average(faces: Tensor, axis: int) -> Tensor:
 
 
 def escape(diffusion: Tensor, step: float) -> Tensor:
-    """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E6)."""
+    """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E2.6)."""
     return 1 / (2 + step / (2 * diffusion))
 
 

@@ -1,4 +1,4 @@
-"""Beams of parallel light inside the volume: their part of L_ri (E1) and of L_ss (E2)."""
+"""Beams of parallel light inside the volume: their part of L_ri (E2.1) and of L_ss (E2.2)."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ class Beam:
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` over each segment of view rays, and the phase function p.
 
-        Their product is what E2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s
-        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C, R]. With
-        a forward peak of depth `peak` [N, C, R] at the nodes (E13), or where it differs from cell
-        to cell, it changes along the ray: then the integral holds it, and the factor is 1.
+        Their product is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]:
+        kappa_s per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C,
+        R]. With a forward peak of depth `peak` [N, C, R] at the nodes (E8.7), or where it differs
+        from cell to cell, it changes along the ray: then the integral holds it, and the factor is
+        1.
         """
         cosine = self.cosine(nodes.direction)
         if peak is None and isinstance(seen, SeenPhase):
@@ -73,7 +74,7 @@ def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
 def follow_beams(
     medium: Medium, lights: Sequence[DirectionalLight], degree: int
 ) -> tuple[list[Beam], Moments]:
-    """The beams of `lights`, and the moments up to `degree` of what they scatter (E2, E17).
+    """The beams of `lights`, and the moments up to `degree` of what they scatter (E2.2, E2.8).
 
     These are the sum of p_l Y_k(w) E tau / (4 pi).
     """

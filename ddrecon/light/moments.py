@@ -1,7 +1,7 @@
 """Light by its moments in angle: radiance(w) = mean + flux . w + ... at every cell.
 
 Sources (Q0, Q1), diffuse light (L0, L1) and what scatters towards a camera all have this form.
-Transport rounds go on to higher degrees (docs/theory.md E17).
+Transport rounds go on to higher degrees (docs/theory.md E2.8).
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class Moments:
 
     @staticmethod
     def of_harmonics(values: Tensor) -> Moments:
-        """The light whose moments phi_k are `values` [K, C, z, y, x] (E17)."""
+        """The light whose moments phi_k are `values` [K, C, z, y, x] (E2.8)."""
         if len(values) == 1:
             return Moments(values[0])
         y, z, x = (_FIRST * values[k] for k in (1, 2, 3))
         return Moments(values[0], (z, y, x), values[4:] if len(values) > 4 else None)
 
     def harmonics(self, degree: int) -> Tensor:
-        """All phi_k up to `degree` [K, C, z, y, x] (E17); those that are missing are zero."""
+        """All phi_k up to `degree` [K, C, z, y, x] (E2.8); those that are missing are zero."""
         parts = [self.mean[None]]
         if degree > 0:
             if self.flux is None:
@@ -121,9 +121,9 @@ class Moments:
     def positive_along(self, direction: Vector, more: Tensor | None = None) -> Tensor:
         """Radiance r = `along` + `more`, bent to zero below m = MARGIN (|L0| + |r - L0|).
 
-        It is r where r >= m, m (1 + r/m)^2 / 4 from there down to -m, and 0 below. E3 is negative
+        It is r where r >= m, m (1 + r/m)^2 / 4 from there down to -m, and 0 below. E2.3 is negative
         where light is more directed than two terms in angle can say; where g is not 0 so may L0 be,
-        since E4's source then has either sign. Both mean darkness. Without a flux E7's M-matrix
+        since E2.4's source then has either sign. Both mean darkness. Without a flux E2.7's M-matrix
         keeps L0 >= 0, and what a solve leaves below zero is cut off.
         """
         radiance = self.along(direction)
@@ -162,7 +162,7 @@ def _harmonics_of(direction: Tensor, degree: int) -> Tensor:
 def beam_moments(radiance: Tensor, direction: Tensor, degree: int) -> Moments:
     """The moments up to `degree` of light that all travels along `direction` w.
 
-    They are `radiance` times Y_k(w) (E17). `radiance`: [C, z, y, x]; `direction`: [3] or
+    They are `radiance` times Y_k(w) (E2.8). `radiance`: [C, z, y, x]; `direction`: [3] or
     [3, z, y, x], array order.
     """
     if degree == 0:

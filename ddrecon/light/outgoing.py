@@ -1,4 +1,4 @@
-"""What one more scattering makes of light inside a medium: E3, towards a camera."""
+"""What one more scattering makes of light inside a medium: E2.3, towards a camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21).
+    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E2.3, E8.12).
 
     Where the phase function differs from cell to cell it is p_l phi_k, per (1 - f) kappa_s.
     """
@@ -44,7 +44,7 @@ def scatter_towards(
 ) -> Tensor:
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
 
-    With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
+    With what the `turned` beams scatter (E8.12). As `Moments.positive_along` has it.
     """
     if light.flux is None:
         return scatter_once_more(medium, light).mean.clamp(min=0)
@@ -70,7 +70,7 @@ def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Ten
 
 
 def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
-    """What light of `beam` scatters `towards` a camera: its phase function is that of E21.
+    """What light of `beam` scatters `towards` a camera: its phase function is that of E8.12.
 
     It is per unit of what `scatter_once_more` is.
     """

@@ -1,4 +1,4 @@
-"""Beams that a backward peak turns back and forth: pairs of beams against each other (E20).
+"""Beams that a backward peak turns back and forth: pairs of beams against each other (E8.11).
 
 The part b of scattering turns light exactly back. So light of a directional light goes on as two
 beams, F along its direction and G against it, with their optical depth t from where it enters:
@@ -67,7 +67,7 @@ class Pair:
     against: Tensor
 
     def source(self, medium: Medium) -> Moments:
-        """What both scatter but for their backward peak (E20)."""
+        """What both scatter but for their backward peak (E8.11)."""
         factors = unturned_moments(medium)
         both = [
             beam_moments(radiance, direction, medium.degree).weighted(factors)
@@ -130,7 +130,7 @@ def _pair(
 def _pair_in_cells(
     medium: Medium, entered: Tensor, step: Tensor, turned: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_pair`, where beta differs from cell to cell (E37); b is `turned`."""
+    """As `_pair`, where beta differs from cell to cell (E8.13); b is `turned`."""
     extinction, back = medium.extinction.value, turned * medium.scattering.value
     forth, against = turn_in_cells(extinction, back, medium.grid, direction)
     tau = medium.extinction.mean_transmittance(entered, step)
@@ -140,7 +140,7 @@ def _pair_in_cells(
 def turn_in_cells(
     extinction: Tensor, turned: Tensor, grid: Grid, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """F and G of E20 over what was never scattered, averaged over cells, [C, z, y, x].
+    """F and G of E8.11 over what was never scattered, averaged over cells, [C, z, y, x].
 
     `extinction` and `turned`, b kappa_s, are [C, z, y, x] [1/u]; `direction` [3]: unit, array
     order, the way that F goes.

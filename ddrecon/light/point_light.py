@@ -85,7 +85,7 @@ class PointBeam:
 
 
 def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[PointBeam, Moments]:
-    """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2).
+    """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2.2).
 
     They go up to `degree`, and are those of radiance that all travels away from the light.
 

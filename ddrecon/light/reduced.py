@@ -1,4 +1,4 @@
-"""Light not yet scattered, L_ri: its beams, and the moments Q0 and Q1 that are the source of E4.
+"""Light not yet scattered, L_ri: its beams, and the moments Q0 and Q1 that are the source of E2.4.
 
 Of skies only sums over directions are kept, so memory does not grow with their number.
 """
@@ -32,7 +32,7 @@ class ReducedLight:
     """Light of directional and point lights not yet scattered.
 
     `source`: Q0, Q1 and what follows, of all `beams` together, averaged over cells, to the degree
-    that was wanted. `turned`: light that backward peaks have turned back and forth (E20).
+    that was wanted. `turned`: light that backward peaks have turned back and forth (E8.11).
     """
 
     beams: tuple[Beam | PointBeam, ...]
@@ -46,8 +46,8 @@ def reduced_light(
     """The light of directional and point `lights` that reaches each cell unscattered.
 
     Of lights that go along w the source holds the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
-    moments of the scattering that remains (E17), for k up to `degree`: Q0, and Q1 with 3 g'. With
-    `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E20).
+    moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. With
+    `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E8.11).
     """
     beams: list[Beam | PointBeam] = []
     sources: list[Moments] = []
@@ -97,7 +97,7 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
 
     Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
     and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
-    as going along its middle (E17).
+    as going along its middle (E2.8).
     """
     skies = _lit_skies(lights)
     if not skies:
@@ -119,8 +119,8 @@ def _moment_weights(sky: Sky, degree: int) -> Tensor:
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
     """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
-    That is the inner integral of E2, sum over directions of p E tau / (4 pi), with the exact phase
-    function p. `towards`: unit, its components broadcast to cells.
+    That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact
+    phase function p. `towards`: unit, its components broadcast to cells.
     """
     total = torch.zeros_like(medium.extinction.value)
     for sky in _lit_skies(skies):

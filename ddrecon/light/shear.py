@@ -1,11 +1,11 @@
 """The mass that a beam passes on its way to each cell.
 
-Times the scale of a `Coefficient` it is the optical depth in the tau of E2. It is found in three
+Times the scale of a `Coefficient` it is the optical depth in the tau of E2.2. It is found in three
 steps on whole slices: shear the grid until the beam runs along an axis, sum along that axis, shear
 back. What is interpolated is the field and its integral, never an exponential of them.
 
 Mass is linear in the field but for bounds on its corrections. So where ranks share cells, what lies
-before a slab is handed on as sums along rays, which are as few as a slice has cells (E42).
+before a slab is handed on as sums along rays, which are as few as a slice has cells.
 """
 
 from __future__ import annotations

@@ -19,11 +19,11 @@ from ddrecon.numerics.third_order import ThirdOrder
 class Emission:
     """What a volume sends towards one camera.
 
-    Emission per unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2 and E3.
+    Emission a unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2.2, E2.3.
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
-    does to p (E13). `remaining`, where given, scatters diffuse light in place of kappa_s: where the
-    phase function differs from cell to cell, that is interpolated as the extinction is. Where
+    does to p (E8.7). `remaining`, where given, scatters diffuse light in place of kappa_s: where
+    the phase function differs from cell to cell, that is interpolated as the extinction is. Where
     `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for.
     """
 

@@ -1,4 +1,4 @@
-"""View rays: the integral of what the medium sends towards the camera (docs/theory.md E1-E3).
+"""View rays: the integral of what the medium sends towards the camera (docs/theory.md E2.1-E2.3).
 
 Between two nodes of a ray density and optical depth are taken as linear, so emission times
 transmittance has a closed form. `integrate_segments` is that; all else says where nodes are.
@@ -39,7 +39,7 @@ backward pass fills an array of all cells.
 def march(
     emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Radiance [C, R] scattered towards the camera along its rays, and transmittance [C, R] (E1).
+    """Radiance [C, R] scattered towards the camera along its rays, and transmittance [C, R] (E2.1).
 
     Every ray through the box is marched itself. Where pixels are closer together than the volume
     can tell, rays of a lattice are marched instead, and pixels interpolated between them to third
@@ -54,7 +54,7 @@ def march(
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
         """Radiance and opacity [2 C, P] of those of `rays` that are in `crossing`."""
         radiance, mass = _march_by_engine(sampler, rays, crossing)
-        # E1: what comes from the volume, and 1 - tau of what is behind it.
+        # E2.1: what comes from the volume, and 1 - tau of what is behind it.
         return torch.cat([radiance, opacity_of(emission, mass)])
 
     if sight.lattice is None:
@@ -119,7 +119,7 @@ def _spread(along: Tensor, sight: Sight) -> Tensor:
 def march_rays(
     sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2, E3).
+    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2.2, E2.3).
 
     `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
     """
@@ -163,7 +163,7 @@ def integrate_segments(
     if front is not None:
         end = end + front
     begin = end - mass
-    # E3: the integral of tau kappa_s (L0 + g L1 . w).
+    # E2.3: the integral of tau kappa_s (L0 + g L1 . w).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
     scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
     scattered = scattered * (emission.remaining or emission.scattering).scale.view(-1, 1)
@@ -172,12 +172,12 @@ def integrate_segments(
     if "number" in at_nodes:
         seen = SeenNodes(seen.phase, at_nodes["number"], seen.degree)
     for index, beam in enumerate(emission.beams):
-        # E13: the depth of the forward peak, from where the light enters to the camera.
+        # E8.7: the depth of the forward peak, from where the light enters to the camera.
         to_light, depth = at_nodes[f"mass {index}"], None
         if emission.peak is not None:
             peak = at_nodes["peak"] if "peak" in at_nodes else emission.peak.view(-1, 1)
             depth = peak * (passed + to_light)
-        # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
+        # E2.2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
         weight, phase = beam.scatter(scattering, nodes, seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)

@@ -1,4 +1,4 @@
-"""View rays through a grid in slabs: each rank integrates what lies in its own (E41).
+"""View rays through a grid in slabs: each rank integrates what lies in its own.
 
 A ray runs through one slab after the other. What a slab adds depends on the others by the mass
 alone that lies before it. So ranks add up the masses that lie before each, and then radiance.
@@ -47,7 +47,7 @@ def march_slabs(
         front = sum_before(mass, is_upwards)
         scattered = scattered * torch.exp(-emission.extinction.scale.view(-1, 1) * front)
     else:
-        # With a forward peak (E13) radiance depends on all mass before it, found first.
+        # With a forward peak (E8.7) radiance depends on all mass before it, found first.
         absorbing = replace(sampler, emission=_without_light(emission))
         mass = of_all(integral.march_rays(absorbing, hitting, own)[1])
         front = sum_before(mass, is_upwards)

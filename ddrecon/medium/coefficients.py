@@ -112,8 +112,8 @@ class Medium:
     `remaining` is (1 - f) kappa_s, `extinction` kappa_a more, and `mean_cosine` the g' of what
     remains. f, g and g' are scalars, [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the
     phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
-    times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it
-    varies, and None without a peak. `support` is the volume's.
+    times a mass, it is the depth x of E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of
+    it varies, and None without a peak. `support` is the volume's.
     """
 
     grid: Grid
@@ -247,7 +247,7 @@ def _find_coefficients(
 def _scale_sections(
     sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, has_peak: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Extinction and scattering that remain beside a peak of part f, per unit density (E18).
+    """Extinction and scattering that remain beside a peak of part f, per unit density (E8.4).
 
     And what `Medium` has as `peak`. `sigma_a` and `sigma_s`: [C, 1, 1, 1] or [C, z, y, x];
     `fraction`: f, which broadcasts to them.

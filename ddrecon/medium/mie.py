@@ -20,7 +20,7 @@ def scatter_droplets(
 ) -> np.ndarray:
     """Values [STEPS + 1] of the phase function at even angles from 0 to pi, of any scale.
 
-    Radii r follow the gamma distribution r^((1 - 3 b) / b) exp(-r / (a b)), E24, of Hansen and
+    Radii r follow the gamma distribution r^((1 - 3 b) / b) exp(-r / (a b)), E8.3, of Hansen and
     Travis 1974 (doi:10.1007/BF00168069), with `effective_radius` a, `effective_variance` b < 0.5.
     `wavelength` and radii in the same unit. Raises MissingExtraError without miepython.
     """

@@ -16,7 +16,7 @@ NEARLY_NONE = 1e-6
 
 
 def mix_media(media: Mapping[str, Volume]) -> Volume:
-    """The volume of two `media` on the same grid, of density 1 (E44).
+    """The volume of two `media` on the same grid, of density 1 (E8.10).
 
     It holds them as `media`. Its phase function is a blend of theirs, which are the same in all
     cells and no mixtures. Raises ValueError for another number of media, or where grids differ.

@@ -1,7 +1,7 @@
 """Phase functions: how likely light is scattered by which angle.
 
-They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
-its Legendre moments chi_l (E22), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
+They are normalized to 4 pi over the sphere, as in docs/theory.md E2.2. A phase function is known by
+its Legendre moments chi_l (E8.1), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
 chi_1 is the mean cosine g. Its numbers may differ by color; what is computed from them has the
 color as first axis, of size 1 where all colors share one phase function. Its last number may
 differ from cell to cell, [z, y, x] or [C, z, y, x]: then moments are followed by the cells' axes.
@@ -58,7 +58,7 @@ class PhaseFunction(ABC):
         """The moments f r_l of the forward peak for `count` degrees l > `degree`, [C, count].
 
         The first is f, the part of scattering that counts as not scattered where light is known to
-        `degree` (docs/theory.md E16). f is 0 without a forward peak, and the others are at most f.
+        `degree` (docs/theory.md E8.5). f is 0 without a forward peak, and the others are at most f.
         """
         return torch.zeros_like(self.moments(count))
 

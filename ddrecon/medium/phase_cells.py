@@ -1,8 +1,8 @@
 """A phase function that differs from cell to cell, as view rays see light of beams scattered by it.
 
 The number that differs is interpolated to the nodes of rays, as density is. Without a forward peak
-the phase function is evaluated there. With one, S of E13 is looked up by that number and by the
-angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E36), for
+the phase function is evaluated there. With one, S of E8.7 is looked up by that number and by the
+angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E8.9), for
 each color whose phase function has other numbers besides.
 """
 
@@ -103,7 +103,7 @@ def _end_table(phase: PhaseFunction) -> Tensor:
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
-    """What `turned_phase` is of each cell, [C, z, y, x] at `angle` [z, y, x] (E21)."""
+    """What `turned_phase` is of each cell, [C, z, y, x] at `angle` [z, y, x] (E8.12)."""
     phase, kind = medium.seen.phase, medium.seen.phase.kind
     assert phase.cells is not None
     backward = STEEP_STEPS

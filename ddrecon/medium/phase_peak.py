@@ -1,7 +1,7 @@
 """What replaces the phase function for a beam seen along a view ray, whose peak was scaled out.
 
 Light that the forward peak alone has scattered, often or once, is still on its way; at a depth x of
-the peak it has spread (docs/theory.md E13, E15). Along a ray only x changes: the function is a
+the peak it has spread (docs/theory.md E8.7, E8.6). Along a ray only x changes: the function is a
 polynomial in (x - s) / (x + s), whose coefficients are kept over the angle.
 """
 
@@ -64,7 +64,7 @@ class SeenPhase:
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
-    """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E15)."""
+    """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E8.6)."""
     count = phase.length()
     chi = phase.moments(count).double()
     tail = phase.peak_tail(degree, count - degree - 1).double()

@@ -18,7 +18,7 @@ NODES = 2048
 
 @dataclass(frozen=True, eq=False)
 class Tabulated(PhaseFunction):
-    """A smooth curve through `values` at even angles from 0 to pi, over its integral (E23).
+    """A smooth curve through `values` at even angles from 0 to pi, over its integral (E8.2).
 
     `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale. `at_even_angles` makes them from
     uneven ones (`numerics.angle_table`).

@@ -13,7 +13,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 
 
 def remaining_moments(medium: Medium) -> Tensor:
-    """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E18), [L + 1, C or 1, 1, 1, 1].
+    """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E8.4), [L + 1, C or 1, 1, 1, 1].
 
     chi_l are the moments of the phase function of `medium`, f the part of its forward peak. Of one
     that differs from cell to cell they are [L + 1, C or 1, z, y, x].
@@ -29,7 +29,7 @@ def _remaining(phase: PhaseFunction, fraction: Tensor, degree: int) -> Tensor:
 
 
 def unturned_moments(medium: Medium) -> Tensor:
-    """p_l - (-1)^l b / (1 - f), of what beams scatter that keep their backward peak b (E20).
+    """p_l - (-1)^l b / (1 - f), of what beams scatter that keep their backward peak b (E8.11).
 
     As `remaining_moments`.
     """
@@ -40,7 +40,7 @@ def unturned_moments(medium: Medium) -> Tensor:
 
 
 def backward_fraction(medium: Medium) -> Tensor:
-    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20).
+    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E8.11).
 
     It is [C or 1, z, y, x] where the phase function differs from cell to cell.
     """
@@ -60,7 +60,7 @@ def has_backward_peak(medium: Medium) -> bool:
 
 @remember_of_phase
 def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
-    """How light that a backward peak has turned scatters once more, towards a camera (E21).
+    """How light that a backward peak has turned scatters once more, towards a camera (E8.12).
 
     A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
     moments are chi_l up to `degree`, and chi_l r_l^turns beyond, where r_l are the backward peak's;

@@ -181,7 +181,7 @@ class _Recomputation:
     When the first is asked for, `function` runs again and saves the same tensors in the same order.
     """
 
-    def __init__(self, function: Callable[[], object]):
+    def __init__(self, function: Callable[[], Any]):
         self.function = function
         self.count = 0
         self.places: dict[tuple[int, torch.Size], int] = {}

@@ -1,4 +1,4 @@
-"""Functions of a depth from 0 to infinity, as polynomials (E25) in x = (depth - s) / (depth + s).
+"""Functions of a depth from 0 to infinity, as polynomials (E8.8) in x = (depth - s) / (depth + s).
 
 They take a few products where a closed form takes many. By interpolation at Chebyshev's extrema
 (Trefethen 2019, Approximation Theory and Approximation Practice, chapter 2,
@@ -18,7 +18,7 @@ COEFFICIENTS = 12
 SCALE = 8.0
 """The depth s, taken to the middle of the polynomial's interval, x = 0.
 
-It suits the one function that is fitted, the phase function E13: at g = 0.95 that is off by 0.0064
+It suits the one function that is fitted, the phase function E8.7: at g = 0.95 that is off by 0.0064
 with 8, by 0.010 with 6 or 12, by 0.04 with 2 or 20.
 """
 DEEPEST = 1e6

@@ -20,7 +20,7 @@ NORMAL = 0.6745
 
 @dataclass(frozen=True)
 class Noise:
-    """The variance of a picture's values x: read^2 + shot x + that of quantization (E26).
+    """The variance of a picture's values x: read^2 + shot x + that of quantization (E9.2).
 
     `read` >= 0 is the standard deviation at black, `shot` >= 0 the variance by radiance, `step` >=
     0 that between neighboring sRGB-encoded values: 1/255 in a picture of 8 bits, 0 in a linear one.

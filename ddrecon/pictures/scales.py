@@ -50,7 +50,7 @@ class Displayed(Scale):
 
 @dataclass(frozen=True, kw_only=True)
 class Stabilized(Scale):
-    """Radiance in units of its `noise`: the integral of 1 / deviation from black (E26).
+    """Radiance in units of its `noise`: the integral of 1 / deviation from black (E9.2).
 
     On this scale noise is the same everywhere, 1.
     """

@@ -1,7 +1,7 @@
-"""The second derivative of a run's objective by Gauss and Newton: products with J^T W J + R (E31).
+"""A run's second derivative by Gauss and Newton: products with J^T W J + R (E11.1).
 
 J is the derivative of all training pictures by all parameters, W how strongly each pixel counts, R
-what the regularizers add (E32). Nobody has the matrix: a product is one tangent and one adjoint,
+what the regularizers add (E11.2). Nobody has the matrix: a product is one tangent and one adjoint,
 view by view, in one light field each, shared out over ranks. Its memory grows with the views by
 their pictures alone.
 Parameters stand in one vector, entry by entry, in their own units and in their order.

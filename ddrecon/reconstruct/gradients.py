@@ -2,7 +2,7 @@
 
 The light inside the volume is solved once and held as if it were given; each view's derivative goes
 back to it at once and is added up there, and the sum goes back through the solve. So memory does
-not grow with the number of views, and the adjoint (E9) is solved once.
+not grow with the number of views, and the adjoint (E3.2) is solved once.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def differentiate(
     else:
         (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
-    # What reached the leaves goes back through the light field, and so through the solve (E9).
+    # What reached the leaves goes back through the light field, and so through the solve (E3.2).
     reached = [pair for pair in zip(tensors, leaf_bars, strict=True) if pair[1] is not None]
     # Nobody else holds it on its way: its memory is free as soon as it has been of use.
     del light_field, tensors, leaves, inputs, sums, leaf_bars

@@ -229,7 +229,7 @@ class Reconstruction:
         gradients: Mapping[str, Tensor],
         compared: Comparison,
     ) -> None:
-        """Moves what is due: fields and maps by Adam, and single numbers all at once (E43)."""
+        """Moves what is due: fields and maps by Adam, and single numbers all at once (E10.2)."""
         rates = {p.name: self.schedule.rate(self.iteration, p.release) for p in self.parameters}
         for p in self.parameters:
             if rates[p.name] and (p.is_field or p not in self.numbers.numbers):

@@ -1,4 +1,4 @@
-"""Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E43).
+"""Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E10.2).
 
 They are few, and look alike: a camera's turn and its shift, a lamp and an exposure, and the level
 of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J, whose
@@ -191,7 +191,7 @@ def find_curvatures(
 
 
 def number_curvature(curvature: Curvature, numbers: Sequence[Parameter]) -> Tensor:
-    """The part [k, k] of J^T W J of `curvature` between the entries of `numbers` (E45)."""
+    """The part [k, k] of J^T W J of `curvature` between the entries of `numbers`."""
     names = [view.name for view in curvature.scene.views] if numbers else []
     found = find_curvatures(curvature, numbers, names, curvature.weights)
     return _sum_between(numbers, found, numbers)
@@ -309,7 +309,7 @@ def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
 def _common_motion(view: View, scene: Scene) -> Tensor:
     """What the volume's turns, shifts and growth are in the twist of a `view`, [6, 7].
 
-    A twist is in the camera's own axes (E29). A volume that grows looks as if it came closer.
+    A twist is in the camera's own axes (E10.3). A volume that grows looks as if it came closer.
     """
     axes, origin = view.camera.pose[:, :3].detach(), view.camera.pose[:, 3].detach()
     motion = axes.new_zeros(6, 7)
@@ -333,7 +333,7 @@ def weigh_calibration(pose: Parameter, curvature: Tensor, unit: Tensor, scene: S
 
 
 def calibration_prior(camera: Camera, grid: Grid) -> Tensor:
-    """The inverse covariance [6, 6] of a twist of `camera` where its calibration is off (E29).
+    """The inverse covariance [6, 6] of a twist of `camera` where its calibration is off (E10.3).
 
     The direction errs by `TURN`, and by itself: a camera turns about its own place, not about the
     volume as a twist does. The place errs by `SHIFT` of the distance from the middle of `grid`.

@@ -22,7 +22,7 @@ class Parameter:
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. Adam moves
-    fields, begun anew at each resolution, and maps (E46, E49); `NumberSteps` moves other numbers.
+    fields, begun anew at each resolution, and maps (E10.1); `NumberSteps` moves other numbers.
     `rate` is one number or one for each entry. `view` is the name of the view that it belongs to,
     None for what all views see. Its total variation is that of it in the `unit` of `unit_of`.
     """
@@ -73,7 +73,7 @@ class Parameter:
         return self.rate if isinstance(self.rate, float) else float(self.rate.max())
 
     def step(self, gradient: Tensor, rate: float, power: float = 0.0) -> None:
-        """Moves a field or map against `gradient`, and back within its bounds (E46, E49).
+        """Moves a field or map against `gradient`, and back within its bounds (E10.1).
 
         `rate` is the part of its learning rate that counts now, `power` the unit of the penalties
         in the gradient, as in `add_penalties`.

@@ -2,7 +2,7 @@
 
 The length of a slope, |s|, lies below (|s|^2 / |s0| + |s0|) / 2, and touches it at the slope s0
 that the field has (lagged diffusivity: Vogel and Oman 1996, doi:10.1137/0917016). So about a
-field total variation is half of x^T R x, R = D^T V D (E32): D takes slopes, V has the weight over
+field total variation is half of x^T R x, R = D^T V D (E11.2): D takes slopes, V has the weight over
 the length of each cell's slope. Along an edge it hardly holds, where a field is flat it holds most.
 """
 
@@ -22,7 +22,7 @@ AXES = (-3, -2, -1)
 
 @dataclass(frozen=True)
 class Roughness:
-    """R = D^T V D of a field on `grid` (E32); `stiffness` >= 0 [..., z, y, x] is V of each cell."""
+    """R = D^T V D of a field on `grid` (E11.2); `stiffness` >= 0 [..., z, y, x] is V of a cell."""
 
     grid: Grid
     stiffness: Tensor
@@ -31,7 +31,7 @@ class Roughness:
     def about(field: Tensor, grid: Grid, weight: float, knee: float | None = None) -> Roughness:
         """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x].
 
-        Where that is of a field compressed above `knee` (E47), its slopes are those of the field
+        Where that is of a field compressed above `knee` (E11.3), its slopes are those of the field
         times the slope of the compression there.
         """
         seen = field if knee is None else compress(field, knee)
@@ -70,9 +70,9 @@ class Roughness:
 
 
 def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
-    """h of E49, where smoothing weighs 1, at `field` [..., z, y, x] compressed above `knee` (E47).
+    """h, where smoothing weighs 1, at `field` [..., z, y, x] compressed above `knee` (E11.3).
 
-    That is the diagonal of R (E32); None is without compression.
+    That is the diagonal of R (E11.2); None is without compression.
     """
     seen = field if knee is None else compress(field, knee)
     if current_engine() == "warp":

@@ -107,7 +107,7 @@ def brightest_black(image: Tensor, step: float) -> float:
     """The radiance up to which a picture `image` [3, h, w] may be black, by its own noise.
 
     Its black is what the darkest part of its pixels, `DARKEST`, does not exceed; what is brighter
-    than that by `DEVIATIONS` of the noise there (E26) shows something.
+    than that by `DEVIATIONS` of the noise there (E9.2) shows something.
     """
     brightest = image.amax(0).flatten()
     black = brightest.kthvalue(max(1, round(tuning.DARKEST * len(brightest)))).values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-# How fields move: Adam (E46, E49). Chosen on the plume, by its density error.
+# How fields move: Adam (E10.1). Chosen on the plume, by its density error.
 BETAS = (0.9, 0.99)
 """How much Adam's moments keep of themselves in a step; the second less than customary, since runs
 are short."""
@@ -17,7 +17,7 @@ FLOOR = 0.3
 So cells that no picture says much of are not moved as far as any by what noise says.
 """
 STIFFNESS = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
-"""What part of smoothing's stiffness is added to it besides (E49). Derived, not chosen: half of it
+"""What part of smoothing's stiffness is added to it besides. Derived, not chosen: half of it
 is where steps neither swell nor fade, in a field that smoothing alone moves."""
 WARM_UP = 5
 """Iterations at a resolution over which rates rise to their value: Adam's first steps are all of
@@ -25,8 +25,8 @@ full size, and would throw away what a coarser grid has found. With 10 the plume
 FINAL_RATE = 0.2
 """Rates fall exponentially over a run, to this part of their value."""
 
-# How numbers move: damped Gauss-Newton steps (E43). Chosen on the capture at half size, and seen on
-# Fig. 10 and 14.
+# How numbers move: damped Gauss-Newton steps (E10.2). Chosen on the capture at half size, and seen
+# on Fig. 10 and 14.
 MOST_ENTRIES = 16
 """Parameters of more values, such as maps of radiance, are not among single numbers."""
 DAMPING = 1.0
@@ -42,7 +42,7 @@ LEAST = 1e-4
 """Least curvature, as a part of the parameter's largest: what no picture shows stays."""
 TURN, SHIFT = math.radians(1.0), 0.005
 """How far a calibration's direction of a camera may be off [rad], and its place, as a part of its
-distance from the volume: what films from ordinary calibrations err by (E29)."""
+distance from the volume: what films from ordinary calibrations err by (E10.3)."""
 TRUST = 0.5
 """Pixels by which a volume may be off that was made with such cameras: pictures count against the
 calibration as if each image were known no better."""

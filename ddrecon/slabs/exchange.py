@@ -1,4 +1,4 @@
-"""What ranks exchange of fields in slabs, differentiable: E40.
+"""What ranks exchange of fields in slabs, differentiable.
 
 The objective is a sum over ranks. So every adjoint is the transpose of the exchange as a whole:
 what one rank has lent to others is added up by those others' cotangents.
@@ -55,7 +55,7 @@ def _exchange(give: Linear, back: Linear, tensor: Tensor) -> Tensor:
 
 
 def add_halo(own: Tensor, slab: Slab) -> Tensor:
-    """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E40)."""
+    """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them."""
     axis, (below, above) = slab.axis - 3, slab.halo
 
     def give(own: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ def add_halo(own: Tensor, slab: Slab) -> Tensor:
 
 
 def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
-    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E40).
+    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part.
 
     `field` itself where `grid` is the whole.
     """
@@ -95,12 +95,12 @@ def gather_own(own: Tensor, slab: Slab) -> Tensor:
 
 
 def sum_slabs(part: Tensor) -> Tensor:
-    """The sum over ranks of `part`, any shape, differentiable (E40)."""
+    """The sum over ranks of `part`, any shape, differentiable."""
     return _exchange(_sum, _sum, part)
 
 
 def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
-    """The sum of `part` [K, R] over the ranks before this one, differentiable (E40).
+    """The sum of `part` [K, R] over the ranks before this one, differentiable.
 
     Those are the ranks below where ray R `is_upwards`, else the ranks above. Each rank adds up some
     of the rays for all ranks: so bytes do not grow with their number.
@@ -128,7 +128,7 @@ def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
 def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
     """What the ranks below and above have for this one, which has `below` and `above` for them.
 
-    All are of one shape; zero where no rank is. Differentiable (E40).
+    All are of one shape; zero where no rank is. Differentiable.
     """
 
     def swap(both: Tensor) -> Tensor:

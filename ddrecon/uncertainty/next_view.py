@@ -1,4 +1,4 @@
-"""Which picture to take next: how much of the posterior's variance a picture would take away (E34).
+"""Which picture to take next: how much of the posterior's variance a picture would take away.
 
 Few samples differ in every picture, so that it seems to tell them all apart. What is used here is a
 bound made of means over pairs and triples of different samples, which have no such bias.
@@ -73,7 +73,7 @@ def rank_views(found: Uncertainty) -> list[dict[str, Any]]:
 
 
 def find_gain(alike: Tensor, shown: Tensor) -> float:
-    """The part of the variance that a picture takes at least: t1^2 / (t1 + t2) of all (E34).
+    """The part of the variance that a picture takes at least: t1^2 / (t1 + t2) of all.
 
     `alike` and `shown` [m, m] are inner products of independent samples, and of how they change the
     picture in units of its noise. t1 and t2 are means over pairs and triples of different ones.

@@ -1,4 +1,4 @@
-"""Samples of what a reconstruction may as well be: its posterior about its optimum (E33).
+"""Samples of what a reconstruction may as well be: its posterior about its optimum (E11.4).
 
 Randomize, then optimize (Bardsley, Solonen, Haario and Laine 2014, doi:10.1137/140964023), with
 pictures as they change to first order: each sample is the least, within bounds, of a quadratic
@@ -39,7 +39,7 @@ PROBED = -1
 GAUGE = 1e6
 """How much more than by pictures a number is constrained by what no picture shows."""
 BEGIN = 0.25
-"""The part of the way from a draw of the prior to what pictures roughly leave of it (E39)."""
+"""The part of the way from a draw of the prior to what pictures roughly leave of it."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Posterior:
         draw = self._without_gauge(self.prior.solve(noise, self.is_kept))
         prior = self._within(self.prior.without_levels(draw, self.is_kept))
         right = noise + level - self.gradient
-        # It begins at the draw, and a part of the way on to what pictures leave of it (E39).
+        # It begins at the draw, and a part of the way on to what pictures leave of it.
         is_fixed = self.is_kept | self._is_at_bound(prior, right)
         begin = self._within(prior + BEGIN * (self._precondition(right, is_fixed) - prior))
         # The residual there: both parts of the data in one adjoint.
@@ -200,10 +200,10 @@ class Posterior:
         return conjugate_gradients(self.product, precondition, right, tolerance, most, guess)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
-        """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
+        """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information`.
 
         That again is solved by conjugate gradients, to which it counts by its diagonal alone.
-        Single numbers are solved for by themselves, all together (E45).
+        Single numbers are solved for by themselves, all together.
         """
         is_out = is_fixed | self.is_number
 
@@ -299,7 +299,7 @@ AXES = (-3, -2, -1)
 
 
 class Information:
-    """About J^T W J of `curvature`: its `diagonal` [n], and of each field a spectrum (E38).
+    """About J^T W J of `curvature`: its `diagonal` [n], and of each field a spectrum.
 
     Pictures tell sums along rays: smooth changes of a field far better than rough ones. How that
     hangs together is nearly the same everywhere, but for its scale, and a few random pictures show

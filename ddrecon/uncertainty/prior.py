@@ -1,7 +1,7 @@
-"""What a run assumes of its parameters before it looks at pictures, as a Gaussian: R + T K (E33).
+"""What a run assumes of its parameters before it looks at pictures, as a Gaussian: R + T K (E11.4).
 
-R is its smoothing (E32). K makes it proper, where smoothing says nothing: how bright a whole field
-is, and what single numbers are. It is so weak that it counts only where pictures say nothing.
+R is its smoothing (E11.2). K makes it proper, where smoothing says nothing: how bright a whole
+field is, and what single numbers are. It is so weak that it counts only where pictures say nothing.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _precision_of(parameter: Parameter, scene: Scene, is_smoothed: bool) -> Tens
     """K of `parameter`: a number for all its entries, or the matrix [6, 6] of a camera.
 
     A smoothed field may be brighter or darker, as a whole, by its root mean square; without
-    smoothing each cell may be, by itself. Cameras err as a calibration does (E29).
+    smoothing each cell may be, by itself. Cameras err as a calibration does (E10.3).
     """
     value = parameter.value.detach()
     if parameter.key == "camera" and parameter.view is not None:

@@ -38,7 +38,7 @@ LEAST_LEFT = 0.1
 
 @dataclass(frozen=True)
 class PictureErrors:
-    """How much pictures err. `temperature` is the objective's unit of it (E33).
+    """How much pictures err. `temperature` is the objective's unit of it (E11.4).
 
     `deviation` [radiance] is the root mean square error of a number of a picture, `count` how many
     independent ones there are. `told` is how many numbers they tell, None where that was not needed

@@ -287,7 +287,7 @@ def relative_error(found: Tensor, exact: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Balance:
-    """How far a solution is from balance (E4, E6, E7); all are 0 where there is no source.
+    """How far a solution is from balance (E2.4, E2.6, E2.7); all are 0 where there is no source.
 
     Iterations update their residual rather than compute it, so that rounding hides from them; here
     it is b - A u itself.
@@ -327,7 +327,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
 
 
 def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
-    """What flows out through the faces of the box (E6), as for dark surroundings."""
+    """What flows out through the faces of the box (E2.6), as for dark surroundings."""
     grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
     leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
     for axis, flux in zip(AXES, problem.source.flux or (None,) * 3, strict=True):

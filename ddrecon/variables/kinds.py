@@ -218,7 +218,7 @@ EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
 PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)
 """Two ways to say the same: a scene gives and varies one pair, and the other follows."""
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
-"""What a camera does to radiance, and what it is where a view has none (E28)."""
+"""What a camera does to radiance, and what it is where a view has none (E9.1)."""
 
 
 def is_of_volume(name: str) -> bool:

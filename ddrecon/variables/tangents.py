@@ -1,6 +1,6 @@
 """Derivative images: how every pixel changes with one number of the scene.
 
-They solve the differential diffusion equation (docs/theory.md E8).
+They solve the differential diffusion equation (docs/theory.md E3.1).
 
 One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
 in every cell.

@@ -72,7 +72,7 @@ def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     text = Path("out/report.html").read_text()
     assert text.count("<img ") == 2 * 2 + 2 and text.count("<svg ") == 2
     shown = [f"{name}: {psnr:.2f} dB" for name, psnr in told.items()]
-    shown += ["density, middle slices", "means along the axes", "Once around", "irradiance: 3.0"]
+    shown += ["density, middle slices", "means along the axes", "irradiance: 3.0"]
     assert all(words in text for words in [*shown, "fluxes Q1 and L1", "torch"])
 
 

@@ -32,7 +32,7 @@ def make_problem(shape: tuple[int, int, int], has_flux: bool) -> DiffusionProble
 
 
 class FaceByFace:
-    """Outward fluxes of a problem, F . n = `own` u(cell) + `other` u(neighbor) + `known` (E6)."""
+    """Outward fluxes of a problem, F . n = `own` u(cell) + `other` u(neighbor) + `known` (E2.6)."""
 
     def __init__(self, problem: DiffusionProblem):
         self.problem, self.shape = problem, problem.medium.grid.shape
@@ -57,7 +57,7 @@ class FaceByFace:
         return mean / h, -mean / h, side * mean * (q[cell] + q[beside]) / 2
 
     def system(self) -> tuple[Tensor, Tensor]:
-        """The matrix [n, n] and right side [n] of E4: outflow + kappa_a u = kappa_s Q0."""
+        """The matrix [n, n] and right side [n] of E2.4: outflow + kappa_a u = kappa_s Q0."""
         number = {c: n for n, c in enumerate(itertools.product(*map(range, self.shape)))}
         absorption = self.problem.medium.absorption.value[0]
         matrix = torch.zeros(len(number), len(number), dtype=torch.float64)
@@ -76,7 +76,7 @@ class FaceByFace:
         return matrix, right
 
     def mean_flux(self, u: Tensor, axis: int) -> Tensor:
-        """L1 = 3 F along `axis`, the mean of both faces of every cell (E5)."""
+        """L1 = 3 F along `axis`, the mean of both faces of every cell (E2.5)."""
         total = torch.zeros_like(u)
         for cell, side in itertools.product(itertools.product(*map(range, self.shape)), (-1, 1)):
             own, other, known = self.flux(cell, axis, side)

@@ -69,8 +69,8 @@ def exact(albedo: float, sun: float, view: float) -> float:
 def p1_multiple(albedo: float, sun: float, view: float) -> float:
     """What P1 with Marshak's boundary adds, in closed form: w int L0 exp(-t / mu) dt / mu.
 
-    With D = 1/3 and E4, L0 = a exp(-t / mu0) + b exp(-k t), k^2 = 3 (1 - w), and L0 / 2 = D L0' at
-    the surface (E6).
+    With D = 1/3 and E2.4, L0 = a exp(-t / mu0) + b exp(-k t), k^2 = 3 (1 - w), and L0 / 2 = D L0'
+    at the surface (E2.6).
     """
     decay = math.sqrt(3 * (1 - albedo))
     a = albedo * IRRADIANCE / (4 * math.pi) / ((1 - albedo) - 1 / (3 * sun**2))

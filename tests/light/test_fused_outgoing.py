@@ -1,4 +1,4 @@
-"""The fused kernels of E3 towards a camera compute what PyTorch's operations compute."""
+"""The fused kernels of E2.3 towards a camera compute what PyTorch's operations compute."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 def make_light(
     shape: tuple[int, int, int], colors: tuple[int, int], dtype: torch.dtype
 ) -> list[Tensor]:
-    """L0 and L1 that are dark in parts, and so directed that E3 is of either sign."""
+    """L0 and L1 that are dark in parts, and so directed that E2.3 is of either sign."""
     seeds = range(11, 15)
     light = [
         random_values(colors[s > 11], *shape, seed=s) * half_empty(*shape, seed=2) for s in seeds
@@ -43,7 +43,7 @@ def radiance_and_bars(
     g: float,
     dtype: torch.dtype,
 ) -> list[Tensor]:
-    """E3, and the cotangents of L0, L1, g and the camera.
+    """E2.3, and the cotangents of L0, L1, g and the camera.
 
     `view`: whether light has a flux, and whether the camera is a point, inside the box.
     """

@@ -55,8 +55,8 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
 
 @pytest.mark.parametrize("g", [-0.8, -0.4])
 def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
-    """E20's beams leave with F at the far end and G at the near one; the rest is the source of E4,
-    whose solution is balanced.
+    """E8.11's beams leave with F at the far end and G at the near one; the rest is the source of
+    E2.4, whose solution is balanced.
     """
     density = 0.2 + torch.rand(9, 1, 1, dtype=torch.float64)
     scene = make_scene(
@@ -76,7 +76,7 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     volume = medium.grid.extent[0] / 9
     received = (medium.absorption.value * beams).sum() * volume
     scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium).mean).sum()
-    # what leaves, by the closed form of E20 for all the depth
+    # what leaves, by the closed form of E8.11 for all the depth
     beta = float(backward_fraction(medium)) * 6.0 / 6.5
     rate, depth = math.sqrt(1 - beta**2), 6.5 * float(density.mean())
     turned, passed = beta / (1 + rate), math.exp(-rate * depth)

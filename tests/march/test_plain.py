@@ -1,4 +1,4 @@
-"""View rays against plain sums of E1 to E3: the same integral, on other nodes, by other sums.
+"""View rays against plain sums of E2.1 to E2.3: the same integral, on other nodes, by other sums.
 
 Both are of second order in the length of a step, so what they differ by is too.
 """
@@ -77,7 +77,7 @@ NUMBERS: dict[type, tuple[str, ...]] = {
 
 @pytest.fixture
 def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Masses are interpolated linearly, and E13 is summed itself, in the fast march as well."""
+    """Masses are interpolated linearly, and E8.7 is summed itself, in the fast march as well."""
 
     def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
         return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
@@ -106,7 +106,7 @@ def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scen
 
 
 def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
-    """Radiance [C, R] along `rays` and transmittance [C, R] (E1), by so many equal steps each."""
+    """Radiance [C, R] along `rays` and transmittance [C, R] (E2.1), by so many equal steps each."""
     grid = emission.grid
     near, far = intersect_box(grid, rays)
     part = torch.linspace(0, 1, steps + 1, dtype=near.dtype, device=near.device)
@@ -116,7 +116,7 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
     extinction = interpolate(grid, emission.extinction.field, points)
     passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
     scale = emission.extinction.scale.view(-1, 1, 1)
-    # E3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
+    # E2.3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
     scattering = interpolate(grid, emission.scattering.value, points)
     by = emission.remaining or emission.scattering
     emitted = interpolate(grid, by.value, points) * interpolate(grid, emission.diffuse, points)
@@ -126,19 +126,19 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
         at_nodes = interpolate(grid, number, points)
         seen = replace(seen, phase=seen.phase.with_cells(at_nodes[..., None]))
     for beam in emission.beams:
-        # E2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
+        # E2.2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
         travel, irradiance = unattenuated(beam, points, rays.direction)
         cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
         mass = interpolate(grid, beam.mass, points)
         if emission.peak is None:
             phase = seen.value(cosine[..., None])[..., 0]
         else:
-            # E13: the forward peak spreads the light on its way to the node and to the camera.
+            # E8.7: the forward peak spreads the light on its way to the node and to the camera.
             depth = interpolate(grid, emission.peak, points) * (passed + mass)
             phase = summed_series(seen, depth, cosine)
         arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
         emitted = emitted + scattering * phase * arriving
-    # E2 + E3: the integral of tau times that, and tau of the whole way.
+    # E2.2 + E2.3: the integral of tau times that, and tau of the whole way.
     tau = torch.exp(-scale * passed)
     scattered = torch.trapezoid(tau * emitted, distance, dim=1)
     return scattered, tau[:, -1].expand_as(scattered)
@@ -222,7 +222,7 @@ def test_images_agree_in_the_limit(lights: str, view: str, medium: str):
 
 
 def test_they_agree_with_finer_cells_whatever_is_interpolated():
-    """Masses to third order or linearly, E13 by a table or itself: in a smooth medium."""
+    """Masses to third order or linearly, E8.7 by a table or itself: in a smooth medium."""
     errors = []
     for count in (8, 16, 32):
         scene = lit_scene(LIGHTS["two beams"][:1], VIEWS["oblique"], g=0.3, model="none")

@@ -1,4 +1,4 @@
-"""Outside of a volume's support nothing is walked, and inside of it nothing else changes (E35)."""
+"""Outside of a volume's support nothing is walked, and inside nothing else changes (E10.4)."""
 
 from __future__ import annotations
 

@@ -205,7 +205,7 @@ def all_per_cell(**settings: Any) -> Found:
 
 
 def rounds(axis: str, g: float, count: int, degree: int, has_tangents: bool = False) -> Found:
-    """Rounds of transport, whose light goes from slab to slab (E48)."""
+    """Rounds of transport, whose light goes from slab to slab."""
     settings: dict[str, Any] = {"g": g, "transport_rounds": count, "degree": degree}
     scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
     return run(scene, [make_camera(ACROSS)], "g", "lights.1.radiance", has_tangents=has_tangents)

@@ -1,12 +1,12 @@
 #pragma once
 #include "ddrecon/diffusion/fused/mesh.h"
-// What flows through the faces of cells (E5 to E7 of docs/theory.md). A cell goes through all six
+// What flows through the faces of cells (E2.5 to E2.7 of docs/theory.md). A cell goes through all six
 // of its faces: for what it gains, and in the other direction for what its numbers count.
 
 namespace ddrecon {
 
-// What a face conducts, with its slopes: the harmonic mean of D here and there (E7), and on the box
-// 1 / (2 + h / (2 D)) (E6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
+// What a face conducts, with its slopes: the harmonic mean of D here and there (E2.7), and on the box
+// 1 / (2 + h / (2 D)) (E2.6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
 template <class F> struct Conduction {
     F value, by_here, by_there;
 };
@@ -25,7 +25,7 @@ INLINE Dual<F> conducted(const Dual<F>& here, const Dual<F>& there, F h, bool in
 }
 
 enum { GAIN, FLUX, SYSTEM };
-// What cells gain from Q1, -div(D kappa_s Q1), or L1 (E5), or all of E7. Given are fields: D,
+// What cells gain from Q1, -div(D kappa_s Q1), or L1 (E2.5), or all of E2.7. Given are fields: D,
 // kappa_s but for its scale; then, unless it is a gain, L0 or Q0; kappa_a, unless it has the field
 // of kappa_s (SHARED); Q1 along z, y and x, as a sum of so many FLUXES; and as many as are BEGUN,
 // to which what is found is added. And numbers: the scale of kappa_s, the radiance outside, the

@@ -1,4 +1,4 @@
-"""The system of E7 and the flux of E5 as functions of tensors, with derivatives, by `faces.h`."""
+"""The system of E2.7 and the flux of E2.5 as functions of tensors, with derivatives (`faces.h`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GIVEN = "int nz, ny, nx, own, sign; F hz, hy, hx"
 
 
 def assemble_system(medium: Medium, diffusion: Tensor, source: Moments, outside: Tensor) -> Tensors:
-    """Conductances along z, y, x, loss and right side of E7; `source` holds Q0 and Q1."""
+    """Conductances along z, y, x, loss and right side of E2.7; `source` holds Q0 and Q1."""
     absorption, flux = medium.absorption, source.flux or ()
     is_shared = absorption.field is medium.remaining.field
     fields = [source.mean, *(() if is_shared else (absorption.field,)), *flux]
@@ -37,7 +37,7 @@ def find_flux(
     begun: Vector | None = None,
     sign: int = 1,
 ) -> Vector:
-    """L1 of L0 = `mean` (E5, E6) for Q1 = `flux` + `more`.
+    """L1 of L0 = `mean` (E2.5, E2.6) for Q1 = `flux` + `more`.
 
     Times the `sign`, and added to a flux that is `begun`.
     """

@@ -3,7 +3,7 @@
 
 namespace ddrecon {
 
-// What is BEGUN less A u of E7. The `matrix` is the loss, then conductances
+// What is BEGUN less A u of E2.7. The `matrix` is the loss, then conductances
 // along z, y and x: in each color, or in one that all share.
 template <bool BEGUN, class F> INLINE void subtract_product(
     const Row& row, const Mesh<F>& mesh, const int* is_each, const F* const* matrix, const F* light,

@@ -1,4 +1,4 @@
-"""S - A u of the diffusion operator in one pass over the light (E7, E9)."""
+"""S - A u of the diffusion operator in one pass over the light (E2.7, E3.2)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def find_imbalance(operator: Operator, right: Tensor, u: Tensor) -> Tensor:
 
 
 class _Imbalance(torch.autograd.Function):
-    """S - A u; its cotangents are those of a solve (E9), with it in place of lambda."""
+    """S - A u; its cotangents are those of a solve (E3.2), with it in place of lambda."""
 
     @staticmethod
     def forward(right: Tensor, u: Tensor, *matrix: Tensor) -> Tensor:

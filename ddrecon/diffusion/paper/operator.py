@@ -1,4 +1,4 @@
-"""The matrix of the paper's Eq. 25, its transpose, and its derivatives (E8, E9).
+"""The matrix of the paper's Eq. 25, its transpose, and its derivatives (E3.1, E3.2).
 
 Central differences as 3 x 3 x 3 convolutions, on arrays with a layer of ghost cells around them.
 
@@ -133,7 +133,7 @@ class PrintedOperator:
         return replace(self, is_transposed=not self.is_transposed)
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Those of diagonal, coefficients and echo, for M_bar = -lambda u^T (E9)."""
+        """Those of diagonal, coefficients and echo, for M_bar = -lambda u^T (E3.2)."""
 
         def applied(diagonal: Tensor, coefficients: Tensor, echo: Tensor) -> Tensor:
             return PrintedOperator(self.stencils, diagonal, coefficients, echo).apply(u)
@@ -143,7 +143,7 @@ class PrintedOperator:
         return diagonal_bar, coefficients_bar, echo_bar
 
     def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
-        """dM u by changes of diagonal, coefficients and echo, term by term (E8, Eq. 29)."""
+        """dM u by changes of diagonal, coefficients and echo, term by term (E3.1, Eq. 29)."""
         d_diagonal, d_coefficients, d_echo = d_tensors
         if d_diagonal is not None:
             yield d_diagonal * u

@@ -1,10 +1,10 @@
 """The paper's own scheme, for the record: central differences (Eq. 22-25) and Algorithm 3.
 
-With kappa = 3 D and the corrections of docs/theory.md, section 4, the balance E4 reads
+With kappa = 3 D and the corrections of docs/theory.md, section 4, the balance E2.4 reads
 grad kappa . grad L0 + kappa lap L0 - 3 kappa_a L0 + S = 0 with
 S = 3 kappa_s Q0 - div(kappa kappa_s Q1).
 
-The paper names no boundary condition; here ghost cells around the box hold what Marshak's E6 asks
+The paper names no boundary condition; here ghost cells around the box hold what Marshak's E2.6 asks
 for. The scheme neither conserves energy nor has a symmetric matrix, and its iteration may diverge
 where kappa changes abruptly: every surface against empty space.
 """
@@ -70,9 +70,9 @@ def solve_printed(
 def solve_printed_system(
     solve: SolverWithMemory, operator: PrintedOperator, source: Tensor
 ) -> Tensor:
-    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
+    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E3.1, E3.2).
 
-    E8 is Eq. 29 here. By `source` and by the tensors of `operator`; one of one color serves a
+    E3.1 is Eq. 29 here. By `source` and by the tensors of `operator`; one of one color serves a
     source of several.
     """
     stencils = operator.stencils
@@ -91,7 +91,7 @@ def solve_printed_system(
 
 @dataclass(frozen=True)
 class Ghosts:
-    """Marshak's condition E6 in ghost cells: L0 there = `echo` L0 of the neighbor + `inflow`.
+    """Marshak's condition E2.6 in ghost cells: L0 there = `echo` L0 of the neighbor + `inflow`.
 
     Both `[C, z + 2, y + 2, x + 2]`; 1 and 0 inside the box. Half a cell from either center, on the
     face, D (-grad L0 + kappa_s Q1) . n = (L0 - outside) / 2, with the mean of the two cells for L0,

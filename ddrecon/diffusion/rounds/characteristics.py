@@ -1,4 +1,4 @@
-"""Radiance along one direction through the whole grid, by short characteristics (E11).
+"""Radiance along one direction through the whole grid, by short characteristics (E2.9).
 
 w . grad I + kappa_t I = kappa_s q is integrated from slice to slice. The slices lie
 across the axis along which the direction crosses most cells, and are visited in the order that
@@ -8,7 +8,7 @@ into the ray is linear in depth between them. Radiance is never negative where t
 white furnace is exact.
 
 All steps are computed at once, but for the recurrence I_k = passed_k I_{k-1} + source_k. In a slab
-of the grid, light comes from one neighbor and leaves for the other (E48).
+of the grid, light comes from one neighbor and leaves for the other.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def radiance_along(
     direction: Direction,
     entering: Tensor | None = None,
 ) -> Tensor:
-    """I [C, z, y, x] at cell centers along `direction`, of what `scatters` into it (E11).
+    """I [C, z, y, x] at cell centers along `direction`, of what `scatters` into it (E2.9).
 
     `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
     `medium` adds (1 - f) kappa_s a unit length; `inflow` [C, 1, 1, 1]: the radiance that enters the

@@ -1,9 +1,10 @@
-"""One sweep: radiance along every direction of a quadrature, of which only moments are kept (E17).
+"""One sweep: radiance along every direction of a quadrature, of which only moments are kept (E2.8).
 
 Directions are gone through one at a time, and computed again one at a time in the backward pass:
 memory does not grow with their number. Through slabs of the grid light goes from one to the next
-(E48): while one rank follows a direction, the next follows that before, and half of the directions
-come from either end, so that all ranks have something to do nearly from the beginning.
+("Cells shared among processes" in docs/theory.md): while one rank follows a direction, the next
+follows that before, and half of the directions come from either end, so that all ranks have
+something to do nearly from the beginning.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ Of two moments 26 give no better images than 18; 14, along axes and corners of a
 
 
 def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) -> Tensor:
-    """The moments [K, C, z, y, x] of the radiance that `source` scatters (E11, E17).
+    """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `inflow`: light from
     outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
@@ -57,7 +58,7 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
         row = values[number]
 
         def follow() -> Tensor:
-            # I (E11), of the sum over moments of this direction's harmonics
+            # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
             return radiance_along(medium, scatters, inflow, directions[number], entering)
 
@@ -109,7 +110,7 @@ def sweep_change(
 ) -> Moments:
     """By how much the first two moments of light change in a sweep, and those of higher degree.
 
-    It scatters `light` and `source`, p_l phi_k + Q_k (E17). `inflow` and `degree` as of `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). `inflow` and `degree` as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:

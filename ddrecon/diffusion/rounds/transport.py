@@ -1,4 +1,4 @@
-"""From diffusion to transport: rounds of sweeps, each corrected by a diffusion solve (E11, E12).
+"""From diffusion to transport: rounds of sweeps, each corrected by a diffusion solve (E2.9, E2.10).
 
 A sweep sends what L0, L1 and the sources scatter along each direction of a quadrature, through the
 real geometry, and takes the moments of what arrives. What it changes is passed on by diffusion
@@ -40,7 +40,7 @@ def run_rounds(
     rounds: int,
     degree: int,
 ) -> Moments:
-    """Light after `rounds` of sweeps, its angles kept to `degree` (E12, E17).
+    """Light after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
 
     `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
     the quadrature. Only the mean is kept where light's direction does not matter.
@@ -73,14 +73,14 @@ def _round(
     cosine: Tensor,
     factor: Tensor | None,
 ) -> Moments:
-    """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19).
+    """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
     `cosine`: as of `_flux_factor`.
     """
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
-    # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
+    # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
     change = sweep_change(medium, light, problem.source, inflow, degree)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
@@ -101,7 +101,7 @@ def _round(
 def _blend(
     medium: Medium, light: Moments, new: Moments, swept: Tensor, factor: Tensor, degree: int
 ) -> Moments:
-    """Light by `factor` as far from what was as to what a round makes of it (E19).
+    """Light by `factor` as far from what was as to what a round makes of it (E7.1).
 
     That is what is `new`, and theta times what was `swept` of higher degree.
     """
@@ -117,7 +117,7 @@ def _blend(
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
-    """How much of the change of the flux counts in a round: p_1 in the last (E12).
+    """How much of the change of the flux counts in a round: p_1 in the last (E2.10).
 
     That passes on smooth changes whole, and multiplies fine ones by up to p_1 / (1 - p_1), above 1
     where scattering is peaked. So earlier rounds take as much of it as multiplies neither by more
@@ -128,7 +128,7 @@ def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
 
 
 def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
-    """The factors o = 1 / (1 - nu) of E19, one for each round, largest first.
+    """The factors o = 1 / (1 - nu) of E7.1, one for each round, largest first.
 
     nu are Chebyshev's nodes of the interval between - and + p_2: by at most about so much a round
     multiplies what is left in the moments that diffusion lacks. As that interval is even, what
@@ -144,10 +144,10 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 def _gain(
     medium: Medium, change: Moments, off: Moments | None, degree: int, cosine: Tensor
 ) -> tuple[Moments, Tensor, Vector | None]:
-    """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
+    """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E2.10, and what they add to S.
 
     That is kappa_s theta (L0' - L0) - theta (S - A L0). And c = theta `cosine` (L1' - L1), by how
-    much the flux that scatters changes (E17). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
+    much the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
     L1 - 3 F(L0), None for zero.
     """
     if is_fused() and not medium.is_cellwise:
@@ -182,7 +182,7 @@ def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 
 
 def _transport_share(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
+    """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E7.2).
 
     The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
     too much if its source is linear over steps of optical depth d, that of `_share_length`.
@@ -196,7 +196,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
 
 
 def _share_length(medium: Medium, degree: int) -> Tensor:
-    """exp(-p_1) (mean step) [u], by whose optical depth theta is (E30), [C or 1, 1, 1, 1]."""
+    """exp(-p_1) (mean step) [u], by whose optical depth theta is (E7.3), [C or 1, 1, 1, 1]."""
     return _mean_step(whole_of(medium.grid), degree) * torch.exp(-remaining_moments(medium)[1])
 
 

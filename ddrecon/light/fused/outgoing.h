@@ -1,6 +1,6 @@
 #pragma once
 #include "ddrecon/kernels/cells.h"
-// E3 towards a camera, of light by its moments in angle; `Moments.positive_along` is the
+// E2.3 towards a camera, of light by its moments in angle; `Moments.positive_along` is the
 // definition.
 
 namespace ddrecon {

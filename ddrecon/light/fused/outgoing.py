@@ -1,4 +1,4 @@
-"""E3 towards a camera as one function of tensors, by the kernels of `outgoing.h`."""
+"""E2.3 towards a camera as one function of tensors, by the kernels of `outgoing.h`."""
 
 from __future__ import annotations
 

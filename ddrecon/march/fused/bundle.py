@@ -1,10 +1,10 @@
 """What kernels are given of rays and of beams, found once where neither is varied.
 
-Where the phase function differs from cell to cell (E36) a node holds the number that differs. How p
-depends on it is the layout's `form`:
+Where the phase function differs from cell to cell (E8.9) a node holds the number that differs. How
+p depends on it is the layout's `form`:
 
 - `LINEAR`: a weight, without a forward peak. p is `at_ends[0] + weight at_ends[1]`.
-- `EVEN`: a weight, with one. E13 by tables at even steps of the weight, the rungs.
+- `EVEN`: a weight, with one. E8.7 by tables at even steps of the weight, the rungs.
 - `STEEP`: g. Where it is positive, and there is a forward peak, by tables at even steps of
   artanh g; else p by its formula.
 
@@ -44,8 +44,8 @@ class Along(NamedTuple):
     """Beams as rays see them.
 
     `angles` [2 beams, R]: of each the foot, then of each the square distance, or cosine and 1;
-    `polynomials` of E13, by beam; `factors`: p of a beam whose phase function is the same all along
-    a ray [C, R], else None.
+    `polynomials` of E8.7, by beam; `factors`: p of a beam whose phase function is the same all
+    along a ray [C, R], else None.
     """
 
     angles: Tensor

@@ -1,6 +1,6 @@
 """The cells that nodes of rays lie in, as kernels are given them: in place.
 
-And which segments of rays are walked: those that a volume's support touches (E35). Between two
+And which segments of rays are walked: those that a volume's support touches (E10.4). Between two
 nodes whose cells all lie outside there is no matter and never will be: the segment adds nothing,
 and to no derivative that is asked for. A packet of rays has a bit for each segment, found once for
 rays and a support that stay.

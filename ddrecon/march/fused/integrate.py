@@ -66,7 +66,7 @@ def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
     light that of what remains; beams' irradiances, and p where it is one of the `factors`
-    [1 or C, R] (E2).
+    [1 or C, R] (E2.2).
     """
     diffuse, *arriving = out.split(emission.colors)
     scattered = diffuse * (emission.remaining or emission.scattering).scale.view(-1, 1)

@@ -107,7 +107,7 @@ class Case(NamedTuple):
 
 @functools.cache
 def integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
-    """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
+    """The kernel of E2.1 to E2.3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
     text = f"walk<F, {_written(layout, Case(is_sliced))}, VALUES>(item, of_all, {{}}, out, masses);"
     return _kernel("integrate", layout, 1, text, "F *out; double *masses", "out masses", "rays")
 

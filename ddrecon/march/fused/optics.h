@@ -86,7 +86,7 @@ template <class F> struct Decay {
     }
 };
 
-// E13 along a ray, by its polynomial in 1 - 2 s / (depth + s).
+// E8.7 along a ray, by its polynomial in 1 - 2 s / (depth + s).
 template <class F, int TERMS> struct Polynomial {
     template <class N> static INLINE N place(const N& depth) {
         return F(1) - F(2.0 * SCALE) / (depth + F(SCALE));
@@ -168,7 +168,7 @@ template <class F, int TERMS> struct Point {
 };
 
 // p where it differs from cell to cell. Tables have values and slopes at even places of two kinds:
-// rungs, of the number that differs, and angles. Between four of them E13's coefficients are cubic
+// rungs, of the number that differs, and angles. Between four of them E8.7's coefficients are cubic
 // in both. A vector read from a row ends within the next one: behind the last row there is one
 // more.
 template <class F, int TERMS, bool IS_STEEP> struct Rungs {

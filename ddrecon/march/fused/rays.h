@@ -71,7 +71,7 @@ struct Layout {
 // across them [u]; or, where there are none, anywhere: at such parts of the way from near to far.
 // `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
 // [2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
-// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E13, or what `bundle.py`
+// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E8.7, or what `bundle.py`
 // has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
 // [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the
 // mass before the rays, if any. `walked` [packets, words]: bits of the segments to be walked, if
@@ -476,7 +476,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
 };
 
-// The integral along a packet of rays, from the camera into the volume (E1 to E3): `out`
+// The integral along a packet of rays, from the camera into the volume (E2.1 to E2.3): `out`
 // [outputs, R] and `masses` [K, R]; or in a TANGENT the changes of both.
 template <class F, class L, class Which, Mode MODE, class Masses>
 void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Masses* masses) {
@@ -502,7 +502,7 @@ void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Ma
                 // The mass passed on the way to the next node, and what it emits behind that.
                 for (int k = 0; k < L::EXTINCTION; ++k) m[k] += rays.mass_between(*a, *b, k);
                 rays.emit(n, *b, m);
-                // E2, E3: what arrives from the segment between both.
+                // E2.2, E2.3: what arrives from the segment between both.
                 for (int i = 0; i < L::OUT; ++i) {
                     const N decay = Decay<F>::of(a->u[i], b->u[i], a->decay[i], b->decay[i]);
                     total[i] += F(0.5) * (a->w[i] + b->w[i]) * rays.measure(*a, *b, i) * decay;

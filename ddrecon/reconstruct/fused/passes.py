@@ -32,7 +32,7 @@ def step_adam(
     """The new value, within its bounds, and the new moments, after `steps` with this one.
 
     `smallest`, a number or one for each, is added to the size of derivatives. The value moves along
-    a mixture of the mean derivative and the newest (E46).
+    a mixture of the mean derivative and the newest (E10.1).
     """
     new = [value.new_empty(value.shape) for _ in range(3)]
     betas = tuning.BETAS
@@ -68,7 +68,7 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
 
 
 def variation_diagonal(field: Tensor, grid: Grid) -> Tensor:
-    """The diagonal of R (E32) about `field` [..., z, y, x] where smoothing weighs 1."""
+    """The diagonal of R (E11.2) about `field` [..., z, y, x] where smoothing weighs 1."""
     return _vary(field, grid)[2].div_(field.numel())
 
 
@@ -123,7 +123,7 @@ def step_kernel(bits: int, is_each: bool) -> TextKernel:
 
 @functools.cache
 def variation_kernel(bits: int) -> TextKernel:
-    """The kernel of lengths of the gradient, with the slope and the diagonal (E32) of their sum."""
+    """The kernel of lengths of the gradient, with slope and diagonal (E11.2) of their sum."""
     text = """
         const Variation<F> variation{nz, ny, nx, kz, ky, kx, rounding};
         totals[item] = variation.vary(item, length, field, slope, diagonal);

@@ -39,7 +39,7 @@ def at_previous(values: Tensor, point: list[float], edge: float | None) -> float
 
 
 def by_cells(medium: Medium, scatters: Tensor, direction: Direction, inflow: float = 0.0) -> Tensor:
-    """I [z, y, x] of a gray medium, cell after cell (E11).
+    """I [z, y, x] of a gray medium, cell after cell (E2.9).
 
     The integral along each step is taken by Gauss's rule.
     """
@@ -74,7 +74,7 @@ def quadrature(directions: int) -> list[tuple[Direction, float]]:
 
 
 def sweep_by_loops(medium: Medium, source: Tensor, inflow: float, directions: int) -> Tensor:
-    """The means of I Y_k [K, 1, z, y, x] (E17), gray, one direction after another."""
+    """The means of I Y_k [K, 1, z, y, x] (E2.8), gray, one direction after another."""
     total = torch.zeros_like(source)
     degree = math.isqrt(len(source)) - 1
     for w, weight in quadrature(directions):
@@ -99,13 +99,13 @@ def share_by_loops(medium: Medium, degree: int) -> Tensor:
 
 
 def remaining_by_formula(g: float, degree: int) -> list[float]:
-    """p_l of E18, and what scaling leaves of a g below 0."""
+    """p_l of E8.4, and what scaling leaves of a g below 0."""
     f = max(g, 0.0) ** (degree + 1)
     return [(g**ell - f) / (1 - f) for ell in range(degree + 1)]
 
 
 def factors_by_formula(g: float, rounds: int) -> list[float]:
-    """1 / (1 - nu) at Chebyshev's nodes nu (E19)."""
+    """1 / (1 - nu) at Chebyshev's nodes nu (E7.1)."""
     bound = 0.9 * remaining_by_formula(g, 3)[2]
     return [1 / (1 - bound * math.cos((k + 0.5) * math.pi / rounds)) for k in range(rounds)]
 
@@ -113,7 +113,7 @@ def factors_by_formula(g: float, rounds: int) -> list[float]:
 def round_by_loops(
     problem: DiffusionProblem, light: Moments, g: float, degree: int, is_last: bool
 ) -> Moments:
-    """One round of E12 from `light`, gray, by `sweep_by_loops` and dense solves."""
+    """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves."""
     medium, (operator, right) = problem.medium, problem.system
     directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
     matrix, theta = dense_matrix(operator)[0], share_by_loops(medium, degree)
@@ -130,7 +130,7 @@ def round_by_loops(
     turned = tuple(
         theta * part * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
     )
-    # the same problem with this flux as its only source: what E4 adds to the right side
+    # the same problem with this flux as its only source: what E2.4 adds to the right side
     alone = replace(
         problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside
     )

@@ -1,4 +1,4 @@
-"""Sweeps and rounds are what loops over directions and cells make of E11 and E12."""
+"""Sweeps and rounds are what loops over directions and cells make of E2.9 and E2.10."""
 
 from __future__ import annotations
 

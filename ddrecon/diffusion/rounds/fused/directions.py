@@ -66,7 +66,7 @@ class Step:
 
     @staticmethod
     def of(grid: Grid, direction: Direction, weight: float) -> Step:
-        """The step of a `direction` of the quadrature through `grid`, half of it [u] (E11)."""
+        """The step of a `direction` of the quadrature through `grid`, half of it [u] (E2.9)."""
         course = Course.of(grid, direction)
         axis = course.order[0] - 1
         moved = [0.0, 0.0, 0.0]

@@ -4,7 +4,7 @@
 
 namespace ddrecon {
 
-// theta of E14 for a step of this depth, 1 / (1 + rho^2) with rho = d (psi / phi - 1/2), and its
+// theta of E7.2 for a step of this depth, 1 / (1 + rho^2) with rho = d (psi / phi - 1/2), and its
 // slope. It is 1 in empty cells, where its formula is 0 / 0.
 template <class F> INLINE Sloped<F> find_share(F depth) {
     const bool is_empty = depth < F(2e-3);
@@ -19,7 +19,7 @@ template <class N> INLINE N share_of(const N& depth) {
     return along(depth, find_share(value_of(depth)));
 }
 
-// What of a sweep counts, and what of that is a source to diffusion (E12, E17). In: extinction,
+// What of a sweep counts, and what of that is a source to diffusion (E2.10, E2.8). In: extinction,
 // scattering unless it has the same field, the change of light's mean and flux, and what light is
 // off diffusion's. Out: the source, the gain of mean and flux, the flux that is turned.
 template <bool HAS_FLUX, bool SHARES_FIELD, bool IS_OFF> struct Gain {
@@ -43,7 +43,7 @@ template <bool HAS_FLUX, bool SHARES_FIELD, bool IS_OFF> struct Gain {
     }
 };
 
-// theta of E14 from the extinction's field; the number is the depth of a mean step in a field of 1.
+// theta of E7.2 from the extinction's field; the number is the depth of a mean step in a field of 1.
 struct Share {
     static constexpr int INS = 1, OUTS = 1, NUMBERS = 1;
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {
@@ -52,7 +52,7 @@ struct Share {
 };
 
 // A moment of higher degree by a factor, the number, as far from what it was to theta times what
-// was swept (E19). In: theta, what was swept, what was, unless that is nothing.
+// was swept (E7.1). In: theta, what was swept, what was, unless that is nothing.
 template <bool IS_BEGUN> struct Blend {
     static constexpr int INS = IS_BEGUN ? 3 : 2, OUTS = 1, NUMBERS = 1;
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {

@@ -1,4 +1,4 @@
-"""What of a sweep counts, and light after a round, by fused kernels (E12, E17, E19)."""
+"""What of a sweep counts, and light after a round, by fused kernels (E2.10, E2.8, E7.1)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def gain_fused(
     """theta (`change` + what L1 is `off`), what diffusion receives, and by how much flux is turned.
 
     The second is kappa_s times the mean's gain less theta times what the mean is `off`, where that
-    is not None (E12); the third theta `cosine` times the change of flux (E17). `length`: of the
-    mean step [u], by which theta is (E14).
+    is not None (E2.10); the third theta `cosine` times the change of flux (E2.8). `length`: of the
+    mean step [u], by which theta is (E7.2).
     """
     extinction, scattering = medium.extinction.field, medium.remaining.field
     is_so = change.flux is not None, scattering is extinction, off is not None
@@ -47,7 +47,7 @@ def blend_fused(
 ) -> Moments:
     """From `light` to what is `made` of it, and of what is higher to theta `swept`, by `factor`.
 
-    As `_blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E14).
+    As `_blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E7.2).
     """
     colors = len(light.mean)
     depth = (medium.extinction.scale * length).reshape(1, -1)

@@ -1,6 +1,6 @@
 #pragma once
 #include "ddrecon/diffusion/rounds/fused/lines.h"
-// Rows of moments from rows of radiance along directions, and the other way around (E17): products
+// Rows of moments from rows of radiance along directions, and the other way around (E2.8): products
 // of small matrices with rows. A direction and its mirror image in x, a pair, share sums over
 // moments even and odd in x.
 

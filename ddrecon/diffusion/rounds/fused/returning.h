@@ -78,7 +78,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         const long long at = job.color * light.cells + here.at;
         const long long ahead = -light.group->y_way * width;
         const Pairs<F> pairs = light.pairs_at(bar_of(0), pitch);
-        // E12 transposed: I_bar.
+        // E2.10 transposed: I_bar.
         Sums<F, COUNT, 1> sums;
         F* found[COUNT];
         const F* taken[COUNT];

@@ -1,6 +1,6 @@
 #pragma once
 #include "ddrecon/diffusion/rounds/fused/moments.h"
-// Rows of cells along which radiance is followed (E11, E12).
+// Rows of cells along which radiance is followed (E2.9, E2.10).
 //
 // A lane goes through the slices across z in the way that its light takes, s counting them, and in
 // each through the rows, t counting them in the way of a group of directions. A step begins at a
@@ -178,7 +178,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     INLINE Line<N> nothing() const { return line_at<N>(empty, 0); }
 
     // What scatters along each direction of a row, from sums of the moments of what was found, is
-    // known and is given (E12).
+    // known and is given (E2.10).
     INLINE const F* row_of(const F* part, long long at) const { return part ? part + at : empty; }
     INLINE void find_scattering(const Here& here, int from, int to) const {
         const long long at = job.color * cells + here.at, ahead = group->y_way * of.width;

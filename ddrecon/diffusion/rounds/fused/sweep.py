@@ -1,4 +1,4 @@
-"""A sweep as one differentiable function of tensors, by fused kernels (E11, E17)."""
+"""A sweep as one differentiable function of tensors, by fused kernels (E2.9, E2.8)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def sweep_fused(
     inflow: Tensor | None,
     directions: int,
 ) -> Moments:
-    """The moments of the radiance that `light`, by `factors`, and `source` scatter (E17).
+    """The moments of the radiance that `light`, by `factors`, and `source` scatter (E2.8).
 
     The first two less those of `light`. `directions`: how many the quadrature has.
     """
