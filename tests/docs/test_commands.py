@@ -80,7 +80,7 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ddrecon.bench.measure.QUICK_PATHS", (1, 2))
 
 
-@pytest.mark.parametrize("page", filter(commands, PAGES), ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", list(filter(commands, PAGES)), ids=lambda page: page.stem)
 def test_the_commands_of_a_page_run(page: Path, surroundings: None) -> None:
     for command in commands(page):
         if command.startswith("ddrecon reference"):

@@ -264,7 +264,7 @@ def test_what_is_too_large_is_refused_by_its_header(
     """A zip bomb among them: what its directory says is enough."""
     path = tmp_path / f"density{suffix}"
     path.write_bytes(sample(suffix, is_volume))
-    monkeypatch.setattr("ddrecon.io.files.reading.MAX_BYTES", 100)
+    monkeypatch.setattr("ddrecon.io.files.arrays.MAX_BYTES", 100)
     with pytest.raises(FormatError, match="at most"):
         read(path, is_volume)
 

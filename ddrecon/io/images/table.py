@@ -15,8 +15,9 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import is_there
+from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images.movies import encode
 from ddrecon.io.images.oiio import (
     PACKAGE,

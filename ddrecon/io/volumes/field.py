@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.reading import as_float32
+from ddrecon.io.files.arrays import as_float32
 
 BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""

@@ -21,8 +21,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ddrecon.errors import FormatError
+from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.files.reading import as_float32, check_size, read_npy
 from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_field
 
 BOUNDS = "bounds"

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import FormatError
+from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.files.reading import as_float32, check_size
 from ddrecon.io.volumes.field import Field, Fields, check_field
 
 RESOLUTION = "ddrecon_resolution"
