@@ -1,12 +1,12 @@
 #pragma once
 #include "ddrecon/diffusion/fused/mesh.h"
-// What flows through the faces of cells (E2.5 to E2.7 of docs/theory.md). A cell goes through all six
-// of its faces: for what it gains, and in the other direction for what its numbers count.
+// What flows through the faces of cells (E2.5 to E2.7 of docs/theory.md). A cell goes through all
+// six of its faces: for what it gains, and in the other direction for what its numbers count.
 
 namespace ddrecon {
 
-// What a face conducts, with its slopes: the harmonic mean of D here and there (E2.7), and on the box
-// 1 / (2 + h / (2 D)) (E2.6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
+// What a face conducts, with its slopes: the harmonic mean of D here and there (E2.7), and on the
+// box 1 / (2 + h / (2 D)) (E2.6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
 template <class F> struct Conduction {
     F value, by_here, by_there;
 };

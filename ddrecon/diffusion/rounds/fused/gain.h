@@ -43,7 +43,8 @@ template <bool HAS_FLUX, bool SHARES_FIELD, bool IS_OFF> struct Gain {
     }
 };
 
-// theta of E7.2 from the extinction's field; the number is the depth of a mean step in a field of 1.
+// theta of E7.2 from the extinction's field; the number is the depth of a mean step in a field
+// of 1.
 struct Share {
     static constexpr int INS = 1, OUTS = 1, NUMBERS = 1;
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {

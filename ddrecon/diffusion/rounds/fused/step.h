@@ -1,7 +1,8 @@
 #pragma once
 #include "ddrecon/diffusion/rounds/fused/given.h"
 #include "ddrecon/kernels/dual.h"
-// A step of light along a direction from cell to cell (E2.9), for rows of cells and for single ones.
+// A step of light along a direction from cell to cell (E2.9), for rows of cells and for single
+// ones.
 
 namespace ddrecon {
 
@@ -53,7 +54,8 @@ template <class N, class D> INLINE D light_after(
     return arriving * by.passed + (scattering_depth * scattered(far, near, by) - inflow * by.lost);
 }
 
-// E2.9 transposed: cotangents of a step's numbers, of that of I; `inflow` but for what I gets of it.
+// E2.9 transposed: cotangents of a step's numbers, of that of I; `inflow` but for what I gets of
+// it.
 template <class F> struct StepBars {
     F arriving, far, near, mass, scattering_mass, scale, strength, inflow;
 };
