@@ -187,16 +187,18 @@ def read_vdb(path: Path, name: str) -> Field:
         for _ in range(roots)
         for leaf in stream.leaves(np.array(stream.unpack("<3i")), UPPER, LOWER)
     ]
-    # [x, y, z, component], in whole leaves until they are all there.
-    values = np.zeros([*(-(-cells // SIDE) * SIDE), components], np.float32)
-    for x, y, z in leaves:
+    values = np.zeros(
+        [*cells[::-1], components], np.float32
+    )  # of which a system makes no pages yet
+    for place in leaves:
         block = stream.voxels(components).reshape(SIDE, SIDE, SIDE, components)
-        values[x : x + SIDE, y : y + SIDE, z : z + SIDE] = block
-    x, y, z = cells
-    inside = values[:x, :y, :z].transpose(2, 1, 0, 3)
+        x, y, z = np.minimum(cells - place, SIDE)
+        stream.require(min(x, y, z) > 0)
+        own = tuple(slice(at, at + SIDE) for at in place[::-1])
+        values[own] = block[:x, :y, :z].transpose(2, 1, 0, 3)
     low = first - size / 2
     box = np.stack([low, low + size * cells])
-    return check_field(path, name, inside[..., 0] if components == 1 else inside, box)
+    return check_field(path, name, values[..., 0] if components == 1 else values, box)
 
 
 class _Stream(io.BytesIO):
