@@ -18,6 +18,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
+from ddrecon.march.slabs import march_slabs
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
@@ -77,9 +78,7 @@ def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[
     if current_engine() == "warp":
         from ddrecon.march.fused.integrate import march_rays as march_own
     if isinstance(sampler.emission.grid, Slab):
-        from ddrecon.march.slabs import march_slabs
-
-        return march_slabs(march_own, sampler, rays, crossing)
+        return march_slabs(march_rays, march_own, sampler, rays, crossing)
     return march_own(sampler, rays, crossing)
 
 

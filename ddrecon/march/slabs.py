@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.march import integral
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
 from ddrecon.march.samplers import Sampler, Way, planes_across
@@ -22,12 +21,16 @@ from ddrecon.slabs.slab import Slab
 
 
 def march_slabs(
+    march_rays: Callable[..., tuple[Tensor, Tensor]],
     march_own: Callable[..., tuple[Tensor, Tensor]],
     sampler: Sampler,
     rays: Rays,
     crossing: Crossing,
 ) -> tuple[Tensor, Tensor]:
-    """As `integral.march_rays`, through all slabs; by `march_own`, or that itself, in this one."""
+    """As `integral.march_rays`, through all slabs: by `march_own`, the engine's, in this one.
+
+    `march_rays` is that of `integral`, by which mass alone is found.
+    """
     emission, slab = sampler.emission, sampler.emission.grid
     assert isinstance(slab, Slab)
     hitting, count = rays.select(crossing.hit), len(crossing.hit)
@@ -49,7 +52,7 @@ def march_slabs(
     else:
         # With a forward peak (E8.7) radiance depends on all mass before it, found first.
         absorbing = replace(sampler, emission=_without_light(emission))
-        mass = of_all(integral.march_rays(absorbing, hitting, own)[1])
+        mass = of_all(march_rays(absorbing, hitting, own)[1])
         front = sum_before(mass, is_upwards)
         scattered = of_all(march_own(sampler, hitting, own, front[:, inside])[0])
     radiance, total = sum_slabs(torch.cat([scattered, mass])).split([len(scattered), len(mass)])
