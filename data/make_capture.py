@@ -9,7 +9,7 @@ one frame is taken; and each training camera is told a little wrong. What is tru
 truth.json and density.npz. `--respoil` takes the smoke and its pictures from the folder, where they
 are kept, and needs no Mitsuba.
 
-The film needs the extra `mp4` (imageio-ffmpeg): pip install "ddrecon[mp4]".
+The film needs imageio-ffmpeg: pip install imageio-ffmpeg.
 """
 
 from __future__ import annotations

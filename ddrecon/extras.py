@@ -17,7 +17,6 @@ EXTRAS = {
     "netCDF4": "netcdf",
     "matplotlib": "plot",
     "mitsuba": "reference",
-    "imageio_ffmpeg": "mp4",
     "warp": "fast",
     "miepython": "mie",
 }

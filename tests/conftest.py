@@ -37,32 +37,25 @@ def same_seed() -> None:
     torch.manual_seed(0)
 
 
-PACKAGES = {
-    ".tif": ("tifffile",),
-    ".tiff": ("tifffile",),
-    ".nc": ("netCDF4",),
-}
-"""What reading a format needs: one of these."""
-READ = [suffix for suffix in FORMATS if suffix != ".vti"]
-"""All formats but one that is only written."""
+BOTH = [suffix for suffix in FORMATS if suffix not in (".vti", ".nc")]
+"""Formats that are written and read."""
 
 
-def _is_readable(suffix: str) -> bool:
-    return suffix not in PACKAGES or any(find_spec(name) for name in PACKAGES[suffix])
+def _is_written(suffix: str) -> bool:
+    return not suffix.startswith(".tif") or find_spec("tifffile") is not None
 
 
 @pytest.fixture(scope="session")
 def readable_formats() -> list[str]:
-    """The suffixes of all volume files that can be read here."""
-    return [suffix for suffix in READ if _is_readable(suffix)]
+    """The suffixes of all volume files that can be written and read here."""
+    return [suffix for suffix in BOTH if _is_written(suffix)]
 
 
-@pytest.fixture(scope="session", params=READ)
+@pytest.fixture(scope="session", params=BOTH)
 def suffix(request: pytest.FixtureRequest) -> str:
-    """The suffix of each kind of volume file that can be read here."""
-    if not _is_readable(request.param):
-        packages = " or ".join(PACKAGES[request.param])
-        pytest.skip(f"reading {request.param} needs {packages}, not installed here")
+    """The suffix of each kind of volume file that can be written and read here."""
+    if not _is_written(request.param):
+        pytest.skip(f"{request.param} needs tifffile, not installed here")
     return request.param
 
 

@@ -93,21 +93,18 @@ def _write_fields(
 ) -> None:
     """Writes a volume to `output`, and prints what is the same everywhere in it."""
     from ddrecon.io.files.folders import require_free_files
-    from ddrecon.io.volumes.table import keeps_constants, raise_z, write_fields
+    from ddrecon.io.volumes.table import raise_z, write_fields
 
     require_free_files([output], may_exist=overwrite)
     if up == "z":
         fields, bounds = raise_z(fields, bounds)
-    write_fields(output, fields, bounds, constants)
+    write_fields(output, fields, bounds)
     if constants:
-        words = {
-            name: " ".join(f"{number:.6g}" for number in value.flatten().tolist())
+        numbers = ", ".join(
+            " ".join([name, *(f"{number:.6g}" for number in value.flatten().tolist())])
             for name, value in constants.items()
-        }
-        numbers = ", ".join(f"{name} {numbers}" for name, numbers in words.items())
-        has_place = keeps_constants(output)
-        place = "in its metadata" if has_place else "which the format has no place for"
-        click.echo(f"fields: {', '.join(fields)}; the same everywhere, {place}: {numbers}")
+        )
+        click.echo(f"fields: {', '.join(fields)}; the same everywhere, not written: {numbers}")
 
 
 def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:

@@ -67,7 +67,6 @@ def check(session: Session, scene: Path) -> None:
     metavar="N",
     help="N views around the volume instead, and ring.png of them.",
 )
-@click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
 @SHARE
 @DTYPE
 @REPORT
@@ -82,17 +81,13 @@ def render(
     parameter: str | None,
     lights: tuple[str, ...],
     count: int | None,
-    has_mp4: bool,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
-    if count is None and has_mp4:
-        raise click.UsageError("--mp4 is a movie of --ring N")
     if lights:
         session = session.with_overrides(f"lights=[{', '.join(lights)}]")
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
-    from ddrecon.io.images.movies import require_mp4
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.render_folder import (
@@ -103,8 +98,6 @@ def render(
         write_ring,
     )
 
-    if has_mp4:
-        require_mp4()
     loaded = session.build(scene_file)
     require_sharing(loaded)
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
@@ -118,7 +111,7 @@ def render(
         if not is_first():
             return
         if count is not None:
-            report["ring"] = write_ring(views, output, has_mp4)
+            report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
     session.show(report, render_lines(report, output))
 

@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.extras import advice
-from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
+from ddrecon.io.images.movies import encode_frames, write_animation
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
@@ -84,16 +84,12 @@ def render_to_folder(
     return report
 
 
-def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
-    """What the report says of the movie `ring.png`, and `ring.mp4`, of all `views` in `folder`."""
+def write_ring(views: list[View], folder: Path) -> dict[str, Any]:
+    """What the report says of the movie `ring.png` of all `views` in `folder`."""
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
-    frames, written = encode_frames(images, white), ["ring.png"]
-    write_animation(folder / "ring.png", frames)
-    if has_mp4:
-        write_mp4(folder / "ring.mp4", frames)
-        written.append("ring.mp4")
-    return {"files": written, "white": white}
+    write_animation(folder / "ring.png", encode_frames(images, white))
+    return {"files": ["ring.png"], "white": white}
 
 
 def remove_targets(scene: Scene, views: list[View], count: int | None) -> Scene:

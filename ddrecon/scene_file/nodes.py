@@ -1,8 +1,8 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
 The strict part of YAML: one document of mappings, lists and scalars; no tags or repeated keys.
-Aliases, and the merge key `<<`, are written out, up to `MAX_COPIES` values. What plain scalars mean
-is the core schema of YAML 1.2 (section 10.3.2): `1e-3` is a number, `yes` is text.
+Aliases are written out, up to `MAX_COPIES` values. What plain scalars mean is the core schema of
+YAML 1.2 (section 10.3.2), which has no merge key `<<`: `1e-3` is a number, `yes` is text.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ Scalar = None | bool | int | float | str
 MAX_DEPTH = 32
 MAX_COPIES = 10_000
 """So many values may come of aliases: a few of these could stand for billions."""
-MERGE = "<<"
 LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
 
@@ -174,19 +173,12 @@ class _Composer:
         return node
 
     def mapping(self, parent: Node, depth: int) -> dict[str, Node]:
-        entries, merged = dict[str, Node](), dict[str, Node]()
+        entries = dict[str, Node]()
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 raise SceneError(
                     f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text"
                 )
-            if event.value == MERGE and not event.style:
-                child = self.node(next(self.events), parent.key, self.where(event), depth)
-                if not isinstance(child.value, dict):
-                    what = f"takes the entries of one mapping, found {describe_found(child)}"
-                    raise child.key_refused(f"{MERGE} {what}")
-                merged = child.value | merged
-                continue
             name = event.value if event.value.isprintable() else repr(event.value)
             child = self.node(
                 next(self.events), parent.child_key(name), self.where(event), depth + 1
@@ -197,7 +189,7 @@ class _Composer:
                 )
             else:
                 entries[name] = child
-        return merged | entries
+        return entries
 
     def where(self, event: yaml.Event) -> str:
         mark = event.start_mark

@@ -41,7 +41,6 @@ render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
 render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
-render scene.yaml -o out --mp4 => 2 Error: --mp4 is a movie of --ring N
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range x>=2
 render scene.yaml -o out --light '{type: sun}' => 2 -D lights=[{type: sun}]: lights.0.type: expected
 render -o out => 2 Error: Missing argument 'SCENE'

@@ -64,6 +64,15 @@ def write_hdr(path: Path, pixels: np.ndarray) -> None:
     path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + size + body)
 
 
+def write_volume(path: Path) -> None:
+    if path.suffix != ".nc":
+        return write_field(path, "density", VALUES, BOUNDS)
+    with pytest.importorskip("netCDF4").Dataset(path, "w") as file:
+        for name, count in zip("zyx", VALUES.shape, strict=True):
+            file.createDimension(name, count)
+        file.createVariable("density", "f4", tuple("zyx"))[:] = VALUES
+
+
 def write_encoded(path: Path, pixels: np.ndarray) -> None:
     iio.imwrite(path, (255 * pixels).astype(np.uint8))
 
@@ -83,7 +92,7 @@ def sample(suffix: str, is_volume: bool) -> bytes:
         path = Path(name, f"density{suffix}")
         try:
             if is_volume:
-                write_field(path, "density", VALUES, BOUNDS)
+                write_volume(path)
             else:
                 WRITERS.get(suffix, write_encoded)(path, PICTURE)
             read(path, is_volume)

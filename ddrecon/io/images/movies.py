@@ -1,4 +1,4 @@
-"""Moving pictures as animated PNG, and MP4 (an extra); pictures within pages as WebP.
+"""Moving pictures as animated PNG; pictures within pages as WebP.
 
 Frames and images are 8-bit sRGB, uint8 [n, h, w, 3] and [h, w, 3].
 """
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.pictures import srgb
 
@@ -41,25 +40,3 @@ def write_animation(path: Path, frames: np.ndarray) -> None:
     with replace_file(path) as temporary:
         timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}
         temporary.write_bytes(encode(frames, ".png", **timing))
-
-
-def require_mp4() -> None:
-    """Raises MissingExtraError where no encoder for MP4 is installed."""
-    load_extra("imageio_ffmpeg", "MP4")
-
-
-def write_mp4(path: Path, frames: np.ndarray) -> None:
-    """Writes `frames` as H.264 in MP4; raises MissingExtraError.
-
-    H.264 takes even sizes only: a last odd row or column is repeated.
-    """
-    import imageio.v3 as iio
-
-    require_mp4()
-    height, width = frames.shape[1:3]
-    even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    with replace_file(path) as temporary:
-        rate = len(frames) / SECONDS
-        iio.imwrite(
-            temporary, even, plugin="FFMPEG", extension=".mp4", fps=rate, macro_block_size=2
-        )

@@ -1,4 +1,4 @@
-"""Volumes as netCDF, for atmospheric fields, through `netCDF4` (extra `netcdf`).
+"""Atmospheric fields in netCDF, read through `netCDF4` (extra `netcdf`).
 
 A field is a variable on axes x, y and z in any order. An axis is known by the attribute `axis` of
 its coordinate (CF conventions), else by its name. Coordinates are centers of cells, evenly spaced,
@@ -14,16 +14,13 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
-from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import Field, Fields, check_field
+from ddrecon.io.files.arrays import check_size
+from ddrecon.io.volumes.field import Field, check_field
 
-COLOR = "color"
 NAMES = {
     "x": ("x", "west_east", "nx"),
     "y": ("y", "south_north", "ny"),
     "z": ("z", "height", "altitude", "bottom_top", "lev", "nz"),
-    COLOR: (COLOR,),
 }
 """What the names of axes begin with."""
 METERS = {
@@ -32,34 +29,6 @@ METERS = {
 }
 EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
-
-
-def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray, constants: Fields) -> None:
-    """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and their box.
-
-    `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds; `constants`
-    as attributes of the file.
-    """
-    z, y, x = next(iter(fields.values())).shape[:3]
-    with (
-        replace_file(path) as temporary,
-        load_for_file("netCDF4", path).Dataset(temporary, "w") as file,
-    ):
-        file.setncatts({"Conventions": "CF-1.11", **constants})
-        for name, count in {"x": x, "y": y, "z": z, "corner": 2, COLOR: 3}.items():
-            file.createDimension(name, count)
-        for axis, count, low, high in zip("xyz", (x, y, z), *bounds, strict=True):
-            edges = np.linspace(low, high, count + 1)
-            corners = file.createVariable(f"{axis}_bounds", "f8", (axis, "corner"))
-            corners[:] = np.column_stack([edges[:-1], edges[1:]])
-            centers = file.createVariable(axis, "f8", (axis,))
-            centers[:] = (edges[:-1] + edges[1:]) / 2
-            about = {"axis": axis.upper(), "long_name": f"{axis} of cell centers"}
-            centers.setncatts({**about, "bounds": corners.name})
-        for name, values in fields.items():
-            axes = ("z", "y", "x", COLOR)[: values.ndim]
-            variable = file.createVariable(name, "f4", axes, compression="zlib", shuffle=True)
-            variable[:] = as_float32(values)
 
 
 def netcdf_names(path: Path) -> list[str]:
@@ -93,7 +62,7 @@ def read_netcdf(path: Path, name: str) -> Field:
 
 
 def _axis_of(file: Any, dimension: str) -> str | None:
-    """Which of x, y, z, or color, the `dimension` is."""
+    """Which of x, y and z the `dimension` is."""
     attribute = str(getattr(file.variables.get(dimension), "axis", "")).lower()
     if attribute in NAMES:
         return attribute
@@ -103,10 +72,7 @@ def _axis_of(file: Any, dimension: str) -> str | None:
 
 
 def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
-    """The values as [z, y, x] or [z, y, x, colors], and the names of the dimensions z, y and x.
-
-    Other dimensions must have one entry.
-    """
+    """The values as [z, y, x], and the names of these dimensions; others must have one entry."""
     # What is masked (_FillValue) is NaN, which `check_field` refuses.
     values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
     dimensions = dict[str, str]()
@@ -117,10 +83,10 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
         elif count > 1:
             advice = f"choose one (ncks -d {name},0)"
             raise FormatError(path, f"{variable.name} has {count} entries along {name!r}; {advice}")
-    kept = [dimensions[axis] for axis in ("z", "y", "x", COLOR) if axis in dimensions]
+    kept = [dimensions[axis] for axis in "zyx"]
     order = sorted(variable.dimensions, key=lambda name: [*kept, name].index(name))
     values = values.transpose([variable.dimensions.index(name) for name in order])
-    return values.reshape(values.shape[: len(kept)]), kept[:3]
+    return values.reshape(values.shape[:3]), kept
 
 
 def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:

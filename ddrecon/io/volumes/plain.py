@@ -15,7 +15,6 @@ from __future__ import annotations
 import struct
 import zipfile
 from pathlib import Path
-from typing import NoReturn
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -129,10 +128,3 @@ def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     head = FILE.format(extent=extent, origin=origin, spacing=spacing, arrays=arrays)
     with replace_file(path) as temporary:
         temporary.write_bytes(head.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")
-
-
-def refuse_vti(path: Path, *_: str) -> NoReturn:
-    """Raises FormatError, which says what is read instead."""
-    raise FormatError(
-        path, ".vti is written, not read: save the volume as .npz or .nc (docs/formats.md)"
-    )

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, Field, Fields
-from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf, write_netcdf
+from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
 from ddrecon.io.volumes.plain import (
     npz_names,
     read_npz,
     read_vol,
-    refuse_vti,
     write_npz,
     write_vol,
     write_vti,
@@ -29,22 +29,32 @@ from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 class VolumeFormat:
     """How one kind of volume file is read and written.
 
-    By `write(path, fields, bounds)`, with `has_metadata` with constants as well, `read(path, name)`
-    and `names(path)`; without, a file holds one field and does not name it.
+    Without `names`, a file holds one field and does not name it.
     """
 
-    write: Callable[..., None]
+    write: Callable[[Path, Fields, np.ndarray], None]
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
-    has_metadata: bool = False
+
+
+def refuse_reading(path: Path, *_: str) -> NoReturn:
+    """Raises FormatError, which says what is read instead."""
+    raise FormatError(
+        path, ".vti is written, not read: save the volume as .npz or .nc (docs/formats.md)"
+    )
+
+
+def refuse_writing(path: Path, *_: object) -> NoReturn:
+    """Raises FormatError, which says what is written instead."""
+    raise FormatError(path, ".nc is read, not written: name a .npz, .vdb or .vti")
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, has_metadata=True),
-    ".vti": VolumeFormat(write_vti, refuse_vti, refuse_vti),
-    ".nc": VolumeFormat(write_netcdf, read_netcdf, netcdf_names, has_metadata=True),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
+    ".vti": VolumeFormat(write_vti, refuse_reading, refuse_reading),
+    ".nc": VolumeFormat(refuse_writing, read_netcdf, netcdf_names),
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
 }
 
@@ -81,21 +91,12 @@ def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -
     write_fields(path, {name: values}, bounds)
 
 
-def write_fields(
-    path: Path, fields: Fields, bounds: np.ndarray, constants: Fields | None = None
-) -> None:
+def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes several fields of the same cells, by name, each as `write_field` does.
 
-    `constants`, each one number or three, become metadata where `keeps_constants`, else nothing.
-    Raises FormatError where the format holds but one field.
+    Raises FormatError where the format holds but one field, or is not written.
     """
-    more = (constants or {},) if keeps_constants(path) else ()
-    _format_of(path).write(path, fields, np.asarray(bounds, np.float64), *more)
-
-
-def keeps_constants(path: Path) -> bool:
-    """Whether the format of the suffix of `path` has metadata for them."""
-    return _format_of(path).has_metadata
+    _format_of(path).write(path, fields, np.asarray(bounds, np.float64))
 
 
 def _format_of(path: Path) -> VolumeFormat:

@@ -43,18 +43,13 @@ ADVICE = (
 )
 
 
-def write_vdb(path: Path, fields: Fields, bounds: np.ndarray, constants: Fields) -> None:
+def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes.
 
-    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform; `constants`, each
-    one number or three, metadata of the file.
+    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform.
     """
     data = HEADER.pack(MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1)
-    labels = {
-        name: ("float" if value.size == 1 else "vec3s", value.astype("<f4").tobytes())
-        for name, value in constants.items()
-    }
-    data += str(uuid.uuid4()).encode() + _metadata(labels) + struct.pack("<I", len(fields))
+    data += str(uuid.uuid4()).encode() + _metadata({}) + struct.pack("<I", len(fields))
     for name, values in fields.items():
         data += _grid(name, as_float32(values), bounds, len(data))
     with replace_file(path) as temporary:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from ddrecon.errors import MissingExtraError
-from ddrecon.io.images.movies import SECONDS, encode_frames, write_animation, write_mp4
+from ddrecon.io.images.movies import SECONDS, encode_frames, write_animation
 
 
 def frames() -> np.ndarray:
@@ -36,21 +34,3 @@ def test_an_animation_keeps_every_bit(tmp_path: Path) -> None:
     )
     about = iio.immeta(tmp_path / "ring.png", plugin="pillow")
     assert about["loop"] == 0 and about["duration"] == pytest.approx(1000 * SECONDS / 7, abs=1)
-
-
-def test_an_mp4_shows_the_frames_in_order(tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg", reason="MP4 is an extra")
-    write_mp4(tmp_path / "ring.mp4", frames())
-    read = iio.imread(tmp_path / "ring.mp4", plugin="FFMPEG").astype(float)
-    assert read.shape == (7, 18, 24, 3)
-    assert np.abs(read[:, :17, :23] - frames())[:, 6:, 6:].mean() < 4
-    assert iio.immeta(tmp_path / "ring.mp4", plugin="FFMPEG")["fps"] == pytest.approx(
-        7 / SECONDS, rel=1e-2
-    )
-
-
-def test_a_missing_encoder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingExtraError, match=r"MP4 needs .*ddrecon\[mp4\]"):
-        write_mp4(tmp_path / "ring.mp4", frames())
-    assert not list(tmp_path.iterdir())

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from refusals import refusal
 
-from ddrecon.io.volumes.table import field_names, read_field, write_fields
+from ddrecon.errors import FormatError
+from ddrecon.io.volumes.table import read_field, write_field
 
 netcdf = pytest.importorskip("netCDF4", reason="netCDF needs netCDF4 (the extra `netcdf`)")
 BOUNDS = np.array([[-1.0, -2.0, 6.0], [1.0, 2.5, 9.0]])
@@ -54,27 +55,6 @@ def plain(**units: str) -> dict[str, tuple[Any, dict[str, str]]]:
         )
         for axis in "xyz"
     }
-
-
-def test_other_programs_find_axes_and_units(tmp_path: Path) -> None:
-    write_fields(
-        tmp_path / "f.nc", {"density": VALUES, "albedo": np.repeat(VALUES[..., None], 3, 3)}, BOUNDS
-    )
-    with netcdf.Dataset(tmp_path / "f.nc") as file:
-        assert file.variables["density"].dimensions == ("z", "y", "x") and file.variables[
-            "albedo"
-        ].dimensions == ("z", "y", "x", "color")
-        for index, axis in enumerate("xyz"):
-            coordinate = file.variables[axis]
-            assert coordinate.axis == axis.upper()
-            np.testing.assert_allclose(coordinate[:], CENTERS[axis], rtol=1e-14)
-            edges = file.variables[coordinate.bounds]
-            assert (
-                edges[0, 0] == BOUNDS[0, index]
-                and edges[-1, 1] == BOUNDS[1, index]
-                and np.array_equal(edges[1:, 0], edges[:-1, 1])
-            )
-    assert field_names(tmp_path / "f.nc") == ["density", "albedo"]
 
 
 @pytest.mark.parametrize("order", ["z y x", "x y z", "y z x", "time z y x"])
@@ -136,6 +116,8 @@ def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
 
 def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
     path = tmp_path / "f.nc"
+    with pytest.raises(FormatError, match=r"read, not written: name a \.npz"):
+        write_field(path, "density", VALUES, BOUNDS)
     assert (
         refusal(written(path, VALUES, "z y x", **plain()))
         == "has no field 'density'; it has 'QN'; say name: QN beside file"

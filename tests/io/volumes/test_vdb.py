@@ -84,13 +84,6 @@ def test_fields_of_a_file_are_read_by_name(tmp_path: Path) -> None:
         read_field(path, "lwc")
 
 
-def test_openvdb_finds_the_constants(tmp_path: Path) -> None:
-    path, constants = tmp_path / "smoke.vdb", {"g": np.array(0.5), "albedo": np.array([0.5, 0, 1])}
-    write_fields(path, {"density": np.ones((1, 2, 3))}, BOUNDS, constants)
-    found = openvdb_python.described("vdb.readAll(sys.argv[1])[1]", path)
-    assert found == {name: value.tolist() for name, value in constants.items()}
-
-
 AGAIN = """
 import sys
 try: import openvdb as vdb
