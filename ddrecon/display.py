@@ -5,16 +5,14 @@ The package itself puts that there (`Displayed._repr_html_`), so that no record 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
-from itertools import islice
+import reprlib
+from collections.abc import Callable
+from dataclasses import MISSING, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-FIRST = 2
-"""Entries of a list or mapping that are shown."""
 SMALL = 4
 """Tensors of so many numbers are shown by these, larger ones by their range."""
 
@@ -26,47 +24,39 @@ class Displayed:
 
     def __repr__(self) -> str:
         """What differs from its default, a line each; of tensors shape, device and range."""
-        lines = "".join(f"  {part},\n" for part in _parts(self))
+        lines = "".join(f"  {part},\n" for part in _Brief().parts_of(self, 6))
         return f"{type(self).__name__}(\n{lines})"
 
 
-def _parts(record: Any) -> list[str]:
-    pairs = [(field, getattr(record, field.name)) for field in fields(record)]
-    return [f"{field.name}={_brief(value)}" for field, value in pairs if _is_told(field, value)]
+class _Brief(reprlib.Repr):
+    """Lists and mappings by their first two entries, records by what differs from its default."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlist, self.maxdict, self.maxstring = 2, 2, 100
 
-def _is_told(field: Field[Any], value: Any) -> bool:
-    """Whether `value` is another than the default of `field`."""
-    default = field.default
-    if field.default_factory is not MISSING:
-        default = field.default_factory()
-    return type(value) is not type(default) or value != default
+    def parts_of(self, record: Any, level: int) -> list[str]:
+        parts = []
+        for field in fields(record):
+            value, default = getattr(record, field.name), field.default
+            if field.default_factory is not MISSING:
+                default = field.default_factory()
+            if type(value) is not type(default) or value != default:
+                parts.append(f"{field.name}={self.repr1(value, level - 1)}")
+        return parts
 
+    def repr_instance(self, x: Any, level: int) -> str:
+        if is_dataclass(x):
+            return f"{type(x).__name__}({', '.join(self.parts_of(x, level))})"
+        return repr(x)
 
-def _brief(value: Any) -> str:
-    from torch import Tensor
+    def repr_Tensor(self, x: Tensor, level: int) -> str:
+        value = x.detach()
+        if value.numel() <= SMALL:
+            numbers = ", ".join(f"{number:.4g}" for number in value.flatten().tolist())
+            return f"[{numbers}]" if value.ndim else numbers
+        kind = str(value.dtype).removeprefix("torch.")
+        span = f"{float(value.min()):.4g} to {float(value.max()):.4g}"
+        return f"<{list(value.shape)} {kind} on {value.device}, {span}>"
 
-    if isinstance(value, Tensor):
-        return _brief_tensor(value.detach())
-    if isinstance(value, list):
-        return f"[{_brief_entries(map(_brief, value), len(value))}]"
-    if isinstance(value, Mapping):
-        entries = (f"{key}: {_brief(entry)}" for key, entry in value.items())
-        return f"{{{_brief_entries(entries, len(value))}}}"
-    if is_dataclass(value):
-        return f"{type(value).__name__}({', '.join(_parts(value))})"
-    return repr(value)
-
-
-def _brief_entries(entries: Iterable[str], count: int) -> str:
-    more = [f"... {count} in all"] if count > FIRST else []
-    return ", ".join([*islice(entries, FIRST), *more])
-
-
-def _brief_tensor(value: Tensor) -> str:
-    if value.numel() <= SMALL:
-        numbers = ", ".join(f"{number:.4g}" for number in value.flatten().tolist())
-        return f"[{numbers}]" if value.ndim else numbers
-    kind = str(value.dtype).removeprefix("torch.")
-    span = f"{float(value.min()):.4g} to {float(value.max()):.4g}"
-    return f"<{list(value.shape)} {kind} on {value.device}, {span}>"
+    repr_Parameter = repr_Tensor

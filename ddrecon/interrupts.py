@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import Any
 
 INTERRUPTED = 130
 """The exit code of a program that was interrupted."""
@@ -30,34 +29,25 @@ def interrupt(number: int, frame: FrameType | None, what: str = "") -> None:
 
     A second signal, or one while a module is imported, ends the process at once.
     """
-    if _is_importing(frame):
-        end_at_once(number, frame)
-    handle_interrupts(end_at_once)
+    caller = frame
+    while caller is not None:
+        if caller.f_code.co_filename.startswith("<frozen importlib"):
+            end_at_once(number, frame)
+        caller = caller.f_back
+    signal.signal(signal.SIGINT, end_at_once)
     raise KeyboardInterrupt(what)
 
 
-def _is_importing(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
-
-
-def handle_interrupts(handler: Any) -> Any:
-    """Has `handler` called at Ctrl-C, unless that is ignored, as in the background; the old one."""
-    old = signal.getsignal(signal.SIGINT)
-    return old if old is signal.SIG_IGN else signal.signal(signal.SIGINT, handler)
-
-
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt in the block."""
-    old = handle_interrupts(interrupt)
+def on_interrupt(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Ctrl-C calls `handler` in the block, unless it is ignored, as in the background."""
+    old = signal.getsignal(signal.SIGINT)
+    if old is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
-        handle_interrupts(old)
+        signal.signal(signal.SIGINT, old)
 
 
 @contextmanager

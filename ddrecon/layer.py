@@ -76,20 +76,17 @@ class VolumeRenderer(torch.nn.Module):
         with torch.autocast(own.device.type, enabled=False):
             given = {n: v.to(own.dtype) if isinstance(v, Tensor) else v for n, v in given.items()}
             counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
-            if not counts:
-                return self._render(given, view, 0)
             if len(set(counts.values())) > 1 or 0 in counts.values():
                 raise UsageError(f"batches differ in size, or hold nothing: {counts}")
-            entries = range(next(iter(counts.values())))
-            each = [{n: v[i] if n in counts else v for n, v in given.items()} for i in entries]
-            return torch.stack([self._render(one, view, i) for i, one in enumerate(each)])
-
-    def _render(self, given: Mapping[str, Tensor], view: str | None, number: int) -> Tensor:
-        """The images of entry `number` of a batch, which starts from its own last solutions."""
-        while len(self.memories) <= number:
-            self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
-        self.memories[number].records.clear()
-        return render(with_values(self.scene, given), view, self.memories[number])
+            images = []
+            for index in range(next(iter(counts.values()), 1)):
+                # Each entry starts from its own last solutions.
+                if len(self.memories) <= index:
+                    self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
+                self.memories[index].records.clear()
+                one = {n: v[index] if n in counts else v for n, v in given.items()}
+                images.append(render(with_values(self.scene, one), view, self.memories[index]))
+            return torch.stack(images) if counts else images[0]
 
     def _is_batch(self, name: str, value: Tensor) -> bool:
         """Whether `value` has an axis of entries in front of what the variable `name` has."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -11,19 +11,10 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 """`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
 
 
-def bar_room() -> tuple[int | None, int | None]:
-    """Columns and rows for a progress bar; None leaves them to tqdm, which asks the terminal.
-
-    A terminal that says it has none, as some containers' do, would see nothing at all.
-    """
-    try:
-        columns, rows = os.get_terminal_size(sys.stderr.fileno())
-    except (OSError, ValueError, AttributeError):
-        return None, None
-    return (None if columns else 80), (None if rows else 24)
-
-
 def bar_settings(is_quiet: bool) -> dict[str, Any]:
-    """How every progress bar is shown: on stderr, with room, and not at all if `is_quiet`."""
-    columns, rows = bar_room()
-    return {"file": sys.stderr, "disable": is_quiet, "ncols": columns, "nrows": rows}
+    """How every progress bar is shown: on stderr, and not at all if `is_quiet`.
+
+    A terminal that says it has no room, as some containers' do, gets 80 columns and 24 rows.
+    """
+    columns, rows = shutil.get_terminal_size()
+    return {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}

@@ -28,7 +28,7 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
-from ddrecon.light.outgoing import scatter_once_more, scatter_towards
+from ddrecon.light.outgoing import scatter_towards
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
@@ -64,11 +64,6 @@ class LightField:
     diffuse: Moments
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
-
-    @property
-    def outgoing(self) -> Moments:
-        """What one more scattering makes of `diffuse` (E2.3), as `scatter_once_more` has it."""
-        return scatter_once_more(self.medium, self.diffuse)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypedDict, Unpack
 
@@ -39,19 +40,9 @@ class Limits(TypedDict, total=False):
     expert: bool
 
 
-def bounded(default: Any, **limits: Unpack[Limits]) -> Any:
-    """A number, or numbers, within `limits`, `default` where the scene gives none."""
+def bounded(default: Any = MISSING, **limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`; the scene must give it where it has no `default`."""
     return field(default=default, metadata=dict(limits))
-
-
-def limited(**limits: Unpack[Limits]) -> Any:
-    """A number, or numbers, within `limits`, that the scene must give."""
-    return field(metadata=dict(limits))
-
-
-def optional(**limits: Unpack[Limits]) -> Any:
-    """A number, or numbers, within `limits`, that may be left out."""
-    return bounded(None, **limits)
 
 
 def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
@@ -71,7 +62,7 @@ class RenderSettings:
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
-    steps_per_voxel: int | None = optional(minimum=1, maximum=8, expert=True)
+    steps_per_voxel: int | None = bounded(None, minimum=1, maximum=8, expert=True)
     tolerance: float = bounded(0.05, minimum=0, maximum=1, expert=True)
     background: bool = True
 
@@ -109,7 +100,7 @@ class DiffusionSettings:
     solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"), expert=True)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = bounded(True, expert=True)
-    transport_rounds: int | None = optional(minimum=0, maximum=16)
+    transport_rounds: int | None = bounded(None, minimum=0, maximum=16)
     degree: int | None = one_of(None, (1, 3, 5, 7))
 
     @property
@@ -122,19 +113,13 @@ class DiffusionSettings:
     @property
     def rounds(self) -> int:
         """How many transport rounds there are: left out, one where there can be any."""
-        return (
-            int(self._can_have_rounds) if self.transport_rounds is None else self.transport_rounds
-        )
-
-    @property
-    def _can_have_rounds(self) -> bool:
-        return (self.model, self.scheme) == ("p1", "conservative")
+        can_have_rounds = (self.model, self.scheme) == ("p1", "conservative")
+        return int(can_have_rounds) if self.transport_rounds is None else self.transport_rounds
 
     def violations(self) -> Iterator[Violation]:
-        """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
-        if self.rounds > 0 and not self._can_have_rounds:
+        if self.rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
             yield (
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",
@@ -181,10 +166,10 @@ class ParameterSettings:
     }
 
     init: Start | None = None
-    lr: float | None = optional(above=0)
+    lr: float | None = bounded(None, above=0)
     min: float | None = None
     max: float | None = None
-    tv: float | None = optional(minimum=0)
+    tv: float | None = bounded(None, minimum=0)
     field: bool | None = None
     support: str | None = one_of(None, (MASKS, AUTO))
     support_margin: float = bounded(2.0, minimum=0, maximum=1000, expert=True)
@@ -237,8 +222,5 @@ class OptimizeSettings:
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
 
     def violations(self) -> Iterator[Violation]:
-        if any(
-            later <= earlier
-            for earlier, later in zip(self.refine_at, self.refine_at[1:], strict=False)
-        ):
+        if any(later <= earlier for earlier, later in pairwise(self.refine_at)):
             yield "refine_at", "must increase from each entry to the next"

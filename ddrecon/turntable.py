@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from ddrecon.cameras import Camera, rotation
 from ddrecon.grid import Triple
@@ -25,7 +24,7 @@ def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Came
     The line runs through `center` (x, y, z).
     """
     middle = camera.pose.new_tensor(center)
-    turn = _turn(axis, angle).to(camera.pose)
+    turn = rotation(angle * torch.eye(3, dtype=torch.float64)[axis]).to(camera.pose)
     origin = middle + turn @ (camera.pose[:, 3] - middle)
     return replace(camera, pose=torch.cat([turn @ camera.pose[:, :3], origin[:, None]], 1))
 
@@ -41,8 +40,3 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
         for index in range(count)
     )
     return [View(f"ring_{index:03d}", camera) for index, camera in enumerate(turned)]
-
-
-def _turn(axis: int, angle: float) -> Tensor:
-    """The matrix [3, 3] that turns by `angle` about `axis`, in double precision."""
-    return rotation(angle * torch.eye(3, dtype=torch.float64)[axis])

@@ -16,7 +16,7 @@ import click
 
 from ddrecon.engine import CHOICES
 from ddrecon.errors import DataWarning, DdreconError
-from ddrecon.interrupts import INTERRUPTED, interruptible
+from ddrecon.interrupts import INTERRUPTED, interrupt, on_interrupt
 
 DEBUG = click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 OVERRIDES = click.option(
@@ -91,7 +91,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
         for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         try:
-            with interruptible():
+            with on_interrupt(interrupt):
                 _run(command, **options)
         except DdreconError as error:
             from ddrecon.ranks import tell_failure
@@ -122,13 +122,13 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
 
 def _run(command: Callable[..., None], **options: Any) -> None:
     """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
-    from ddrecon.cli.session import Session, show_compilations
+    from ddrecon.cli.session import Session
     from ddrecon.io.files.folders import require_folder_of
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = {field.name for field in fields(Session)} & options.keys()
     session = Session(**{name: options.pop(name) for name in common})
-    with show_warnings(), show_compilations(session.quiet):
+    with show_warnings():
         if session.report is not None:
             require_folder_of(session.report)
         if "RANK" in os.environ:  # ranks meet before one of them fails, so that it is told once

@@ -10,8 +10,7 @@ import click
 
 from ddrecon import __version__
 from ddrecon.cli.file_commands import export, info
-from ddrecon.cli.scene_commands import check, optimize, render, watch
-from ddrecon.cli.uncertainty import uncertainty
+from ddrecon.cli.scene_commands import check, optimize, render, uncertainty, watch
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError

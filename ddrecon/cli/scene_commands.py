@@ -1,4 +1,4 @@
-"""Commands of scenes and runs: check, render, optimize, watch.
+"""Commands of scenes and runs: check, render, optimize, uncertainty, watch.
 
 torch is imported inside the commands, after their scene is read: help, and what is wrong with a
 scene file, are shown at once.
@@ -13,9 +13,13 @@ from typing import TYPE_CHECKING
 import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
+from ddrecon.errors import UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+
+SAMPLES = 16
+"""Of the posterior, unless another number is asked for."""
 
 
 @click.command()
@@ -84,7 +88,7 @@ def render(
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
     if lights:
-        session = session.with_overrides(f"lights=[{', '.join(lights)}]")
+        session = session.with_override(f"lights=[{', '.join(lights)}]")
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -154,19 +158,20 @@ def optimize(
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
     if iterations is not None:
-        session = session.with_overrides(f"optimize.iterations={iterations}")
+        session = session.with_override(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    from ddrecon.cli.uncertainty import add_uncertainty, follow_added
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
+    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
+    from ddrecon.uncertainty.folder import uncertainty_lines
 
     built, environment = session.build(scene_file), session.environment()
     require_sharing(built)
     if not is_first():
         run = follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         if has_uncertainty:
-            follow_added(run)
+            follow_uncertainty(run, SAMPLES, Request(run.seed))
         return
     choice = {"may_exist": overwrite, "resume": resume}
     with open_run(built, scene_file, output, environment, **choice) as (run, folder):
@@ -174,9 +179,93 @@ def optimize(
         summary = drive_run(run, folder, preview_every, session.is_quiet, is_last)
         lines = summary_lines(summary, output)
         if has_uncertainty:
-            record, more = add_uncertainty(run, output, session.is_quiet)
-            summary, lines = summary | {"uncertainty": record}, [*lines, *more]
+            sure = output / "uncertainty"
+            sure.mkdir(exist_ok=True)
+            choice = {"has_samples": False, "resume": False, "is_quiet": session.is_quiet}
+            record = drive_uncertainty(run, sure, SAMPLES, Request(run.seed), **choice)
+            lines += uncertainty_lines(record, sure)
+            summary |= {"uncertainty": record}
     session.show(summary, lines)
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    default=SAMPLES,
+    show_default=True,
+    metavar="N",
+    help="Samples of the posterior in all, also after --resume.",
+)
+@click.option(
+    "--noise",
+    "read",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="X",
+    help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
+    "reconstruction leaves.",
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, max=1, min_open=True),
+    help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
+)
+@click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
+@click.option(
+    "--next-view",
+    type=click.Choice(["ring", "lights"]),
+    help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
+    "(ring), or in directional lights that are (lights).",
+)
+@click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
+@REPORT
+@in_session
+def uncertainty(
+    session: Session,
+    run: Path,
+    output: Path,
+    overwrite: bool,
+    samples: int,
+    read: float | None,
+    tolerance: float | None,
+    has_samples: bool,
+    next_view: str | None,
+    resume: bool,
+) -> None:
+    """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
+    they do not.
+    """
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.pictures.noise import Noise
+    from ddrecon.ranks import is_first
+    from ddrecon.run.run_folder import load_run
+    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
+    from ddrecon.uncertainty.folder import uncertainty_lines
+    from ddrecon.uncertainty.next_view import FEWEST
+
+    if next_view and samples < FEWEST:
+        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
+    if output.resolve() == run.resolve():
+        raise click.UsageError("-o names the run itself; name another folder")
+
+    taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
+    if taken.stage + 1 < len(taken.problem.factors):
+        raise UsageError(
+            f"{run}: the run stopped before its last resolution; finish it with "
+            "`ddrecon optimize --resume`"
+        )
+    noise = None if read is None else Noise(read, 0.0)
+    request = Request(session.seed, noise, tolerance, next_view)
+    if not is_first():
+        follow_uncertainty(taken, samples, request)
+        return
+    with claim_folder(output, may_exist=overwrite or resume):
+        choice = {"has_samples": has_samples, "resume": resume, "is_quiet": session.is_quiet}
+        record = drive_uncertainty(taken, output, samples, request, **choice)
+    session.show(record, uncertainty_lines(record, output))
 
 
 @click.command()

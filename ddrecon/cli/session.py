@@ -8,8 +8,7 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,9 +73,20 @@ class Session:
             )
         has_gpu = has_gpu and self.device != "cpu"
         join_ranks(has_gpu, self.share == "cells")
+        log = logging.getLogger(LOG)
+        log.handlers = [_AboveBars()]
+        log.setLevel(logging.WARNING if self.is_quiet else logging.INFO)
         use_engine(self.engine or current_engine())
-        place = torch.device("cuda" if has_gpu else "cpu")
-        self.place = _own_gpu() if has_gpu and rank_count() > 1 else place
+        self.place = torch.device("cuda" if has_gpu else "cpu")
+        if has_gpu and rank_count() > 1:
+            own, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
+            if own >= count:
+                raise UsageError(
+                    f"--nproc-per-node: {own + 1} processes or more, but torch sees {count} GPU "
+                    "here; start one for each, or say --device cpu"
+                )
+            torch.cuda.set_device(own)
+            self.place = torch.device("cuda", own)
         cores = max(1, (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
         usual = torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else cores
         self.threads = self.threads or usual
@@ -90,13 +100,18 @@ class Session:
         """Whether no progress is shown; of several ranks the first alone shows it."""
         return self.quiet or not is_first()
 
-    def with_overrides(self, *overrides: str) -> Session:
-        """The same session with more overrides of the scene file."""
-        return replace(self, overrides=self.overrides + overrides)
+    def with_override(self, override: str) -> Session:
+        """The same session with one more override of the scene file."""
+        return replace(self, overrides=(*self.overrides, override))
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
-        return read_scene(result_in(path) if os.path.isdir(path) else path, self.overrides)
+        if os.path.isdir(path) and not (path / RESULT).is_file():
+            raise UsageError(
+                f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; "
+                "name a scene file, or finish the run with --resume"
+            )
+        return read_scene(path / RESULT if os.path.isdir(path) else path, self.overrides)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.
@@ -155,50 +170,8 @@ class Session:
         }
 
 
-def result_in(folder: Path) -> Path:
-    """The scene file that a run leaves in its `folder` at its end.
+class _AboveBars(logging.Handler):
+    """What the engine logs, that it compiles kernels, as lines above the progress bar."""
 
-    Raises UsageError where there is none.
-    """
-    path = folder / RESULT
-    if not path.is_file():
-        raise UsageError(
-            f"{folder}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; "
-            "name a scene file, or finish the run with --resume"
-        )
-    return path
-
-
-def _own_gpu() -> torch.device:
-    """The GPU of this rank, by its place on its machine; raises UsageError without one."""
-    import torch
-
-    place, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
-    if place >= count:
-        raise UsageError(
-            f"--nproc-per-node: {place + 1} processes or more, but torch sees {count} GPU here; "
-            "start one for each, or say --device cpu"
-        )
-    torch.cuda.set_device(place)
-    return torch.device("cuda", place)
-
-
-@contextmanager
-def show_compilations(is_quiet: bool) -> Iterator[None]:
-    """What the engine logs, that it compiles kernels, becomes lines on stderr, unless quiet.
-
-    They stand above the progress bar that may be there.
-    """
-
-    def show(record: logging.LogRecord) -> bool:
-        if is_first():
-            tqdm.write(record.getMessage(), file=sys.stderr)
-        return False
-
-    log = logging.getLogger(LOG)
-    log.setLevel(logging.WARNING if is_quiet else logging.INFO)
-    log.addFilter(show)
-    try:
-        yield
-    finally:
-        log.removeFilter(show)
+    def emit(self, record: logging.LogRecord) -> None:
+        tqdm.write(record.getMessage(), file=sys.stderr)

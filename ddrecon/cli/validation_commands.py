@@ -135,10 +135,18 @@ def bench(
     from ddrecon.io.files.folders import claim_folder
 
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
-        if is_hard:
-            _bench_hard(session, output)
-        else:
+        if not is_hard:
             _bench_speed(session, scene_file, is_quick, output)
+            return
+        from ddrecon.io.files.atomic import write_json
+        from ddrecon.validate.hard import describe, run_cases, table
+
+        results = run_cases(session.start(), session.progress)
+        if output is not None:
+            write_json(output / "hard.json", describe(results))
+        session.show(describe(results), table(results))
+        if any(result.failures() for result in results):
+            sys.exit(1)
 
 
 def _bench_speed(
@@ -169,16 +177,3 @@ def _bench_speed(
         except MissingExtraError as error:
             written = [f"{written[0]}, without a plot: {error}"]
     session.show(measured, [*bench_lines(rows), *written])
-
-
-def _bench_hard(session: Session, output: Path | None) -> None:
-    """Runs the hard cases, writes their table where asked for, and exits with 1 if any fails."""
-    from ddrecon.io.files.atomic import write_json
-    from ddrecon.validate.hard import describe, run_cases, table
-
-    results = run_cases(session.start(), session.progress)
-    if output is not None:
-        write_json(output / "hard.json", describe(results))
-    session.show(describe(results), table(results))
-    if any(result.failures() for result in results):
-        sys.exit(1)

@@ -67,10 +67,8 @@ def _summarize(values: np.ndarray, is_gray: bool) -> dict[str, float]:
 def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     if "pixels" in report:
-        colors = _colors(report) + (", with alpha" if report["has_alpha"] else "")
-        return [
-            f"image: {_sizes(report['pixels'])} pixels, {colors}, linear radiance {_values(report)}"
-        ]
+        about = "with alpha, " * report["has_alpha"] + "linear radiance "
+        return [f"image: {_sizes(report['pixels'])} pixels, {_values(report, about)}"]
     if not report["fields"]:
         return ["no fields"]
     box = ", no box: the scene's volume.bounds will be taken"
@@ -80,7 +78,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         box = f" of {_sizes(sides)} u, from {low} to {high}"
     return [
         f"cells: {_sizes(report['resolution'])} (x, y, z){box}",
-        *(f"{name}: {_colors(each)}, {_values(each)}" for name, each in report["fields"].items()),
+        *(f"{name}: {_values(each)}" for name, each in report["fields"].items()),
         *(
             f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
             for name, value in report.get("constants", {}).items()
@@ -88,14 +86,11 @@ def lines(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _colors(report: dict[str, Any]) -> str:
-    return "gray" if report["colors"] == 1 else "RGB"
-
-
-def _values(report: dict[str, Any]) -> str:
+def _values(report: dict[str, Any], about: str = "") -> str:
+    """Whether values have colors, what else there is to say `about` them, and their range."""
     return (
-        f"{report['min']:.4g} to {report['max']:.4g}, mean {report['mean']:.4g}, "
-        f"not 0 in {100 * report['filled']:.3g} %"
+        f"{'gray' if report['colors'] == 1 else 'RGB'}, {about}{report['min']:.4g} to "
+        f"{report['max']:.4g}, mean {report['mean']:.4g}, not 0 in {100 * report['filled']:.3g} %"
     )
 
 

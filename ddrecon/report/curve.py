@@ -6,7 +6,7 @@ matplotlib is an extra and takes seconds to start; a report is written after eve
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 
 Point = tuple[float, float]
@@ -28,42 +28,52 @@ def draw_curve(
     that are not finite are left out.
     """
     # What is drawn: thinned, and by its logarithm where asked for.
-    drawn = {name: _drawable(points, is_logarithmic) for name, points in series.items()}
-    drawn = {name: points for name, points in drawn.items() if points}
+    drawn = dict[str, list[Point]]()
+    for name, points in series.items():
+        kept = [(x, y) for x, y in points if math.isfinite(y)]
+        if is_logarithmic:
+            kept = [(x, math.log10(y)) for x, y in kept if y > 0]
+        if kept:
+            drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST)], kept[-1]]
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
     ys = [y for points in drawn.values() for _, y in points] or [0.0]
-    horizontal = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT)
-    vertical = _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
+    left, right, across_at = _axis(xs, LEFT, WIDTH - RIGHT)
+    low, high, up_at = _axis(ys, HEIGHT - BOTTOM, TOP)
     parts = [_text(LEFT, 16, title, "start")]
     # A line across for every round value of y, a number below for every one of x.
-    for value in (logarithmic_ticks if is_logarithmic else ticks)(vertical.low, vertical.high):
-        y, label = vertical.place(value), f"{10**value if is_logarithmic else value:.4g}"
+    for value in (logarithmic_ticks if is_logarithmic else ticks)(low, high):
+        y, label = up_at(value), f"{10**value if is_logarithmic else value:.4g}"
         parts.append(_line(y, 0.2))
         parts.append(_text(LEFT - 6, y + 4, label, "end"))
-    for value in ticks(horizontal.low, horizontal.high):
-        parts.append(_text(horizontal.place(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
+    for value in ticks(left, right):
+        parts.append(_text(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
     parts.append(_line(HEIGHT - BOTTOM, 0.7))
     parts.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
     # The curves, and their names in the legend.
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
-        parts.append(_path([(horizontal.place(x), vertical.place(y)) for x, y in points], color))
+        places = [(across_at(x), up_at(y)) for x, y in points]
+        # A line of one point goes from there to there.
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in (places if places[1:] else 2 * places))
+        style = f'fill="none" stroke="{color}" stroke-width="1.8" stroke-linecap="round"'
+        parts.append(f'<polyline points="{line}" {style}/>')
         end = WIDTH - RIGHT - LEGEND * (len(drawn) - 1 - index)
         parts.append(_text(end, 16, name, "end", color=color))
     label = f'role="img" aria-label="{escape(title)}"'
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(parts)}</svg>'
 
 
-class _Axis:
-    """Values from `low` to `high` at places from `first` to `last`."""
+def _axis(
+    values: Sequence[float], first: float, last: float
+) -> tuple[float, float, Callable[[float], float]]:
+    """The least and the greatest of `values`, and where on an axis from `first` to `last` each is.
 
-    def __init__(self, low: float, high: float, first: float, last: float):
-        # A range of one value is widened, so that it has a middle and ticks.
-        more = max(0.0, 1e-9 * max(abs(low), abs(high), 1e-3) - (high - low) / 2)
-        self.low, self.high, self.first, self.last = low - more, high + more, first, last
-
-    def place(self, value: float) -> float:
-        return self.first + (value - self.low) / (self.high - self.low) * (self.last - self.first)
+    A range of one value is widened, so that it has a middle and ticks.
+    """
+    low, high = min(values), max(values)
+    more = max(0.0, 1e-9 * max(abs(low), abs(high), 1e-3) - (high - low) / 2)
+    low, high = low - more, high + more
+    return low, high, lambda value: first + (value - low) / (high - low) * (last - first)
 
 
 def ticks(low: float, high: float) -> list[float]:
@@ -87,25 +97,6 @@ def logarithmic_ticks(low: float, high: float) -> list[float]:
     values = [decade + math.log10(factor) for decade in decades[::every] for factor in factors]
     inside = [value for value in values if low - 1e-9 <= value <= high + 1e-9]
     return inside or ticks(low, high)
-
-
-def _drawable(points: Sequence[Point], is_logarithmic: bool) -> list[Point]:
-    """Those of `points` that are finite, and if `is_logarithmic` log10 of their y > 0.
-
-    Of more than `MOST` every so many, and the last.
-    """
-    kept = [(x, y) for x, y in points if math.isfinite(y)]
-    if is_logarithmic:
-        kept = [(x, math.log10(y)) for x, y in kept if y > 0]
-    return [*kept[: len(kept) - 1 : max(1, len(kept) // MOST)], *kept[-1:]]
-
-
-def _path(places: Sequence[Point], color: str) -> str:
-    if len(places) == 1:
-        ((x, y),) = places
-        return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{color}"/>'
-    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-    return f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="1.8"/>'
 
 
 def _line(y: float, opacity: float) -> str:

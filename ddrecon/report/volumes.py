@@ -66,7 +66,14 @@ def volume_viewer(
         "</label>"
         for name, label, low, high, step in CONTROLS
     )
-    slices = "".join(_slice(axis, label) for axis, label in enumerate("xyz"))
+    slices = "".join(
+        f'<figure class="slice" data-axis="{axis}"><div class="both">'
+        f'<canvas data-of="result" role="img" aria-label="result, cut across {label}"></canvas>'
+        f'<canvas data-of="truth" role="img" aria-label="truth, cut across {label}"></canvas>'
+        '</div><input type="range" min="0" max="1" step="any" value="0.5"'
+        f' aria-label="place along {label}"><figcaption><output></output></figcaption></figure>'
+        for axis, label in enumerate("xyz")
+    )
     return "\n".join(
         [
             f'<div class="still">{still}</div>',
@@ -79,25 +86,15 @@ def volume_viewer(
     )
 
 
-def _slice(axis: int, label: str) -> str:
-    canvases = "".join(
-        f'<canvas data-of="{of}" role="img" aria-label="{of}, cut across {label}"></canvas>'
-        for of in ("result", "truth")
-    )
-    slider = (
-        '<input type="range" min="0" max="1" step="any" value="0.5"'
-        f' aria-label="place along {label}">'
-    )
-    return (
-        f'<figure class="slice" data-axis="{axis}"><div class="both">{canvases}</div>{slider}'
-        "<figcaption><output></output></figcaption></figure>"
-    )
-
-
 def _data(field: Shown) -> str:
-    """`field` for the scripts: as it is displayed, in 8 bits, x fastest."""
-    values = field.values.detach()
-    values = _coarsen(values if values.ndim == 4 else values[None])
+    """`field` for the scripts: as it is displayed, in 8 bits, x fastest.
+
+    Of more than about `MOST_CELLS` cells there are means of blocks.
+    """
+    values = field.values.detach().float()
+    values = values if values.ndim == 4 else values[None]
+    factor = math.ceil((values[0].numel() / MOST_CELLS) ** (1 / 3))
+    values = avg_pool3d(values, factor, ceil_mode=True, count_include_pad=False)
     cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
     if cells.min() < 0:
         cells = diverge(cells.mean(-1))
@@ -113,9 +110,3 @@ def _data(field: Shown) -> str:
         "data": base64.b64encode(packed).decode("ascii"),
     }
     return f'<script type="application/json" class="field">{json.dumps(content)}</script>'
-
-
-def _coarsen(values: Tensor) -> Tensor:
-    """`values` [C, z, y, x] with at most about `MOST_CELLS` cells, means of blocks of them."""
-    factor = math.ceil((values[0].numel() / MOST_CELLS) ** (1 / 3))
-    return avg_pool3d(values.float(), factor, ceil_mode=True, count_include_pad=False)

@@ -15,8 +15,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.extras import advice
-from ddrecon.io.images.movies import encode_frames, write_animation
-from ddrecon.io.images.table import PREVIEW, read_image, write_picture
+from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_over_ranks
@@ -88,7 +87,7 @@ def write_ring(views: list[View], folder: Path) -> dict[str, Any]:
     """What the report says of the movie `ring.png` of all `views` in `folder`."""
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
-    write_animation(folder / "ring.png", encode_frames(images, white))
+    write_animation(folder / "ring.png", images, white)
     return {"files": ["ring.png"], "white": white}
 
 

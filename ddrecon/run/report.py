@@ -14,8 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.engine import name_engines
-from ddrecon.io.images.movies import webp_of
-from ddrecon.io.images.table import png_of
+from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 import os
-import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ddrecon.errors import DataWarning, FormatError, UsageError
-from ddrecon.grid import Triple
 from ddrecon.io.images.table import read_image
-from ddrecon.io.volumes.table import read_field
 from ddrecon.layer import DTYPES
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps, greatest_depth
@@ -30,10 +25,9 @@ from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, make_room, needs_of
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
-from ddrecon.scene_file.build_volume import build_media
+from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
 from ddrecon.scene_file.problems import Problems, suggestion
-from ddrecon.scene_file.read import type_hints
 from ddrecon.scene_file.schema import (
     AmbientSection,
     Color,
@@ -43,7 +37,7 @@ from ddrecon.scene_file.schema import (
     SceneTree,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
-from ddrecon.variables.kinds import PAIRS, PHASE, kind_of, split_name
+from ddrecon.variables.kinds import PHASE, kind_of, split_name
 from ddrecon.variables.values import component_names, name_each, value_of, variable_names
 
 MORE_ROUNDS = 0.3, 0.6
@@ -88,8 +82,7 @@ def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
     """The scene of a file that was read, as tensors; `load_scene` says what is raised."""
-    place, tree, problems = torch.device(device), share_colors(scene_file.tree), Problems()
-    scene_file = replace(scene_file, tree=tree)
+    place, tree, problems = torch.device(device), scene_file.tree, Problems()
     media, grid = dict[str, Volume](), None
     with problems.collecting():
         media = build_media(scene_file, dtype, place)
@@ -138,19 +131,20 @@ def _build_light(
     def tensor(value: Color) -> Tensor:
         return torch.tensor(value, dtype=dtype, device=device)
 
-    def color(value: Color) -> Tensor:
+    def color(name: str) -> Tensor:
         """[1] or [3]"""
-        return tensor(value).view(-1)
+        value = getattr(section, name)
+        return tensor(scene_file.tree.share_color(f"lights.{index}.{name}", value)).view(-1)
 
     if isinstance(section, DirectionalSection):
-        return DirectionalLight(tensor(section.direction), color(section.irradiance))
+        return DirectionalLight(tensor(section.direction), color("irradiance"))
     if isinstance(section, AmbientSection):
-        return AmbientLight(color(section.radiance))
+        return AmbientLight(color("radiance"))
     if isinstance(section, PointSection):
-        return PointLight(tensor(section.position), color(section.intensity))
+        return PointLight(tensor(section.position), color("intensity"))
     pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
     is_gray = bool((pixels == pixels[..., :1]).all())
-    if is_gray and not may_change(scene_file.tree, f"lights.{index}.radiance"):
+    if is_gray and not scene_file.tree.may_change(f"lights.{index}.radiance"):
         pixels = pixels[..., :1]
     radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
     numbers = tensor(section.scale), tensor(section.rotation)
@@ -253,50 +247,6 @@ def choose_rounds(
     )
 
 
-def share_colors(tree: SceneTree) -> SceneTree:
-    """`tree` with one number for each color whose three are equal, but for what is optimized."""
-    return replace(
-        tree,
-        volume=_share(tree, tree.volume, ""),
-        lights=_share(tree, tree.lights, "lights."),
-        views=tuple(_share(tree, view, f"views.{view.name}.") for view in tree.views),
-    )
-
-
-def may_change(tree: SceneTree, name: str) -> bool:
-    """Whether the variable `name` is optimized, or follows from others that are."""
-    medium, last = split_name(name)
-    names = {name, medium + last.removeprefix(PHASE), re.sub(r"^views\..*\.", "views.*.", name)}
-    others = [pair for pair in PAIRS if last not in pair]
-    if len(others) == 1:
-        names |= {medium + other for other in others[0]}
-    return not names.isdisjoint(tree.optimize.parameters if tree.optimize else ())
-
-
-def _share(tree: SceneTree, value: Any, owner: str) -> Any:
-    """`value` of `tree`, names in which begin with `owner`, with equal colors as one number."""
-    if isinstance(value, Mapping):
-        return {name: _share(tree, one, f"{owner}{name}.") for name, one in value.items()}
-    if isinstance(value, tuple):
-        return tuple(_share(tree, one, f"{owner}{index}.") for index, one in enumerate(value))
-    if not is_dataclass(value) or isinstance(value, type):
-        return value
-    shared = {}
-    for field in fields(value):
-        one, name = getattr(value, field.name), owner + field.name
-        is_color = isinstance(one, tuple) and field.name in _colors_of(type(value))
-        is_equal = is_color and len(set(one)) == 1 and not may_change(tree, name)
-        shared[field.name] = one[0] if is_equal else _share(tree, one, f"{name}.")
-    return replace(value, **shared)
-
-
-@functools.cache
-def _colors_of(kind: type) -> set[str]:
-    """The fields of records of this `kind` that are a number or three."""
-    hints = type_hints(kind).items()
-    return {name for name, hint in hints if {float, Triple} <= set(get_args(hint))}
-
-
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
     """The value from which the parameter `name` of `scene` starts."""
     key = f"optimize.parameters.{name}"
@@ -308,7 +258,13 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         ) from None
     kind = kind_of(name)
     if isinstance(settings.init, FieldFile):
-        value = _read_cells(scene_file, f"{key}.init.file", name, settings.init, value)
+        if not kind.is_cellwise:
+            raise scene_file.refused(f"{key}.init.file", f"{name} is not a field: give its numbers")
+        called = settings.init.name or split_name(name)[1].removeprefix(PHASE)
+        read = partial(read_quantity, name=name, called=called)
+        field = read_referenced(scene_file, f"{key}.init.file", settings.init.file, read)
+        cells = cells_of(field).to(value)
+        value = cells if kind.is_color else cells[0]
     elif settings.init is not None:
         value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
@@ -318,25 +274,6 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
             f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
         )
     return value
-
-
-def _read_cells(
-    scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
-) -> Tensor:
-    """The file's values per cell, [C, z, y, x] or, where there are no colors, [z, y, x]."""
-    kind = kind_of(name)
-    if not kind.is_cellwise:
-        raise scene_file.refused(key, f"{name} is not a field: give its numbers")
-    read = partial(read_field, name=init.name or split_name(name)[1].removeprefix(PHASE))
-    field = torch.from_numpy(read_referenced(scene_file, key, init.file, read).values).to(value)
-    if field.ndim == 4 and not kind.is_color:
-        raise scene_file.refused(
-            key,
-            f"{name} has no colors, but the file has {list(field.shape)} values [z, y, x, color]",
-        )
-    if not kind.is_color:
-        return field
-    return field.permute(3, 0, 1, 2) if field.ndim == 4 else field[None]
 
 
 def _fill(

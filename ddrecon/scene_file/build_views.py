@@ -25,7 +25,7 @@ from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
 READERS: Mapping[str, Callable[[Path], Image]] = {
     "image": read_image,
     "background": read_image,
-    "mask": lambda path: Image(read_mask(path)[..., None]),
+    "mask": read_mask,
 }
 """What reads the pictures of a view, by their keys."""
 LATTICE = 33
@@ -85,14 +85,13 @@ def _build_view(
             _require_unfolded(scene_file, f"{key}.camera", camera)
     problems.raise_any()
 
-    def color(value: Color, default: float) -> Tensor | None:
-        """[1] or [3], None where it is the default."""
-        tensor = torch.tensor(value, dtype=dtype, device=device).view(-1)
-        return None if value == default else tensor
+    def color(value: Color) -> Tensor:
+        """[1] or [3]"""
+        return torch.tensor(value, dtype=dtype, device=device).view(-1)
 
     background = pictures.get("background")
     if background is None and isinstance(section.background, float | tuple):
-        background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
+        background = color(section.background).view(-1, 1, 1)
     lens = camera.distortion
     return View(
         section.name,
@@ -105,8 +104,8 @@ def _build_view(
         pictures["mask"][0] if "mask" in pictures else None,
         section.split == "test",
         section.weight,
-        color(section.exposure, 1.0),
-        color(section.offset, 0.0),
+        None if section.exposure == 1 else color(section.exposure),
+        None if section.offset == 0 else color(section.offset),
         background,
         step,
         None if section.noise is None else Noise(section.noise.read, section.noise.shot, step),

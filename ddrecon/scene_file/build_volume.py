@@ -30,6 +30,7 @@ from ddrecon.scene_file.schema import (
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
+    SceneTree,
     TableSection,
     TwoLobeSection,
 )
@@ -53,9 +54,10 @@ def build_media(
     """
     media, problems = dict[str, _Medium](), Problems()
     for name, section in scene_file.tree.media.items():
-        key = f"volume.media.{name}" if name else "volume"
+        prefix = f"media.{name}." if name else ""
         with problems.collecting():
-            media[name] = _Medium(key, section, _read_fields(scene_file, key, section))
+            fields = _read_fields(scene_file, prefix, section)
+            media[name] = _Medium(scene_file.tree, prefix, section, fields)
     problems.raise_any()
     grid = _agree_on_grid(
         scene_file, dict(at for each in media.values() for at in each.fields.values())
@@ -68,21 +70,22 @@ def build_media(
 
 @dataclass(frozen=True)
 class _Medium:
-    """What the scene says at `key` of a medium.
+    """What the scene `tree` says of a medium, names in which begin with `prefix`.
 
     `fields` are those of its files by variable, and where the scene names them.
     """
 
-    key: str
+    tree: SceneTree
+    prefix: str
     section: MediumSection
     fields: Mapping[str, tuple[str, Field]]
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
         if name in self.fields:
-            values = torch.from_numpy(self.fields[name][1].values).double()
-            return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
-        return torch.tensor(getattr(self.section, name), dtype=torch.float64).view(-1)
+            return cells_of(self.fields[name][1]).double()
+        value = self.tree.share_color(self.prefix + name, getattr(self.section, name))
+        return torch.tensor(value, dtype=torch.float64).view(-1)
 
     def build(
         self, grid: Grid, phase: PhaseFunction, dtype: torch.dtype, device: torch.device
@@ -102,9 +105,9 @@ class _Medium:
 
 
 def _read_fields(
-    scene_file: SceneFile, key: str, section: MediumSection
+    scene_file: SceneFile, prefix: str, section: MediumSection
 ) -> dict[str, tuple[str, Field]]:
-    """The quantities at `key` that files give cell by cell, by variable; and where it says so."""
+    """The quantities that files give cell by cell, by variable; and where the scene says so."""
     given = {name: (name, getattr(section, name)) for name in FIELDS if hasattr(section, name)}
     if isinstance(section.phase, HenyeyGreensteinSection):
         given["g"] = "phase.g", section.phase.g
@@ -114,16 +117,22 @@ def _read_fields(
     for variable, (name, value) in given.items():
         if isinstance(value, FieldFile):
             called = value.name or variable.removeprefix(PHASE)
-            read = partial(_read_quantity, name=variable, called=called)
+            read = partial(read_quantity, name=variable, called=called)
             with problems.collecting():
-                at = f"{key}.{name}.file"
+                at = f"volume.{prefix}{name}.file"
                 found[variable] = at, read_referenced(scene_file, at, value.file, read)
     problems.raise_any()
     return found
 
 
-def _read_quantity(path: Path, name: str, called: str) -> Field:
-    """The quantity `name`, which the file has as `called`."""
+def cells_of(field: Field) -> Tensor:
+    """The values [C, z, y, x] of `field`."""
+    values = torch.from_numpy(field.values)
+    return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
+
+
+def read_quantity(path: Path, name: str, called: str) -> Field:
+    """The quantity `name`, which the file has as `called`; raises FormatError."""
     field, kind = read_field(path, called), kind_of(name)
     if not kind.is_color and field.values.ndim != 3:
         raise FormatError(
@@ -182,34 +191,36 @@ def _show(value: np.ndarray) -> str:
 def _build_phase(
     scene_file: SceneFile, medium: _Medium, dtype: torch.dtype, device: torch.device
 ) -> PhaseFunction:
-    """The phase function of `medium` in `dtype` on `device`.
+    """The phase function of `medium`; MissingExtraError for droplets without miepython."""
 
-    Raises SceneError, FormatError, or MissingExtraError for droplets without miepython.
-    """
-
-    def tensor(value: Any) -> Tensor:
+    def tensor(value: Any, name: str = "") -> Tensor:
         if isinstance(value, FieldFile):
             name = next(name for name in BY_ANGLE if name in medium.fields)
             return medium.values(name).to(device, dtype)
+        value = medium.tree.share_color(f"{medium.prefix}{name}", value)
         return torch.as_tensor(value, dtype=dtype, device=device)
 
     match section := medium.section.phase:
         case None:
             return HenyeyGreenstein(tensor(medium.section.g))
         case HenyeyGreensteinSection():
-            return HenyeyGreenstein(tensor(section.g))
+            return HenyeyGreenstein(tensor(section.g, "g"))
         case TwoLobeSection():
-            return TwoLobe(tensor(section.g), tensor(section.weight))
+            return TwoLobe(tensor(section.g), tensor(section.weight, "phase.weight"))
         case TableSection():
-            return Tabulated(tensor(_table(scene_file, section, f"{medium.key}.phase")))
+            key = f"volume.{medium.prefix}phase.file"
+            return Tabulated(tensor(_table(scene_file, section, key)))
         case MieSection():
-            return Tabulated(tensor(_droplets(section)))
+            colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
+            sizes = section.effective_radius, section.effective_variance
+            values = [scatter_droplets(float(length), float(n), *sizes) for length, n in colors]
+            return Tabulated(tensor(np.stack(values)))
     return Rayleigh(tensor(0.0))
 
 
 def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:
     """Values at even angles, [C, steps + 1]."""
-    read = read_referenced(scene_file, f"{key}.file", section.file, read_phase_table)
+    read = read_referenced(scene_file, key, section.file, read_phase_table)
     values = torch.from_numpy(at_even_angles(*read))
     means = Tabulated(values).mean
     if bool(((means - 1).abs() > FAR_OFF).any()):
@@ -217,11 +228,3 @@ def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:
         what = f"its mean over the sphere is {found}; it is divided by that"
         warnings.warn(f"{section.file}: {what}", DataWarning, 4)
     return values
-
-
-def _droplets(section: MieSection) -> Tensor:
-    """Values at even angles of each color, [C, steps + 1]."""
-    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
-    sizes = section.effective_radius, section.effective_variance
-    values = [scatter_droplets(float(length), float(n), *sizes) for length, n in colors]
-    return torch.from_numpy(np.stack(values))

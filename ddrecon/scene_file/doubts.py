@@ -8,8 +8,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera
-from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import extinction_of, with_values
@@ -83,28 +81,19 @@ def _doubt_faces(volume: Volume, extinction: Tensor, angles: int) -> list[str]:
 
 
 def _doubt_cameras(scene: Scene) -> list[str]:
-    grid, lines = scene.volume.grid, []
-    for what, is_doubted in (
-        ("within the box, not outside of it:", _is_inside),
-        ("the box is smaller than a pixel or two to", _is_far),
-    ):
-        if names := [view.name for view in scene.views if is_doubted(view.camera, grid)]:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            lines.append(f"views: {what} camera {names[0]}{more}; {UNITS}")
-    return lines
-
-
-def _is_inside(camera: Camera, grid: Grid) -> bool:
-    low, high = (camera.pose.new_tensor(corner) for corner in grid.bounds_xyz)
-    place = camera.pose[:, 3]
-    return camera.is_perspective and bool(((low < place) & (place < high)).all())
-
-
-def _is_far(camera: Camera, grid: Grid) -> bool:
-    """Whether the diagonal of the box, seen from the side, takes hardly any pixels of `camera`."""
-    low, high = (camera.pose.new_tensor(corner).double() for corner in grid.bounds_xyz)
-    distance = 1.0
-    if camera.is_perspective:
-        distance = float(torch.dist((low + high) / 2, camera.pose[:, 3].double()))
-    width = 2 * float(camera.half_width) * distance
-    return float(torch.dist(low, high)) * camera.size[1] < SMALLEST * width
+    doubted: dict[str, list[str]] = {}
+    for view in scene.views:
+        camera, place = view.camera, view.camera.pose[:, 3].double()
+        low, high = (place.new_tensor(corner) for corner in scene.volume.grid.bounds_xyz)
+        distance = float(torch.dist((low + high) / 2, place)) if camera.is_perspective else 1.0
+        # The diagonal of the box, seen from the side, takes hardly any pixels.
+        width = 2 * float(camera.half_width) * distance
+        if float(torch.dist(low, high)) * camera.size[1] < SMALLEST * width:
+            doubted.setdefault("the box is smaller than a pixel or two to", []).append(view.name)
+        if camera.is_perspective and bool(((low < place) & (place < high)).all()):
+            doubted.setdefault("within the box, not outside of it:", []).append(view.name)
+    return [
+        f"views: {what} camera {names[0]}"
+        f"{f' and {len(names) - 1} more' if len(names) > 1 else ''}; {UNITS}"
+        for what, names in doubted.items()
+    ]

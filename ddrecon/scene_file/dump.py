@@ -44,8 +44,11 @@ def write_described(described: dict[str, Any], path: Path) -> None:
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         tag = {"type": value.type} if hasattr(value, "type") else {}
-        left_out = _left_out(value)
         given = {field.name: getattr(value, field.name) for field in fields(value)}
+        # Nor what belongs to an alternative that was not taken.
+        groups = getattr(value, "ALTERNATIVES", ())
+        left_out = {name for group in groups if given[group[0]] is None for name in group}
+        left_out |= {"g"} if given.get("phase") is not None else set()
         return tag | {
             name: _plain(entry)
             for name, entry in given.items()
@@ -58,21 +61,13 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _left_out(record: Any) -> set[str]:
-    """Keys of the alternatives that `record` did not take."""
-    groups = getattr(record, "ALTERNATIVES", ())
-    left_out = {name for group in groups if getattr(record, group[0]) is None for name in group}
-    return left_out | {"g"} if getattr(record, "phase", None) is not None else left_out
-
-
 class _Dumper(yaml.SafeDumper):
     """Quotes text that would be read as something else; PyYAML itself goes by YAML 1.1."""
 
 
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    return dumper.represent_scalar(
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar(
         "tag:yaml.org,2002:str", text, style=None if resolve(text) == text else '"'
-    )
-
-
-_Dumper.add_representer(str, _represent_text)
+    ),
+)

@@ -170,14 +170,11 @@ def _violations(
         yield "support", f"{settings.support!r} is for density alone"
     for key in ("min", "max", "init"):
         value = getattr(settings, key)
-        numbers = [
-            one
-            for one in (value if isinstance(value, tuple) else [value])
-            if isinstance(one, float)
-        ]
-        if beyond := [one for one in numbers if not kind.low <= one <= kind.high]:
-            limits = f"at least {kind.low:g} and at most {kind.high:g}"
-            yield key, f"must be {limits}, found {beyond[0]:g}"
+        for one in value if isinstance(value, tuple) else [value]:
+            if isinstance(one, float) and not kind.low <= one <= kind.high:
+                limits = f"at least {kind.low:g} and at most {kind.high:g}"
+                yield key, f"must be {limits}, found {one:g}"
+                break
     for key in ("field", "tv"):
         if getattr(settings, key) and not kind.is_cellwise:
             yield key, "it is not a field, so it has none"

@@ -6,7 +6,6 @@ of them it is. Records are told apart by their `type`, others by their first key
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
@@ -111,7 +110,7 @@ def read_value(node: Node, rule: Rule) -> Any:
             _check_choice(node, rule.limits.get("choices", ()), rule)
             return node.value
         case int() | float() if float in kinds:
-            if not math.isfinite(node.value) or abs(node.value) > LARGEST:
+            if not -LARGEST <= node.value <= LARGEST:
                 raise node.refused(
                     f"expected a finite number of single precision, found {describe_found(node)}"
                 )

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import mul
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ddrecon.grid import Triple
 from ddrecon.settings import (
@@ -25,11 +25,9 @@ from ddrecon.settings import (
     RenderSettings,
     Violation,
     bounded,
-    limited,
     one_of,
-    optional,
 )
-from ddrecon.variables.kinds import PAIRS, split_name
+from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
 Color = float | Triple
 Count = tuple[int, int, int]
@@ -53,7 +51,7 @@ class HenyeyGreensteinSection:
 
     type: ClassVar[str] = "henyey_greenstein"
 
-    g: Quantity = limited(above=-1, below=1)
+    g: Quantity = bounded(above=-1, below=1)
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,8 @@ class TwoLobeSection:
 
     type: ClassVar[str] = "two_lobe"
 
-    g: Pair = limited(above=-1, below=1)
-    weight: Quantity = limited(minimum=0, maximum=1)
+    g: Pair = bounded(above=-1, below=1)
+    weight: Quantity = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)
@@ -88,20 +86,14 @@ class MieSection:
 
     type: ClassVar[str] = "mie"
 
-    wavelength: Color = limited(above=0, maximum=1e3)
-    refractive_index: Color = limited(above=1, maximum=10)
-    effective_radius: float = limited(above=0, maximum=100)
-    effective_variance: float = limited(above=0, below=0.5)
+    wavelength: Color = bounded(above=0, maximum=1e3)
+    refractive_index: Color = bounded(above=1, maximum=10)
+    effective_radius: float = bounded(above=0, maximum=100)
+    effective_variance: float = bounded(above=0, below=0.5)
 
 
 PartSection = HenyeyGreensteinSection | RayleighSection | TableSection | MieSection
 PhaseSection = PartSection | TwoLobeSection
-GONE = {
-    "draine": "write type: table with its values over the angle, or type: two_lobe",
-    "legendre": "write type: table with the series' values over the angle",
-    "blend": "write two media, volume.media: each has a density and a phase function of its own",
-}
-"""Phase functions of old scene files, and what to write instead."""
 
 
 @dataclass(frozen=True)
@@ -122,13 +114,18 @@ class MediumSection:
     """One of the two media of a mixture; its phase function is the same in all cells."""
 
     ALTERNATIVES: ClassVar = PAIRS
-    RETIRED: ClassVar = GONE
+    RETIRED: ClassVar = {
+        "draine": "write type: table with its values over the angle, or type: two_lobe",
+        "legendre": "write type: table with the series' values over the angle",
+        "blend": "write two media, volume.media: each has a density and a phase function of its "
+        "own",
+    }
 
-    density: Density = limited(minimum=0)
-    sigma_a: Quantity | None = optional(minimum=0)
-    sigma_s: Quantity | None = optional(minimum=0)
-    sigma_t: Quantity | None = optional(minimum=0)
-    albedo: Quantity | None = optional(minimum=0, maximum=1)
+    density: Density = bounded(minimum=0)
+    sigma_a: Quantity | None = bounded(None, minimum=0)
+    sigma_s: Quantity | None = bounded(None, minimum=0)
+    sigma_t: Quantity | None = bounded(None, minimum=0)
+    albedo: Quantity | None = bounded(None, minimum=0, maximum=1)
     g: float = bounded(0.0, above=-1, below=1)
     phase: PartSection | None = None
 
@@ -146,7 +143,7 @@ class VolumeSection(MediumSection):
     g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
     phase: PhaseSection | None = None  # type: ignore[assignment]
     bounds: Bounds | None = None
-    resolution: Count | None = optional(minimum=1, maximum=4096)
+    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
@@ -161,7 +158,7 @@ class MixtureSection:
 
     media: Mapping[str, MediumSection]
     bounds: Bounds | None = None
-    resolution: Count | None = optional(minimum=1, maximum=4096)
+    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
 
     def violations(self) -> Iterator[Violation]:
         if len(self.media) != 2:
@@ -178,7 +175,7 @@ class DirectionalSection:
     type: ClassVar[str] = "directional"
 
     direction: Triple
-    irradiance: Color = limited(minimum=0)
+    irradiance: Color = bounded(minimum=0)
 
     def violations(self) -> Iterator[Violation]:
         if not any(self.direction):
@@ -191,7 +188,7 @@ class AmbientSection:
 
     type: ClassVar[str] = "ambient"
 
-    radiance: Color = limited(minimum=0)
+    radiance: Color = bounded(minimum=0)
 
 
 @dataclass(frozen=True)
@@ -219,7 +216,7 @@ class PointSection:
     type: ClassVar[str] = "point"
 
     position: Triple
-    intensity: Color = limited(minimum=0)
+    intensity: Color = bounded(minimum=0)
 
 
 LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
@@ -239,41 +236,26 @@ class PoseSection:
     target: Triple | None = None
     up: Triple = (0.0, 1.0, 0.0)
     matrix: Matrix | None = None
-    resolution: Size | None = optional(minimum=1, maximum=16384)
+    resolution: Size | None = bounded(None, minimum=1, maximum=16384)
     pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
 
     def violations(self) -> Iterator[Violation]:
-        if self.matrix is not None:
-            yield from _rigidity(self.matrix)
-
-
-def _rigidity(matrix: Matrix) -> Iterator[Violation]:
-    """Why `matrix` is no rotation and shift, where it is not."""
-    *rows, last = matrix
-    x, y, z, _ = zip(*rows, strict=True)
-    lengths = [sum(map(mul, one, one)) for one in (x, y, z)]
-    across = [sum(map(mul, one, other)) for one, other in ((x, y), (y, z), (z, x))]
-    volume = sum(x[i] * (y[i - 2] * z[i - 1] - y[i - 1] * z[i - 2]) for i in range(3))
-    if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:
-        yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif not all(abs(error) <= 1e-4 for error in (*across, *(one - 1 for one in lengths))):
-        yield "matrix", "must be rigid: its first three columns of unit length and perpendicular"
-    elif volume < 0:
-        yield "matrix", "must be rigid, but it mirrors (determinant -1)"
-
-
-@dataclass(frozen=True)
-class OpencvSection:
-    """A lens of OpenCV's model, as COLMAP and nerfstudio have it: see `ddrecon.lenses`."""
-
-    type: ClassVar[str] = "opencv"
-
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
+        if self.matrix is None:
+            return
+        *rows, last = self.matrix
+        x, y, z, _ = zip(*rows, strict=True)
+        lengths = [sum(map(mul, one, one)) for one in (x, y, z)]
+        across = [sum(map(mul, one, other)) for one, other in ((x, y), (y, z), (z, x))]
+        volume = sum(x[i] * (y[i - 2] * z[i - 1] - y[i - 1] * z[i - 2]) for i in range(3))
+        if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:
+            yield "matrix", "its last row must be [0, 0, 0, 1]"
+        elif not all(abs(error) <= 1e-4 for error in (*across, *(one - 1 for one in lengths))):
+            yield (
+                "matrix",
+                "must be rigid: its first three columns of unit length and perpendicular",
+            )
+        elif volume < 0:
+            yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
 @dataclass(frozen=True)
@@ -286,6 +268,16 @@ class FisheyeSection:
     k2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
+
+
+@dataclass(frozen=True)
+class OpencvSection(FisheyeSection):
+    """A lens of OpenCV's model, as COLMAP and nerfstudio have it: see `ddrecon.lenses`."""
+
+    type: ClassVar[str] = "opencv"
+
+    p1: float = 0.0
+    p2: float = 0.0
 
 
 LensSection = OpencvSection | FisheyeSection
@@ -301,7 +293,7 @@ class PerspectiveSection(PoseSection):
 
     type: ClassVar[str] = "perspective"
 
-    fov: float = limited(above=0, below=180)
+    fov: float = bounded(above=0, below=180)
     principal_point: Pair = (0.5, 0.5)
     distortion: LensSection | None = None
 
@@ -312,7 +304,7 @@ class OrthographicSection(PoseSection):
 
     type: ClassVar[str] = "orthographic"
 
-    width: float = limited(above=0)
+    width: float = bounded(above=0)
 
 
 CameraSection = PerspectiveSection | OrthographicSection
@@ -365,13 +357,13 @@ class RingSection:
     The circle is horizontal, `height` above `target`.
     """
 
-    count: int = limited(minimum=1, maximum=10000)
-    radius: float = limited(above=0)
-    fov: float = limited(above=0, below=180)
+    count: int = bounded(minimum=1, maximum=10000)
+    radius: float = bounded(above=0)
+    fov: float = bounded(above=0, below=180)
     height: float = 0.0
     target: Triple = (0.0, 0.0, 0.0)
     up: Triple = (0.0, 1.0, 0.0)
-    resolution: Size | None = optional(minimum=1, maximum=16384)
+    resolution: Size | None = bounded(None, minimum=1, maximum=16384)
 
 
 @dataclass(frozen=True)
@@ -391,7 +383,7 @@ class ViewSource:
     transforms: Paths | None = None
     colmap: Path | None = None
     images: str | None = None
-    test_every: int | None = optional(minimum=2)
+    test_every: int | None = bounded(None, minimum=2)
 
     def violations(self) -> Iterator[Violation]:
         if self.ring is not None and self.images is None and self.ring.resolution is None:
@@ -420,6 +412,23 @@ class SceneTree:
     def media(self) -> Mapping[str, VolumeSection | MediumSection]:
         """The sections of media by name, "" where there is one medium."""
         return {"": self.volume} if isinstance(self.volume, VolumeSection) else self.volume.media
+
+    def may_change(self, name: str) -> bool:
+        """Whether the variable `name` is optimized, or follows from others that are."""
+        medium, last = split_name(name)
+        names = {name, medium + last.removeprefix(PHASE)}
+        others = [pair for pair in PAIRS if last not in pair]
+        if len(others) == 1:
+            names |= {medium + other for other in others[0]}
+        return not names.isdisjoint(self.optimize.parameters if self.optimize else ())
+
+    def share_color(self, name: str, value: Any) -> Any:
+        """One number for the color `value` of the variable `name` if its three are equal.
+
+        Light of one color is then computed once. What is optimized keeps its three.
+        """
+        is_equal = isinstance(value, tuple) and len(value) == 3 and len(set(value)) == 1
+        return value[0] if is_equal and not self.may_change(name) else value
 
     def violations(self) -> Iterator[Violation]:
         for name in self.optimize.parameters if self.optimize else ():

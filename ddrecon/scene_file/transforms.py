@@ -65,7 +65,16 @@ def read_transforms(
     problems, views = Problems(), list[ViewSection]()
     for path in paths:
         with problems.collecting():
-            document = _document(node, path)
+            if not path.is_file():
+                raise node.refused(f"{path} does not exist, or is not a file")
+            with guard_reading(path):
+                if path.stat().st_size > MAX_BYTES:
+                    most = f"{MAX_BYTES // 2**20} MiB"
+                    raise FormatError(path, f"is larger than {most}; it holds more than cameras")
+                try:
+                    document = node_of("", str(path), json.loads(path.read_bytes()))
+                except (ValueError, RecursionError) as error:
+                    raise FormatError(path, f"not JSON: {error}") from error
             with in_file(path):
                 views += _file_views(document, path, test_every)
     problems.raise_any()
@@ -80,25 +89,6 @@ def in_file(path: Path) -> Iterator[None]:
     except SceneError as error:
         first, *others = error.problems
         raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
-
-
-def _document(node: Node, path: Path) -> Node:
-    if not path.is_file():
-        raise node.refused(f"{path} does not exist, or is not a file")
-    with guard_reading(path):
-        if path.stat().st_size > MAX_BYTES:
-            raise FormatError(
-                path, f"is larger than {MAX_BYTES // 2**20} MiB; it holds more than cameras"
-            )
-        try:
-            return node_of("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
-        except (ValueError, RecursionError) as error:
-            raise FormatError(path, f"not JSON: {error}") from error
-
-
-def _whole(digits: str) -> int | float:
-    """A whole number; infinite where no arithmetic could be done with it."""
-    return int(digits) if len(digits) < 300 else float(digits)
 
 
 def node_of(key: str, where: str, value: Any) -> Node:
@@ -142,22 +132,20 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
     lists = {name: root.entries()[name] for name in LISTS if name in root.entries()}
     if not lists:
         return []
-    named = [
-        frame.value.get("file_path") if isinstance(frame.value, dict) else None for frame in frames
-    ]
-    names = [None if one is None else Path(str(one.value)) for one in named]
+    named = [isinstance(frame.value, dict) and frame.value.get("file_path") for frame in frames]
+    paths = [Path(str(one.value)) if one else None for one in named]
     listed = {name: set[Path]() for name in LISTS}
     for name, node in lists.items():
         for entry in node.children():
             path = Path(read_as(entry, str, Path()))
-            if path not in names:
+            if path not in paths:
                 raise entry.refused(f"no frame has the file_path {entry.value!r}")
             listed[name].add(path)
     train, *tests = listed.values()
     splits = list[str | None]()
-    for own in names:
-        is_test = any(own in test for test in tests)
+    for own in paths:
         is_train = own is None or own in train or LISTS[0] not in lists
+        is_test = own is not None and own in set.union(*tests)
         splits.append("test" if is_test else "train" if is_train else None)
     if not any(splits):
         raise root.refused("its lists of files name no frame")
@@ -286,7 +274,7 @@ def export_transforms(
         frames.append(names | _camera(view))
         for name in LISTS[1:] if view.is_test else LISTS[:1]:
             splits[name] += [names["file_path"]] if "file_path" in names else []
-    models = {frame.get("camera_model", "PINHOLE") for frame in frames}
+    models = {frame["camera_model"] for frame in frames}
     model = models.pop() if len(models) == 1 else "PINHOLE"
     lists = splits if any(view.is_test for view in scene.views) else {}
     write_json(path, {"camera_model": model, **lists, "frames": frames})
@@ -302,6 +290,7 @@ def _camera(view: View) -> dict[str, Any]:
     (height, width), (x, y) = camera.size, camera.principal_point
     focal = width / 2 / float(camera.half_width)
     intrinsics: dict[str, Any] = {
+        "camera_model": "PINHOLE",
         "w": width,
         "h": height,
         "fl_x": focal,

@@ -1,15 +1,23 @@
-"""Views that a scene does not list one by one, and the names of all."""
+"""Views that a scene does not list one by one, and the names of all.
+
+A COLMAP model is a folder with `cameras.txt` and `images.txt`, or the same as `.bin`. Its poses are
+world to camera with OpenCV's axes (right, down, forward); its points are of no use and are skipped.
+Source: https://colmap.github.io/format.html
+"""
 
 from __future__ import annotations
 
 import glob
 import math
 import re
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from ddrecon.scene_file.colmap import read_colmap
+from ddrecon.errors import FormatError
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import (
@@ -19,7 +27,21 @@ from ddrecon.scene_file.schema import (
     ViewSource,
     split_views,
 )
-from ddrecon.scene_file.transforms import read_transforms
+from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera, read_transforms
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+"""The camera models that are read, in the order of their numbers in binary files, with their
+parameters in order.
+"""
+Posed = tuple[str, int, Sequence[float]]
+"""An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
 def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection, ...]:
@@ -27,8 +49,8 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
     entries = node.entries()
     every = source.test_every
     if source.transforms is not None:
-        paths = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
-        return name_by_images(read_transforms(entries["transforms"], paths, every))
+        files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
+        return name_by_images(read_transforms(entries["transforms"], files, every))
     if source.colmap is not None:
         pictures = (folder / (source.images or "")).absolute()
         read = read_colmap(entries["colmap"], source.colmap, pictures)
@@ -37,7 +59,11 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
     cameras = ring_cameras(source.ring)
     images: list[Path] | list[None] = [None] * len(cameras)
     if source.images is not None:
-        images = match_files(source.images, folder)
+        # Wildcards stand in the last two parts: those above may match without end.
+        is_endless = glob.has_magic(str(Path(source.images).parent.parent))
+        names = [] if is_endless else glob.glob(source.images, root_dir=folder)
+        paths = [(folder / name).absolute() for name in names]
+        images = sorted(path for path in paths if path.is_file())
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
             raise entries["images"].refused(f"{what} {len(cameras)} cameras")
@@ -69,16 +95,12 @@ def name_listed(
 def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     """`views` with names, all different, by their images where they have some."""
     paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
-    stems = [_in_names(path.stem) for path in paths]
-    folders = [_in_names(path.parent.name) for path in paths]
+    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", path.stem) for path in paths]
+    folders = [re.sub(r"[^A-Za-z0-9_-]", "_", path.parent.name) for path in paths]
     longer = [f"{folder}_{stem}" for folder, stem in zip(folders, stems, strict=True)]
     numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]
     names = next(names for names in (stems, longer, numbered) if len(set(names)) == len(names))
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
-
-
-def _in_names(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", text)
 
 
 def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
@@ -93,15 +115,139 @@ def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
     return cameras
 
 
-def match_files(pattern: str, folder: Path) -> list[Path]:
-    """The files that match the glob `pattern`, as sorted absolute paths.
+def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
+    """The views of the model in `folder`, which `node` of a scene names, in order of their images.
 
-    It is relative to `folder`; wildcards stand in its last two parts.
+    Their pictures are in the folder `images`; they have no names yet. Raises SceneError where there
+    is no model, FormatError for one that is damaged or distorted in a way that is not known.
     """
-    if glob.has_magic(str(Path(pattern).parent.parent)):
-        return []
-    return sorted(
-        path
-        for name in glob.glob(pattern, root_dir=folder)
-        if (path := (folder / name).absolute()).is_file()
-    )
+    suffix = next((end for end in ("txt", "bin") if (folder / f"images.{end}").is_file()), None)
+    if suffix is None or not (folder / f"cameras.{suffix}").is_file():
+        raise node.refused(
+            f"{folder} has no COLMAP model; expected cameras.txt and images.txt, or .bin"
+        )
+    path, of_cameras = folder / f"images.{suffix}", folder / f"cameras.{suffix}"
+    with guard_reading(of_cameras):
+        cameras = dict(READERS[suffix][0](of_cameras))
+    with guard_reading(path):
+        posed = sorted(READERS[suffix][1](path))
+    if not posed:
+        raise FormatError(path, "has no images")
+    views = []
+    for name, number, pose in posed:
+        if number not in cameras:
+            raise FormatError(path, f"image {name!r}: there is no camera {number}")
+        picture = Path(name)
+        if picture.is_absolute() or ".." in picture.parts:
+            raise FormatError(path, f"image {name!r} leaves the folder of pictures; rename it")
+        frame = cameras[number] | {"transform_matrix": _matrix(path, name, pose)}
+        with in_file(of_cameras):
+            said = node_of(f"camera {number}", str(of_cameras), frame)
+            camera = read_camera(said, said.entries(), folder)
+        views.append(ViewSection(camera=camera, image=images / picture))
+    return views
+
+
+def _matrix(path: Path, name: str, pose: Sequence[float]) -> list[list[float]]:
+    """Camera to world with OpenGL axes."""
+    import numpy as np
+
+    quaternion, shift = np.array(pose[:4]), np.array(pose[4:])
+    norm = math.sqrt(float(quaternion @ quaternion))
+    if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):
+        raise FormatError(path, f"image {name!r}: its pose is not finite, or no rotation")
+    w, x, y, z = quaternion / norm
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    to_world = np.eye(3) - 2 * w * cross + 2 * cross @ cross
+    matrix = np.eye(4)
+    matrix[:3, :3] = to_world * (1, -1, -1)
+    matrix[:3, 3] = -to_world @ shift
+    return matrix.tolist()
+
+
+def _camera(
+    path: Path, number: int, model: str, size: tuple[int, int], parameters: Sequence[float]
+) -> dict[str, Any]:
+    """Camera `number` in the words of transforms.json."""
+    names = MODELS.get(model, ())
+    if model not in MODELS:
+        raise FormatError(path, f"camera {number}: lens model {model} is not known; {REMEDY}")
+    if len(parameters) != len(names):
+        what = f"{model} has {len(names)} parameters, {', '.join(names)}"
+        raise FormatError(path, f"camera {number}: {what}")
+    given = dict(zip(names, parameters, strict=True))
+    focal = given.pop("f", 0.0)
+    lens = {"camera_model": model, "w": size[0], "h": size[1], "fl_x": focal, "fl_y": focal}
+    return lens | given
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text file that are no comments, with their numbers."""
+    with path.open(encoding="utf-8") as stream:
+        for number, line in enumerate(stream, 1):
+            if not line.startswith("#"):
+                yield number, line.strip()
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    for number, line in _lines(path):
+        if not line:
+            continue
+        try:
+            camera, model, width, height, *parameters = line.split()
+            size, values = (int(width), int(height)), [float(word) for word in parameters]
+            index = int(camera)
+        except ValueError as error:
+            raise FormatError(
+                path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
+            ) from error
+        yield index, _camera(path, index, model, size, values)
+
+
+def _text_images(path: Path) -> Iterator[Posed]:
+    """Every other line is an image; the others, which may be empty, are its points."""
+    lines = _lines(path)
+    for number, line in lines:
+        if not line:
+            continue
+        try:
+            _, *numbers = (words := line.split(maxsplit=9))[:8]
+            pose, camera, name = [float(word) for word in numbers], int(words[8]), words[9]
+        except (ValueError, IndexError) as error:
+            raise FormatError(
+                path, f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            ) from error
+        yield name, camera, pose
+        next(lines, None)
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            number, model, width, height = _unpack(path, stream, "<iiQQ")
+            name = dict(enumerate(MODELS)).get(model, f"number {model}")
+            parameters = _unpack(path, stream, f"<{len(MODELS.get(name, ()))}d")
+            yield number, _camera(path, number, name, (width, height), parameters)
+
+
+def _binary_images(path: Path) -> Iterator[Posed]:
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            _, *pose, camera = _unpack(path, stream, "<i7di")
+            name = bytearray()
+            while (letter := _unpack(path, stream, "c")[0]) != b"\0":
+                name += letter
+            (points,) = _unpack(path, stream, "<Q")
+            stream.seek(24 * points, 1)
+            yield name.decode(), camera, pose
+
+
+def _unpack(path: Path, stream: BinaryIO, layout: str) -> tuple[Any, ...]:
+    data = stream.read(struct.calcsize(layout))
+    if len(data) < struct.calcsize(layout):
+        raise FormatError(path, "ends too soon")
+    return struct.unpack(layout, data)
+
+
+READERS = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
+"""What reads cameras and images, by the suffix of their files."""

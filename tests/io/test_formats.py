@@ -65,12 +65,13 @@ def write_hdr(path: Path, pixels: np.ndarray) -> None:
 
 
 def write_volume(path: Path) -> None:
-    if path.suffix != ".nc":
-        return write_field(path, "density", VALUES, BOUNDS)
-    with pytest.importorskip("netCDF4").Dataset(path, "w") as file:
-        for name, count in zip("zyx", VALUES.shape, strict=True):
-            file.createDimension(name, count)
-        file.createVariable("density", "f4", tuple("zyx"))[:] = VALUES
+    if path.suffix == ".nc":
+        with pytest.importorskip("netCDF4").Dataset(path, "w") as file:
+            for name, count in zip("zyx", VALUES.shape, strict=True):
+                file.createDimension(name, count)
+            file.createVariable("density", "f4", tuple("zyx"))[:] = VALUES
+    else:
+        write_field(path, "density", VALUES, BOUNDS)
 
 
 def write_encoded(path: Path, pixels: np.ndarray) -> None:

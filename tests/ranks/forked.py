@@ -24,10 +24,11 @@ import torch
 import torch._decomp.decompositions_for_jvp
 import torch._dynamo
 
+import ddrecon.cli.scene_commands
+
 # What commands import is imported once, before there are several processes. So is, above, what
 # pictures and derivatives in forward mode need.
 import ddrecon.cli.session
-import ddrecon.cli.uncertainty
 import ddrecon.run.render_folder
 import ddrecon.scene_file.build
 import ddrecon.scene_file.doubts
@@ -70,7 +71,7 @@ def do(job: dict[str, Any], rank: int) -> int:
     """The exit code of one rank."""
     if job.get("failing", [None])[0] == rank:
         fail_before(*job["failing"][1:])
-    ddrecon.cli.uncertainty.SAMPLES = job.get("samples", 0)
+    ddrecon.cli.scene_commands.SAMPLES = job.get("samples", 0)
     seed = ["--seed", str(rank)] if job.get("seeds") else []
     try:
         main([*job["arguments"], *seed], standalone_mode=False)

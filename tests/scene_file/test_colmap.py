@@ -16,8 +16,8 @@ from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.colmap import MODELS
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.view_sources import MODELS
 from ddrecon.settings import LENSES
 
 Read = Callable[..., SceneFile]

@@ -81,7 +81,7 @@ def test_aliases_mean_what_yaml_says():
     assert plain(root) == yaml.safe_load(ALIASED)
     marks = {node.key: node.where for node in root.walk()}
     assert marks["views.0.camera"] == "4:23" and marks["views.0.camera.fov"] == "2:19"
-    assert marks["views.1.camera.fov"] == "5:41" and marks["views.1.camera.size.1"] == "2:39"
+    assert marks["views.1.camera.fov"] == "5:42" and marks["views.1.camera.size.1"] == "2:39"
 
 
 @pytest.mark.parametrize(

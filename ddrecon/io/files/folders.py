@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -33,7 +33,20 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"{path}: cannot be made: {error.strerror or error}") from error
     lock = path / LOCK
-    with _acquire(lock):
+    try:
+        # No soft locks: what they leave behind would have to be judged stale or not.
+        held = FileLock(lock, fallback_to_soft=False).acquire(timeout=0)
+    except Timeout:
+        holder = ""
+        with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
+            holder = lock.read_text()
+        process = f"process {holder}" if holder.isdigit() else "another process"
+        raise UsageError(
+            f"{path}: {process} is writing there; wait for it, or choose another folder"
+        ) from None
+    except OSError as error:
+        raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
+    with held:
         lock.write_text(str(os.getpid()))
         try:
             if not may_exist and any(entry != lock for entry in path.iterdir()):
@@ -44,23 +57,6 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
         finally:
             # Before the lock goes: whoever waits for a file without a name has to begin again.
             lock.unlink(missing_ok=True)
-
-
-def _acquire(path: Path) -> AbstractContextManager[object]:
-    """The lock on the file at `path`, until its block ends."""
-    try:
-        # No soft locks: what they leave behind would have to be judged stale or not.
-        return FileLock(path, fallback_to_soft=False).acquire(timeout=0)
-    except Timeout:
-        holder = ""
-        with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
-            holder = path.read_text()
-        process = f"process {holder}" if holder.isdigit() else "another process"
-        raise UsageError(
-            f"{path.parent}: {process} is writing there; wait for it, or choose another folder"
-        ) from None
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be locked: {error.strerror or error}") from error
 
 
 def require_free_files(paths: Sequence[Path], *, may_exist: bool) -> None:

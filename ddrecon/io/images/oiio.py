@@ -120,12 +120,6 @@ def read_tiff(path: Path) -> np.ndarray:
     return pixels[..., 0] if pixels.shape[2] == 1 else pixels
 
 
-def read_deep_png(path: Path) -> np.ndarray:
-    """The stored values of a PNG of 16 bits, uint16 [h, w, channels]; not multiplied by alpha."""
-    with opened(path, "PNG") as (file, _):
-        return read_pixels(path, file, "uint16")
-
-
 def write_exr(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3] as float32 RGB.
 

@@ -7,9 +7,10 @@ pixel of alpha 0 is empty: black. Previews have exposure 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,12 @@ from ddrecon.extras import is_there
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.images.movies import encode
 from ddrecon.io.images.oiio import (
     PACKAGE,
-    read_deep_png,
+    opened,
     read_exr,
     read_hdr,
+    read_pixels,
     read_tiff,
     write_exr,
 )
@@ -36,6 +37,8 @@ BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"W
 
 Pillow alone would go by content whatever the suffix, and run Ghostscript on PostScript.
 """
+SECONDS = 4.0
+"""How long a movie takes from its first frame back to it."""
 COLORS = ("LA", "RGB", "RGBA")
 """Pillow's modes of several channels."""
 
@@ -63,59 +66,6 @@ def read_image(path: Path) -> Image:
 
     Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
     """
-    values, step = _read_values(path)
-    if values.ndim == 2:
-        return Image(np.repeat(values[..., None], 3, axis=2), None, step)
-    if values.shape[2] == 3:
-        return Image(values, None, step)
-    coverage = values[..., 3]
-    pixels = np.where(coverage[..., None] > 0, values[..., :3], np.float32(0))
-    return Image(pixels, coverage, step)
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """The mask at `path`, float32 [h, w]: 0 where its image is black or empty, else 1.
-
-    Pixels of mask 0 are ignored.
-    """
-    brightest: np.ndarray = read_image(path).pixels.max(axis=2)
-    return as_float32(brightest > 0)
-
-
-def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
-    """Writes `pixels` [h, w, 3] as float32 to `stem`.exr and `stem`.npy; returns these paths.
-
-    Where OpenImageIO is not installed, there is no .exr.
-    """
-    picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
-    with replace_file(array) as temporary:
-        np.save(temporary, as_float32(pixels), allow_pickle=False)
-    if not is_there(PACKAGE):
-        return [array]
-    write_exr(picture, pixels)
-    return [picture, array]
-
-
-def png_of(pixels: np.ndarray) -> bytes:
-    """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
-    return encode(srgb.encode_bytes(pixels), ".png")
-
-
-def write_preview(path: Path, pixels: np.ndarray) -> None:
-    """Writes `png_of` these `pixels` to `path`."""
-    with replace_file(path) as temporary:
-        temporary.write_bytes(png_of(pixels))
-
-
-def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
-    """`write_linear` of `pixels` [h, w, 3], and a preview of them, or of `preview`; all paths."""
-    path = stem.with_name(stem.name + ".png")
-    write_preview(path, pixels if preview is None else preview)
-    return [*write_linear(stem, pixels), path]
-
-
-def _read_values(path: Path) -> tuple[np.ndarray, float]:
-    """Linear values [h, w], or [h, w, c] with c of 3 or 4, and the `step` of an image."""
     reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
         known = ", ".join(READERS)
@@ -136,7 +86,73 @@ def _read_values(path: Path) -> tuple[np.ndarray, float]:
         where = f"row {row}, column {column} ({np.count_nonzero(flawed)} such pixels)"
         advice = "repair it: a pixel to ignore may hold any finite number"
         raise FormatError(path, f"{what} at {where}; {advice}")
-    return values, step
+    if values.ndim == 2:
+        return Image(np.repeat(values[..., None], 3, axis=2), None, step)
+    if values.shape[2] == 3:
+        return Image(values, None, step)
+    coverage = values[..., 3]
+    pixels = np.where(coverage[..., None] > 0, values[..., :3], np.float32(0))
+    return Image(pixels, coverage, step)
+
+
+def read_mask(path: Path) -> Image:
+    """The mask at `path`: 0 where its image is black or empty, and ignored, else 1."""
+    return Image(as_float32(read_image(path).pixels.max(axis=2, keepdims=True) > 0))
+
+
+def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
+    """Writes `pixels` [h, w, 3] as float32 to `stem`.exr and `stem`.npy; returns these paths.
+
+    Where OpenImageIO is not installed, there is no .exr.
+    """
+    picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
+    with replace_file(array) as temporary:
+        np.save(temporary, as_float32(pixels), allow_pickle=False)
+    if not is_there(PACKAGE):
+        return [array]
+    write_exr(picture, pixels)
+    return [picture, array]
+
+
+def encode(pixels: np.ndarray, extension: str, **settings: Any) -> bytes:
+    """An image, uint8 [h, w, 3], or frames of one, as a file of this kind, by Pillow."""
+    import imageio.v3 as iio
+
+    return iio.imwrite("<bytes>", pixels, plugin="pillow", extension=extension, **settings)
+
+
+def webp_of(image: np.ndarray) -> bytes:
+    """`image`, every pixel as it is: smaller than PNG."""
+    return encode(image, ".webp", lossless=True, quality=90, method=4)
+
+
+def write_animation(path: Path, frames: Sequence[np.ndarray], white: float) -> None:
+    """Writes `frames` [h, w, 3], linear, as an animated PNG that goes on for ever to `path`.
+
+    Radiance `white` > 0 is white.
+    """
+    encoded = np.stack([srgb.encode_bytes(frame / white) for frame in frames])
+    with replace_file(path) as temporary:
+        timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}
+        temporary.write_bytes(encode(encoded, ".png", **timing))
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
+    return encode(srgb.encode_bytes(pixels), ".png")
+
+
+def write_preview(path: Path, pixels: np.ndarray) -> None:
+    """Writes `png_of` these `pixels` to `path`."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(png_of(pixels))
+
+
+def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
+    """`write_linear` of `pixels` [h, w, 3], and a preview of them, or of `preview`; all paths."""
+    path = stem.with_name(stem.name + ".png")
+    write_preview(path, pixels if preview is None else preview)
+    return [*write_linear(stem, pixels), path]
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -159,7 +175,8 @@ def _read_encoded(path: Path) -> np.ndarray:
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
         if is_deep and mode in COLORS:  # which Pillow reads as 8 bits
             picture.verify()  # of its checksums libpng would tell stderr as well
-            return read_deep_png(path)
+            with opened(path, "PNG") as (file, _):
+                return read_pixels(path, file, "uint16")
     stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "P", *COLORS} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")

@@ -53,12 +53,24 @@ def read_netcdf(path: Path, name: str) -> Field:
     with load_for_file("netCDF4", path).Dataset(path) as file:
         variable = file.variables[name]
         check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
-        values, axes = _arrange(path, file, variable)
-        sides = [_side(path, file, dimension) for dimension in axes]
+        # What is masked (_FillValue) is NaN, which `check_field` refuses.
+        values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
+        axes = dict[str, str]()
+        for dimension, count in zip(variable.dimensions, values.shape, strict=True):
+            axis = _axis_of(file, dimension)
+            if axis and axis not in axes:
+                axes[axis] = dimension
+            elif count > 1:
+                advice = f"choose one (ncks -d {dimension},0)"
+                raise FormatError(path, f"{name} has {count} entries along {dimension!r}; {advice}")
+        kept = [axes[axis] for axis in "zyx"]
+        order = sorted(variable.dimensions, key=lambda one: [*kept, one].index(one))
+        values = values.transpose([variable.dimensions.index(one) for one in order])
+        sides = [_side(path, file, dimension) for dimension in kept]
     flips = tuple(slice(None, None, step) for step, _ in sides)
     known = [edges for _, edges in sides if edges is not None]
     bounds = np.array(known[::-1]).T if len(known) == 3 else None
-    return check_field(path, name, values[flips], bounds)
+    return check_field(path, name, values.reshape(values.shape[:3])[flips], bounds)
 
 
 def _axis_of(file: Any, dimension: str) -> str | None:
@@ -69,24 +81,6 @@ def _axis_of(file: Any, dimension: str) -> str | None:
     return next(
         (axis for axis, names in NAMES.items() if dimension.lower().startswith(names)), None
     )
-
-
-def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
-    """The values as [z, y, x], and the names of these dimensions; others must have one entry."""
-    # What is masked (_FillValue) is NaN, which `check_field` refuses.
-    values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
-    dimensions = dict[str, str]()
-    for name, count in zip(variable.dimensions, values.shape, strict=True):
-        axis = _axis_of(file, name)
-        if axis and axis not in dimensions:
-            dimensions[axis] = name
-        elif count > 1:
-            advice = f"choose one (ncks -d {name},0)"
-            raise FormatError(path, f"{variable.name} has {count} entries along {name!r}; {advice}")
-    kept = [dimensions[axis] for axis in "zyx"]
-    order = sorted(variable.dimensions, key=lambda name: [*kept, name].index(name))
-    values = values.transpose([variable.dimensions.index(name) for name in order])
-    return values.reshape(values.shape[:3]), kept
 
 
 def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:
@@ -110,12 +104,9 @@ def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None
         edges = centers[[0, -1]] + steps.mean() / 2 * np.array([-1, 1])
     else:
         return step, None
-    return step, np.array([edges.min(), edges.max()]) * _scale(file, coordinate)
-
-
-def _scale(file: Any, coordinate: Any) -> float:
-    """What takes `coordinate` to the unit of the first axis of x; 1 unless both are known."""
+    # In the unit of the first axis of x, where both are known.
     along_x = [name for name in file.dimensions if _axis_of(file, name) == "x"]
     first = next((file.variables[name] for name in along_x if name in file.variables), coordinate)
-    units = [METERS.get(str(getattr(one, "units", "")).lower()) for one in (coordinate, first)]
-    return units[0] / units[1] if units[0] and units[1] else 1.0
+    own, unit = (METERS.get(str(getattr(one, "units", "")).lower()) for one in (coordinate, first))
+    scale = own / unit if own and unit else 1.0
+    return step, np.array([edges.min(), edges.max()]) * scale

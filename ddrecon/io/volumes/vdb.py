@@ -68,8 +68,13 @@ def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> byte
     }
     places, is_active, voxels = _leaves(values)
     topology, order = _topology(places, [_bits(mask) for mask in is_active], bytes(4 * components))
+    # The map from index to world: a translation, a scale, and what OpenVDB derives from it.
+    size = (bounds[1] - bounds[0]) / cells
+    is_uniform = np.allclose(size, size[0], rtol=1e-9, atol=0)
+    numbers = [bounds[0] + size / 2, size, size, 1 / size, size**-2, 0.5 / size]
     head = struct.pack("<I", ACTIVE_MASK_COMPRESSION) + _metadata(labels)
-    head += _transform(np.array(cells), bounds) + topology
+    head += _text("UniformScaleTranslateMap" if is_uniform else "ScaleTranslateMap")
+    head += np.concatenate(numbers).astype("<f8").tobytes() + topology
     buffers = b"".join(
         _bits(mask) + ONLY_ACTIVE_VALUES + leaf[mask].astype("<f4", copy=False).tobytes()
         for mask, leaf in zip(is_active[order], voxels[order], strict=True)
@@ -125,16 +130,6 @@ def _topology(places: np.ndarray, masks: list[bytes], background: bytes) -> tupl
     return data, order
 
 
-def _transform(cells: np.ndarray, bounds: np.ndarray) -> bytes:
-    """The map from index to world: a translation, a scale, and what OpenVDB derives from it."""
-    low, high = bounds
-    size = (high - low) / cells
-    is_uniform = np.allclose(size, size[0], rtol=1e-9, atol=0)
-    numbers = np.concatenate([low + size / 2, size, size, 1 / size, size**-2, 0.5 / size])
-    kind = "UniformScaleTranslateMap" if is_uniform else "ScaleTranslateMap"
-    return _text(kind) + numbers.astype("<f8").tobytes()
-
-
 def _metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:
     """Each entry's name, type and value."""
     parts = [
@@ -182,9 +177,7 @@ def read_vdb(path: Path, name: str) -> Field:
         for _ in range(roots)
         for leaf in stream.leaves(np.array(stream.unpack("<3i")), UPPER, LOWER)
     ]
-    values = np.zeros(
-        [*cells[::-1], components], np.float32
-    )  # of which a system makes no pages yet
+    values = np.zeros([*cells[::-1], components], np.float32)  # a system makes no pages of it yet
     for place in leaves:
         block = stream.voxels(components).reshape(SIDE, SIDE, SIDE, components)
         x, y, z = np.minimum(cells - place, SIDE)

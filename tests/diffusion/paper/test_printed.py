@@ -196,7 +196,7 @@ def test_both_schemes_agree_as_the_grid_refines(lights: dict[str, None], least: 
             smooth_scene(cells, scheme=scheme, closure="smooth", tolerance=1e-8, **lights)
             for scheme in ("printed", "conservative")
         )
-        ours, theirs = (solve_light(scene, SolveMemory()).outgoing.mean for scene in scenes)
+        ours, theirs = (solve_light(scene, SolveMemory()).diffuse.mean for scene in scenes)
         return float((ours - theirs).norm() / theirs.norm())
 
     counts = [6, 9, 12]
@@ -228,14 +228,14 @@ def test_a_white_furnace_is_white(g: float):
 
 def test_light_scales_with_its_source():
     """However dim: the stop is relative, in float32, too."""
-    light = solve_light(smooth_scene(), SolveMemory()).outgoing.mean
+    light = solve_light(smooth_scene(), SolveMemory()).diffuse.mean
     for scale in (1e-30, 1e30):
         dim = smooth_scene(
             directional=(3 * scale, 2 * scale, scale),
             ambient=(0.3 * scale, 0.4 * scale, 0.5 * scale),
         )
         torch.testing.assert_close(
-            solve_light(dim, SolveMemory()).outgoing.mean / scale, light, rtol=1e-10, atol=0
+            solve_light(dim, SolveMemory()).diffuse.mean / scale, light, rtol=1e-10, atol=0
         )
 
 

@@ -16,7 +16,14 @@ from PIL import Image as Pillow
 
 from ddrecon.errors import FormatError
 from ddrecon.io.images.oiio import write_exr
-from ddrecon.io.images.table import read_image, read_mask, write_linear, write_preview
+from ddrecon.io.images.table import (
+    SECONDS,
+    read_image,
+    read_mask,
+    write_animation,
+    write_linear,
+    write_preview,
+)
 from ddrecon.pictures import srgb
 
 
@@ -163,5 +170,17 @@ def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
         [[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8
     )
     iio.imwrite(tmp_path / "m.png", stored)
-    mask = read_mask(tmp_path / "m.png")
+    mask = read_mask(tmp_path / "m.png").pixels[..., 0]
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
+
+
+def test_a_movie_keeps_its_frames_in_order_and_what_is_white(tmp_path: Path) -> None:
+    pictures = [np.full((17, 23, 3), level) for level in np.linspace(0, 2.4, 7)]
+    for picture in pictures:
+        picture[:4, :4] += 0.3
+    write_animation(tmp_path / "ring.png", pictures, 2.0)
+    frames = iio.imread(tmp_path / "ring.png", index=..., plugin="pillow")[..., :3]
+    assert np.array_equal(frames, [srgb.encode_bytes(picture / 2.0) for picture in pictures])
+    assert frames[0, 10, 10, 0] == 0 and frames[-3, 10, 10, 0] < frames[-1, 10, 10, 0] == 255
+    about = iio.immeta(tmp_path / "ring.png", plugin="pillow")
+    assert about["loop"] == 0 and about["duration"] == pytest.approx(1000 * SECONDS / 7, abs=1)
