@@ -67,20 +67,27 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
             f"RANK and WORLD_SIZE are set, but not {' and '.join(missing)}; start by torchrun"
         )
     rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-    wait = timedelta(seconds=float(os.environ.get(MEET_VARIABLE, MEET_SECONDS)))
+    seconds = float(os.environ.get(MEET_VARIABLE, MEET_SECONDS))
+    wait, limit = timedelta(seconds=seconds), timedelta(seconds=EXCHANGE_SECONDS)
+    keys = [f"ddrecon/here/{other}" for other in range(count)]
     try:
         store, *_ = next(dist.rendezvous("env://", timeout=wait))
+        store.set(keys[rank], "here")
     except (RuntimeError, ValueError, OSError) as error:
-        place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
         raise RanksError(
-            f"rank {rank} of {count} cannot meet the others at {place}"
-            f" within {wait.total_seconds():g} s ({_reason(error)});"
+            f"rank {rank} of {count} cannot meet the others at {os.environ['MASTER_ADDR']}:"
+            f"{os.environ['MASTER_PORT']} within {seconds:g} s ({_reason(error)});"
             " check MASTER_ADDR and MASTER_PORT, or torchrun's rendezvous"
         ) from error
-    _meet(store, rank, count, wait)
-    backend = "cpu:gloo,cuda:nccl" if has_gpu else "gloo"
     try:
-        limit, own = timedelta(seconds=EXCHANGE_SECONDS), dist.PrefixStore("ddrecon", store)
+        store.wait(keys, wait)
+    except RuntimeError as error:
+        absent = ", ".join(str(other) for other in range(count) if not store.check([keys[other]]))
+        raise RanksError(
+            f"rank {rank} of {count} has waited {seconds:g} s in vain for rank {absent}"
+        ) from error
+    backend, own = "cpu:gloo,cuda:nccl" if has_gpu else "gloo", dist.PrefixStore("ddrecon", store)
+    try:
         dist.init_process_group(backend, store=own, rank=rank, world_size=count, timeout=limit)
     except RuntimeError as error:
         raise RanksError(
@@ -88,20 +95,6 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
             "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
         ) from error
     _group = _Group(rank, count, has_slabs)
-
-
-def _meet(store: Any, rank: int, count: int, wait: timedelta) -> None:
-    """Returns when all ranks are there; raises RanksError that names those that are not."""
-    keys = [f"ddrecon/here/{other}" for other in range(count)]
-    store.set(keys[rank], "here")
-    try:
-        store.wait(keys, wait)
-    except RuntimeError as error:
-        missing = [str(other) for other, key in enumerate(keys) if not store.check([key])]
-        raise RanksError(
-            f"rank {rank} of {count} has waited {wait.total_seconds():g} s in vain"
-            f" for rank {', '.join(missing)}"
-        ) from error
 
 
 def leave_ranks() -> None:
@@ -166,17 +159,6 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
             torch.cuda.synchronize(flat.device)
     parts = flat.split([tensor.numel() for tensor in tensors])
     return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
-
-
-def gather_from_ranks(part: Tensor) -> list[Tensor]:
-    """The `part` that each rank has, by rank; all are of one shape."""
-    import torch
-
-    part = part.contiguous()
-    parts = [torch.empty_like(part) for _ in range(_group.count)]
-    with _exchange(part.nbytes):
-        torch.distributed.all_gather(parts, part)
-    return parts
 
 
 def trade_with_ranks(parts: Tensor) -> Tensor:

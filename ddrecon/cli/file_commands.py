@@ -57,7 +57,8 @@ def export(
     """
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
     _require_volumes(sources)
-    from ddrecon.io.volumes.table import FORMATS, read_together
+    from ddrecon.io.files.folders import require_free_files
+    from ddrecon.io.volumes.table import FORMATS, raise_z, read_together, write_fields
 
     kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
     if kind not in known:
@@ -72,10 +73,9 @@ def export(
         raise click.UsageError(f"one scene at a time is written as {kind}")
     if kind not in FORMATS and up == "z":
         raise click.UsageError("--up z turns volumes only")
-    written = [output]
+    constants: Fields = {}
     if not is_of_scene:
         fields, bounds = read_together(sources)
-        _write_fields(output, overwrite, up, fields, {}, bounds)
     else:
         scene_file = scene_file or session.read(sources[0])
         scene = session.build(scene_file)
@@ -84,27 +84,18 @@ def export(
         elif kind == ".json":
             written = export_transforms(scene, scene_file, output, may_exist=overwrite)
         else:
-            _write_fields(output, overwrite, up, *_fields_of(scene))
-    click.echo(f"written: {', '.join(map(str, written))}")
-
-
-def _write_fields(
-    output: Path, overwrite: bool, up: str, fields: Fields, constants: Fields, bounds: np.ndarray
-) -> None:
-    """Writes a volume to `output`, and prints what is the same everywhere in it."""
-    from ddrecon.io.files.folders import require_free_files
-    from ddrecon.io.volumes.table import raise_z, write_fields
-
-    require_free_files([output], may_exist=overwrite)
-    if up == "z":
-        fields, bounds = raise_z(fields, bounds)
-    write_fields(output, fields, bounds)
+            fields, constants, bounds = _fields_of(scene)
+    if kind in FORMATS:
+        written = [output]
+        require_free_files(written, may_exist=overwrite)
+        write_fields(output, *(raise_z(fields, bounds) if up == "z" else (fields, bounds)))
     if constants:
         numbers = ", ".join(
             " ".join([name, *(f"{number:.6g}" for number in value.flatten().tolist())])
             for name, value in constants.items()
         )
         click.echo(f"fields: {', '.join(fields)}; the same everywhere, not written: {numbers}")
+    click.echo(f"written: {', '.join(map(str, written))}")
 
 
 def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:

@@ -250,7 +250,6 @@ def uncertainty(
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
-
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):
         raise UsageError(

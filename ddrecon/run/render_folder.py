@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import UsageError
+from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
 from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
 from ddrecon.losses import Target
@@ -22,7 +22,6 @@ from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
-from ddrecon.scene_file.problems import suggestion
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
 from ddrecon.variables.tangents import variation, varied

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import DataWarning, FormatError, UsageError
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, suggestion
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
@@ -27,7 +27,6 @@ from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
-from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.schema import (
     AmbientSection,
     Color,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, image_places, look_at, project
-from ddrecon.errors import FormatError
+from ddrecon.errors import FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.lenses import is_folded
@@ -19,7 +19,6 @@ from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, read_referenced
-from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
 
 READERS: Mapping[str, Callable[[Path], Image]] = {

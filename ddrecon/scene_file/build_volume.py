@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import DataWarning, FormatError
+from ddrecon.errors import DataWarning, FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
@@ -25,7 +25,6 @@ from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
-from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import (
     HenyeyGreensteinSection,
     MediumSection,

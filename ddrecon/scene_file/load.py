@@ -9,10 +9,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import FormatError, Problems, SceneError, suggestion
 from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse
-from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
 from ddrecon.scene_file.view_sources import name_listed, views_of

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import yaml
 
-from ddrecon.errors import SceneError
-from ddrecon.scene_file.problems import Problems
+from ddrecon.errors import Problems, SceneError
 
 Scalar = None | bool | int | float | str
 

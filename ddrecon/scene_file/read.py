@@ -15,8 +15,8 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from ddrecon.errors import Problems, suggestion
 from ddrecon.scene_file.nodes import Node, describe_found
-from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile
 
 R = TypeVar("R")

@@ -18,12 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import FormatError, Problems, SceneError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.read import read_as
 from ddrecon.scene_file.schema import (
     FisheyeSection,

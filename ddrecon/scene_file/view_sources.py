@@ -16,10 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import FormatError, Problems
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import (
     PerspectiveSection,
     RingSection,

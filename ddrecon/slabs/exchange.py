@@ -16,7 +16,6 @@ from torch.nn.functional import pad
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import differentiate_once
 from ddrecon.ranks import (
-    gather_from_ranks,
     own_rank,
     rank_count,
     sum_over_ranks,
@@ -159,7 +158,8 @@ def swap_ends(
 def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
     """All ranks' `own` parts one after the other along `axis` < 0, of `sizes`; no derivatives."""
     missing = max(sizes) - own.shape[axis]
-    parts = gather_from_ranks(pad(own, (0, 0) * (-axis - 1) + (0, missing)))
+    padded = pad(own, (0, 0) * (-axis - 1) + (0, missing))
+    parts = trade_with_ranks(padded.expand(rank_count(), *padded.shape))
     return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
 
 

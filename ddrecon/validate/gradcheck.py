@@ -23,12 +23,11 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import SolveError, UsageError
+from ddrecon.errors import SolveError, UsageError, suggestion
 from ddrecon.losses import image_loss
 from ddrecon.progress import Progress
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.scene_file.problems import suggestion
 from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import (
     component_names,

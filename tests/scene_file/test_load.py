@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -171,15 +170,3 @@ def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_p
     (tmp_path / "elsewhere").mkdir()
     dump_scene(scene_file, tmp_path / "elsewhere" / "scene.yaml")
     assert read_scene(tmp_path / "elsewhere" / "scene.yaml").tree == scene_file.tree
-
-
-def test_what_a_record_is_is_found_out_once(read: Read):
-    """So that thousands of views are read quickly: no annotation is evaluated again."""
-    read(SCENE)
-    called = set[str]()
-    sys.setprofile(lambda frame, event, _: called.add(frame.f_code.co_qualname))
-    try:
-        read(SCENE)
-    finally:
-        sys.setprofile(None)
-    assert "read_record" in called and "get_type_hints" not in called

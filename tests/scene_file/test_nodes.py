@@ -12,10 +12,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import Problems, SceneError
 from ddrecon.scene_file.load import MAX_BYTES, read_scene
 from ddrecon.scene_file.nodes import Node, parse, resolve
-from ddrecon.scene_file.problems import Problems
 
 Refusal = Callable[..., list[str]]
 
