@@ -20,8 +20,7 @@ import torch
 from ddrecon.errors import DataWarning, FormatError, UsageError
 from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.scene_file.dump import describe
-from ddrecon.scene_file.load import SceneFile, referenced_files
+from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
 FORMAT = 7
 """What a checkpoint holds; counts up when that changes."""

@@ -23,8 +23,7 @@ from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_r
 from ddrecon.run.quality import describe_loss, find_results, loss_text
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder, remove_run
 from ddrecon.scene import Scene
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.load import SceneFile, dump_scene
 from ddrecon.terms import engine_of_scene
 
 

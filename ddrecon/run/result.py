@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ddrecon.scene_file.dump import describe
-from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.load import SceneFile, describe
 from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, is_of_volume, split_name
 

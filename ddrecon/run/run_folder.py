@@ -33,8 +33,7 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.dump import write_described
-from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files
+from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files, write_described
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     FIELDS,

@@ -39,8 +39,6 @@ from ddrecon.variables.values import cross_sections
 
 FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
-BY_ANGLE = "g", "phase.weight"
-"""Quantities that belong to the phase function."""
 
 
 def build_media(
@@ -194,14 +192,13 @@ def _build_phase(
 
     def tensor(value: Any, name: str = "") -> Tensor:
         if isinstance(value, FieldFile):
-            name = next(name for name in BY_ANGLE if name in medium.fields)
             return medium.values(name).to(device, dtype)
         value = medium.tree.share_color(f"{medium.prefix}{name}", value)
         return torch.as_tensor(value, dtype=dtype, device=device)
 
     match section := medium.section.phase:
         case None:
-            return HenyeyGreenstein(tensor(medium.section.g))
+            return HenyeyGreenstein(tensor(medium.section.g, "g"))
         case HenyeyGreensteinSection():
             return HenyeyGreenstein(tensor(section.g, "g"))
         case TwoLobeSection():

@@ -19,8 +19,7 @@ from ddrecon.renderer import render
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import RunFolder
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.load import dump_scene, read_scene
 
 CROSS_SECTIONS = {
     "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",

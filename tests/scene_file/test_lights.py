@@ -13,8 +13,7 @@ from example_scene import changed
 from ddrecon.errors import DataWarning
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.load import dump_scene, read_scene
 
 TURNED = {"scale": 2.5, "rotation": -370.0, "directions": 12, "up": "z"}
 

@@ -10,8 +10,7 @@ import pytest
 import yaml
 from example_scene import CAMERA, SCENE, changed
 
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
 
@@ -90,11 +89,6 @@ def test_every_error_is_told_at_once_with_its_place(refusal: Refusal):
         "scene.yaml:12:94: views.0.camera.fov: must be above 0, found 0",
         "-D render.steps_per_voxel=1.5: render.steps_per_voxel: expected a whole number, found 1.5",
     ]
-
-
-@pytest.mark.parametrize("section", ["volume", "lights", "views"])
-def test_required_sections(refusal: Refusal, section: str):
-    assert refusal(changed(**{section: None})) == [f"scene.yaml:1:1: missing key {section!r}"]
 
 
 def test_left_out_names_count_from_zero_and_all_are_unique(read: Read, refusal: Refusal):

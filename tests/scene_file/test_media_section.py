@@ -16,8 +16,7 @@ from ddrecon.medium.phase import Rayleigh
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.run.result import describe_result, result_names
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.dump import dump_scene, write_described
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.load import dump_scene, read_scene, write_described
 from ddrecon.variables.values import value_of
 
 CLOUD = {"density": {"file": "cloud.npz"}, "sigma_t": 20, "albedo": 0.9, "g": 0.8}

@@ -17,8 +17,7 @@ from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.load import dump_scene, read_scene
 
 VOLUME = {name: value for name, value in yaml.safe_load(SCENE)["volume"].items() if name != "g"}
 SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from example_scene import changed
 
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
 from ddrecon.scene_file.schema import PerspectiveSection, RingSection
 from ddrecon.scene_file.view_sources import ring_cameras
 

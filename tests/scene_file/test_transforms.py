@@ -19,8 +19,7 @@ from example_scene import SCENE, changed
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
 from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
 from ddrecon.scene_file.transforms import export_transforms
 
