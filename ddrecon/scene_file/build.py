@@ -50,6 +50,11 @@ THICK = 2.0
 nearer to the truth than any of more: what is not scaled out as a peak has to cross the cell. Only
 where the phase function is given.
 """
+FLAT, BACKWARD = 0.5, 0.2
+"""A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
+side of a plane, which takes more directions. So does a backward peak of more than that part of
+scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
+"""
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
 
@@ -233,17 +238,28 @@ def choose_rounds(
     moments = phase.moments(3)
     left = float(moments[:, 2].abs().max())
     is_forward = float(moments[:, 1].min()) > 0 and not bool(phase.backward_tail(1, 1).any())
+    is_thick = is_forward and volume is not None and greatest_depth(volume) > THICK
     optimized = tree.optimize.parameters if tree.optimize else {}
     if any(name == "g" or name.startswith(PHASE) for name in optimized):
         left = max(left, OPTIMIZED)
-    elif is_forward and volume is not None and greatest_depth(volume) > THICK:
+    elif is_thick:
         left = 0.0
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
+    is_flat = volume is not None and not is_thick and _is_flat(volume)
+    if is_flat or float(phase.backward_tail(3, 1).max()) > BACKWARD:
+        rounds, degree = rounds + (left > MORE_ROUNDS[1]), 5
     return replace(
         settings,
         transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,
         degree=degree if settings.degree is None else settings.degree,
     )
+
+
+def _is_flat(volume: Volume) -> bool:
+    """Whether the medium of `volume` goes up to a face of the box."""
+    density = volume.density
+    faces = (density.select(axis, end).mean() for axis in range(3) for end in (0, -1))
+    return float(max(faces)) > FLAT * float(density.mean())
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:

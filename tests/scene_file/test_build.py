@@ -60,15 +60,27 @@ def test_constants(write: Write):
 
 
 @pytest.mark.parametrize(
-    "g, sigma_s, expected",
-    [(0.3, 12, (1, 1)), (0.8, 12, (3, 3)), (0.8, 70, (1, 1)), (-0.8, 70, (3, 3))],
+    "g, depth, is_flat, expected",
+    [
+        (0.3, 0.5, False, (1, 1)),
+        (0.3, 0.5, True, (1, 5)),
+        (0.8, 0.5, False, (3, 3)),
+        (0.8, 0.5, True, (4, 5)),
+        (0.8, 3, True, (1, 1)),
+        (-0.8, 3, False, (4, 5)),
+    ],
     ids=str,
 )
-def test_rounds_and_degree_follow_from_the_phase_function_and_from_thick_cells(
-    write: Write, g: float, sigma_s: float, expected: tuple[int, int]
+def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
+    tmp_path: Path, write: Write, g: float, depth: float, is_flat: bool, expected: tuple[int, int]
 ):
-    """Cells of density 0.1 are 0.42 long in the mean: 70 makes them 2.9 optical depths thick."""
-    text = volume(g=g, sigma_s=sigma_s)
+    """Cells are `depth` optical depths thick; all of them, or one that no face of the box has."""
+    values = np.full((5, 5, 5), depth, np.float32)
+    if not is_flat:
+        values *= np.arange(125).reshape(5, 5, 5) == 62
+    write_field(tmp_path / "body.npz", "density", values, BOUNDS)
+    density, size = {"file": "body.npz"}, (0.2 + 0.3 + 0.2) / 3
+    text = volume(g=g, sigma_a=0.1 / size, sigma_s=0.9 / size, density=density, resolution=[5] * 3)
     found = load_scene(write(text)).diffusion
     assert (found.rounds, found.angles) == expected
     chosen = load_scene(write(text), overrides=("diffusion.degree=5",)).diffusion
