@@ -213,7 +213,6 @@ def _sum_between(
 
 
 def _shown_by(view: str, numbers: Sequence[Parameter]) -> list[Parameter]:
-    """Those of `numbers` that the picture of `view` shows."""
     return [p for p in numbers if p.view is None or p.view == view]
 
 

@@ -144,7 +144,6 @@ class Schedule:
         return [round(part * self.planned) for part in self.refine_at] + [self.planned]
 
     def _part(self, iteration: int) -> int:
-        """The number of the part that `iteration` belongs to."""
         return sum(self.place(iteration) >= end for end in self._part_ends)
 
 

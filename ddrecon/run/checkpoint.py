@@ -167,7 +167,6 @@ def _shorten(value: Any) -> str:
 
 
 def _digest(path: Path) -> str:
-    """The SHA-256 of the file at `path`, or of those of all files in the folder `path`."""
     if path.is_dir():
         return hashlib.sha256(
             "".join(_digest(entry) for entry in sorted(path.iterdir())).encode()

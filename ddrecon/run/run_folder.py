@@ -190,7 +190,6 @@ class RunFolder:
         return parameters
 
     def _pictures(self, found: Findings, mark: str) -> None:
-        """Writes pictures of views and fields."""
         folder = self.path / "previews"
         for name, value in fields_of(found.scene).items():
             write_preview(folder / f"{name}.slices{mark}.png", slices(value))
