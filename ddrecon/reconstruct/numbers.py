@@ -24,11 +24,11 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.curvature import Curvature, change_of
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import has_slabs, own_views
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import LightField, solve_light
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
 from ddrecon.variables.values import with_values
@@ -149,7 +149,6 @@ def find_curvatures(
     scene, values = point.scene, point.values
     own = own_views(scene, names)
     rendered = names if has_slabs(scene) else own
-    derivatives = scene.optimize.derivatives if scene.optimize else "all"
     jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
 
     def light_of(world: Scene) -> LightField:
@@ -163,9 +162,7 @@ def find_curvatures(
                 world = with_values(scene, {**values, **moving})
                 lit = light_of(world) if light is None else light
                 for name in views:
-                    picture = view_picture(lit, world, world.view(name), derivatives)
-                    tangent = forward_ad.unpack_dual(picture).tangent
-                    found[name].append(picture * 0 if tangent is None else tangent.clone())
+                    found[name].append(change_of(lit, world, name))
         for name, changes in found.items():
             jacobians[name].append(_by_entry(torch.stack(changes), _count(p)).flatten(1))
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import refusals, remove_temporaries, write_json
+from ddrecon.io.files.atomic import flush, refusals, remove_temporaries, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -119,7 +119,7 @@ class RunFolder:
         """
         if self.saved != run.iteration:
             start = monotonic()
-            self.log.flush()
+            flush(self.log.path)
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 

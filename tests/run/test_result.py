@@ -64,15 +64,9 @@ VARIED = [
 
 def moved(value: Tensor) -> Tensor:
     """`value` a little larger, everywhere by another amount."""
-    return (
-        value
-        * (
-            1.1
-            + 0.1
-            * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)
-        )
-        + 0.01
-    )
+    generator = torch.Generator().manual_seed(0)
+    random = torch.rand(value.shape, generator=generator, dtype=value.dtype)
+    return value * (1.1 + 0.1 * random) + 0.01
 
 
 def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g: 0.3") -> Any:
