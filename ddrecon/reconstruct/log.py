@@ -15,8 +15,7 @@ class Row:
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
-    views are None where none was rendered, and SSIMs where they were not looked at. `chi_square` is
-    that of the images per pixel, None where their noise is not known.
+    views are None where none was rendered, and SSIMs where they were not looked at.
     """
 
     iteration: int
@@ -31,7 +30,6 @@ class Row:
     penalty: float
     ssim: float | None = None
     test_ssim: float | None = None
-    chi_square: float | None = None
 
 
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)

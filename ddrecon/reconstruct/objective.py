@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import islice
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -32,8 +33,8 @@ def target_of(view: View) -> Tensor:
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    With `has_similarity` by SSIM as well, and by chi^2 where there are `noise_targets`. `pictures`
-    are this rank's images so far, by name, `found` their numbers in that order, by kind.
+    With `has_similarity` by SSIM as well. `pictures` are this rank's images so far, by name,
+    `found` their numbers in that order, by kind.
     """
 
     def __init__(
@@ -41,11 +42,10 @@ class Comparison:
         views: Sequence[View],
         targets: Mapping[str, Target],
         has_similarity: bool = False,
-        noise_targets: Mapping[str, Target] | None = None,
     ):
-        self.views, self.targets, self.noise_targets = views, targets, noise_targets or {}
-        kinds = {"loss": True, "psnr": True, "ssim": has_similarity, "chi_square": noise_targets}
-        self.found: dict[str, list[Tensor]] = {kind: [] for kind, is_so in kinds.items() if is_so}
+        self.views, self.targets = views, targets
+        kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]
+        self.found: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
         self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
@@ -60,8 +60,6 @@ class Comparison:
         self.found["psnr"].append(target.psnr_of(seen))
         if "ssim" in self.found:
             self.found["ssim"].append(target.ssim_of(seen))
-        if "chi_square" in self.found:
-            self.found["chi_square"].append(self.noise_targets[view.name].loss_of(seen))
         return value
 
     def share(self, view: View) -> float:
@@ -85,25 +83,24 @@ class Comparison:
         loss: Tensor,
         gradients: Mapping[str, Tensor],
         parameters: Sequence[Parameter],
-    ) -> tuple[float, float, dict[str, list[float]]]:
-        """The `loss` of an iteration, its part of the images, and numbers of each view by kind.
+    ) -> tuple[float, float, float, float | None]:
+        """The `loss` of an iteration, its part of the images, their mean PSNR [dB], and SSIM.
 
-        They are its loss, "psnr" [dB], "ssim" where that was looked at, and "chi_square" per pixel
-        where noise is known; all are read at once, with the extremes of `gradients`. Raises
-        NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
+        The last is None where it was not looked at. All are read at once, with the extremes of
+        `gradients`. Raises NotFiniteError where a loss, or a derivative by one of the `parameters`,
+        is not finite.
         """
         self.gather()
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
         groups = [[loss, objective.loss], extremes, *self.found.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
         (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
-        of_views = dict(zip(self.found, rows, strict=True))
-        if not all(math.isfinite(number) for number in of_views["loss"] + ends):
+        losses, *qualities = rows
+        if not all(map(math.isfinite, losses + ends)):
             self.require_finite()
             require_finite(parameters, gradients)
-        shares = map(self.share, self.views)
-        losses = [x / share for x, share in zip(of_views["loss"], shares, strict=True)]
-        return total, of_images, of_views | {"loss": losses}
+        psnr, *ssim = map(fmean, qualities)
+        return total, of_images, psnr, ssim[0] if ssim else None
 
 
 def add_penalties(

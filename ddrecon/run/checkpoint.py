@@ -23,7 +23,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile, referenced_files
 
-FORMAT = 7
+FORMAT = 8
 """What a checkpoint holds; counts up when that changes."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
