@@ -139,12 +139,7 @@ def render(
     metavar="K",
     help="Write pictures every K iterations.",
 )
-@click.option(
-    "--uncertainty",
-    "has_uncertainty",
-    is_flag=True,
-    help="Then also say how sure the result is, as ddrecon uncertainty does.",
-)
+@click.option("--uncertainty", "has_uncertainty", is_flag=True, hidden=True)
 @SHARE
 @DTYPE
 @REPORT
@@ -160,10 +155,11 @@ def optimize(
     has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
+    if has_uncertainty:
+        raise click.UsageError(f"--uncertainty: say `ddrecon uncertainty {output} -o DIR` after it")
     if iterations is not None:
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    from ddrecon.cli.uncertainty import add_uncertainty, follow_added
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
@@ -171,19 +167,12 @@ def optimize(
     built, environment = session.build(scene_file), session.environment()
     require_sharing(built)
     if not is_first():
-        run = follow_run(built, scene_file, resume=resume, preview_every=preview_every)
-        if has_uncertainty:
-            follow_added(run)
+        follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         return
     choice = {"may_exist": overwrite, "resume": resume}
     with open_run(built, scene_file, output, environment, **choice) as (run, folder):
-        is_last = not has_uncertainty
-        summary = drive_run(run, folder, preview_every, session.is_quiet, is_last)
-        lines = summary_lines(summary, output)
-        if has_uncertainty:
-            record, more = add_uncertainty(run, output, session.is_quiet)
-            summary, lines = summary | {"uncertainty": record}, [*lines, *more]
-    session.show(summary, lines)
+        summary = drive_run(run, folder, preview_every, session.is_quiet)
+    session.show(summary, summary_lines(summary, output))
 
 
 @click.command()

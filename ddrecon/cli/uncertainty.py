@@ -1,9 +1,9 @@
-"""The command `uncertainty`, and what `optimize --uncertainty` does."""
+"""The command `uncertainty`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     import torch
 
     from ddrecon.cli.session import Session
-    from ddrecon.reconstruct.loop import Reconstruction
     from ddrecon.scene import Scene
-
-SAMPLES = 16
 
 
 @click.command()
@@ -27,7 +24,7 @@ SAMPLES = 16
 @click.option(
     "--samples",
     type=click.IntRange(min=2),
-    default=SAMPLES,
+    default=16,
     show_default=True,
     metavar="N",
     help="Samples of the posterior in all, also after --resume.",
@@ -101,24 +98,3 @@ def uncertainty(
         choice = {"has_samples": has_samples, "resume": resume, "is_quiet": session.is_quiet}
         record = drive_uncertainty(taken, output, samples, request, **choice)
     session.show(record, uncertainty_lines(record, output))
-
-
-def add_uncertainty(
-    run: Reconstruction, folder: Path, is_quiet: bool
-) -> tuple[dict[str, Any], list[str]]:
-    """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
-    from ddrecon.uncertainty.drive import Request, drive_uncertainty
-    from ddrecon.uncertainty.folder import uncertainty_lines
-
-    path = folder / "uncertainty"
-    path.mkdir(exist_ok=True)
-    choice = {"has_samples": False, "resume": False, "is_quiet": is_quiet}
-    record = drive_uncertainty(run, path, SAMPLES, Request(run.seed), **choice)
-    return record, uncertainty_lines(record, path)
-
-
-def follow_added(run: Reconstruction) -> None:
-    """Does this rank's part of what `add_uncertainty` does on the first."""
-    from ddrecon.uncertainty.drive import Request, follow_uncertainty
-
-    follow_uncertainty(run, SAMPLES, Request(run.seed))

@@ -23,7 +23,6 @@ from ddrecon.ranks import cells_are_shared, from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
-from ddrecon.reconstruct.levels import resample_solutions
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
@@ -190,11 +189,11 @@ class Reconstruction:
             self.memory.last[kind] = field.to(self.problem.scene.volume.density)
 
     def _enter_stage(self, stage: int) -> None:
-        """Takes scenes, parameters and solutions to the resolution of `stage`."""
+        """Takes scenes and parameters to the resolution of `stage`."""
         self.stage, self.level = stage, self.problem.at(stage)
-        before, volume = self.parameters[0].grid, self.level.train.volume
-        self.memory.last = resample_solutions(self.memory.last, before, volume.grid)
-        self.numbers.curvatures = {}  # which belong to another resolution
+        volume = self.level.train.volume
+        # These belong to another resolution.
+        self.memory.last, self.numbers.curvatures = {}, {}
         for parameter in self.parameters:
             if parameter.grid != volume.grid:
                 parameter.refine(volume.grid)

@@ -99,7 +99,11 @@ class NumberSteps:
             at = places[p.name]
             block = matrix[at[:, None], at]
             if p in self.calibrated:
-                prior = weigh_calibration(p, block, unit[at], point.scene)
+                # As strong as what the picture says of a shift in the image by `TRUST`.
+                of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2
+                camera = next(v.camera for v in point.scene.views if v.name == p.view)
+                prior = calibration_prior(camera, p.grid).cpu() * of_shifts
+                prior = prior * unit[at] * unit[at][:, None]
                 right[at] -= prior @ (p.value.detach().double().cpu() / unit[at])
                 block = block + prior
             least = tuning.LEAST * block.diagonal().max() + torch.finfo(torch.float32).tiny
@@ -314,18 +318,6 @@ def _common_motion(view: View, scene: Scene) -> Tensor:
     if view.camera.is_perspective:
         motion[3:, 6] = axes.T @ away
     return motion
-
-
-def weigh_calibration(pose: Parameter, curvature: Tensor, unit: Tensor, scene: Scene) -> Tensor:
-    """The second derivative [6, 6] of what the calibration of a camera adds to its view's loss.
-
-    It is as strong as what the picture, by the loss's `curvature` [6, 6], says of a shift in the
-    image by `TRUST`; both are in the `unit` [6] of the twist `pose`, its rates.
-    """
-    assert pose.view is not None
-    of_shifts = curvature.diagonal()[3:5].mean() / PIXELS**2
-    prior = calibration_prior(scene.view(pose.view).camera, scene.volume.grid).cpu()
-    return prior * unit * unit[:, None] * (tuning.TRUST**2 * of_shifts)
 
 
 def calibration_prior(camera: Camera, grid: Grid) -> Tensor:

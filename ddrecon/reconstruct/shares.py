@@ -48,39 +48,25 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     One that is named twice is rendered twice, by the same rank.
     """
     pixels = {name: math.prod(scene.view(name).camera.size) for name in names}
-    owners = assign([names.count(name) * count for name, count in pixels.items()], rank_count())
-    own = [name for name, owner in zip(pixels, owners, strict=True) if owner == own_rank()]
+    # By turns, those of most pixels first, so that all end at about one time.
+    own = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
     return [name for name in names if name in own]
 
 
 def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[str, Tensor]:
     """The pictures [3, h, w] of the views of `scene`, by name, on all ranks.
 
-    Each is what `picture_of` gives one of them. Of cells in slabs all ranks look at all views.
+    Each is what `picture_of` gives one of them.
     """
     names = [view.name for view in scene.views]
-    rendered = names if has_slabs(scene) else own_views(scene, names)
+    rendered = own_views(scene, names)
     pictures = [
         picture_of(view)
         if view.name in rendered
         else scene.volume.density.new_zeros(3, *view.camera.size)
         for view in scene.views
     ]
-    pictures = pictures if has_slabs(scene) else sum_over_ranks(pictures)
-    return dict(zip(names, pictures, strict=True))
-
-
-def assign(costs: Sequence[float], ranks: int) -> list[int]:
-    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
-
-    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
-    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
-    """
-    owners, loads = [0] * len(costs), [0.0] * ranks
-    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
-        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
-        loads[owners[job]] += costs[job]
-    return owners
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:

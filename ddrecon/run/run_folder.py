@@ -237,7 +237,6 @@ RUN_FILES = (
     *("loss.csv", "report.html", *CHECKPOINT_FILES),
     *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
     *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
-    *(f"uncertainty/{name}" for name in SAMPLE_FILES),
 )
 """What files of `ddrecon optimize` are called, but for those named after media and views."""
 

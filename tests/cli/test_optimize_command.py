@@ -113,15 +113,13 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
-    names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "uncertainty/notes.txt"
-    options = "uncertainty/uncertainty.json", "lights.1.radiance.npy"
-    for path in (Path("out", name) for name in names + options):
-        path.parent.mkdir(exist_ok=True)
+    names = "notes.txt", "volumes/mine.npz", "previews/mine.png"
+    for path in (Path("out", name) for name in (*names, "lights.1.radiance.npy")):
         path.write_text(path.name)
     succeed(*OPTIMIZE, "out", "--overwrite")
     succeed(*OPTIMIZE, "fresh")
     assert np.array_equal(density_of("out"), density_of("fresh")) and len(rows("out")) == 4
-    assert set(contents(Path("out"))) == {*contents(Path("fresh")), *names, "uncertainty"}
+    assert set(contents(Path("out"))) == {*contents(Path("fresh")), *names}
     assert all(Path("out", name).read_text() == Path(name).name for name in names)
 
 
