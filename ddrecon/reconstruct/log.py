@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ddrecon.display import Displayed
 from ddrecon.scene import Scene
@@ -34,25 +34,6 @@ class Row:
 
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
-
-
-def sum_rows(total: Row, row: Row) -> Row:
-    """`total` of the rows before `row`, and `row`.
-
-    It is `row` with all solver iterations so far, and where it lacks SSIM or the quality of test
-    views, the last that is known.
-    """
-    known = {
-        name: getattr(total, name)
-        for name in ("test_psnr", "ssim", "test_ssim")
-        if getattr(row, name) is None
-    }
-    return replace(
-        row,
-        **known,
-        forward_iterations=total.forward_iterations + row.forward_iterations,
-        adjoint_iterations=total.adjoint_iterations + row.adjoint_iterations,
-    )
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from time import perf_counter
 from typing import Any
 
@@ -23,7 +23,7 @@ from ddrecon.ranks import cells_are_shared, from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
-from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
+from ddrecon.reconstruct.log import NO_ROWS, Result, Row
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
 from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
@@ -152,7 +152,11 @@ class Reconstruction:
             ssim=ssim,
             test_ssim=test_ssim,
         )
-        self.total = sum_rows(self.total, row)
+        # Sum: the solvers' iterations, and quality as last known.
+        known = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
+        counts = "forward_iterations", "adjoint_iterations"
+        sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
+        self.total = replace(row, **known, **sums)
         return row
 
     def current_scene(self) -> Scene:
@@ -209,7 +213,6 @@ class Reconstruction:
             return differentiate(self.level.train, names, values, compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
-            compared.gather()
             compared.require_finite()
             raise
         finally:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import islice
-from statistics import fmean
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
-from ddrecon.ranks import cells_are_shared
+from ddrecon.ranks import cells_are_shared, sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import gather_numbers, own_views
+from ddrecon.reconstruct.shares import own_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
@@ -66,16 +65,12 @@ class Comparison:
         """The part of the mean loss that `view` has, by weight."""
         return view.weight / sum(view.weight for view in self.views)
 
-    def gather(self) -> None:
-        """Learns what other ranks have compared, of which they keep the pictures."""
-        names = [view.name for view in self.views]
-        self.found = gather_numbers(self.found, list(self.pictures), names)
-
     def require_finite(self) -> None:
-        """Raises NotFiniteError where a loss is not finite."""
-        for view, loss in zip(self.views, self.found["loss"], strict=False):
+        """Raises NotFiniteError where the loss of a view of this rank's is not finite."""
+        own = [view.name for view in self.views if view.name in self.pictures]
+        for name, loss in zip(own, self.found["loss"], strict=False):
             if not math.isfinite(loss):
-                raise NotFiniteError(f"the loss of view {view.name} is not finite")
+                raise NotFiniteError(f"the loss of view {name} is not finite")
 
     def read(
         self,
@@ -90,16 +85,15 @@ class Comparison:
         `gradients`. Raises NotFiniteError where a loss, or a derivative by one of the `parameters`,
         is not finite.
         """
-        self.gather()
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
         groups = [[loss, objective.loss], extremes, *self.found.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
         (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
-        losses, *qualities = rows
-        if not all(map(math.isfinite, losses + ends)):
+        if not all(map(math.isfinite, [total, *ends])):
             self.require_finite()
             require_finite(parameters, gradients)
-        psnr, *ssim = map(fmean, qualities)
+            raise NotFiniteError("the loss is not finite")
+        psnr, *ssim = (one / len(self.views) for one in sum_numbers([sum(row) for row in rows[1:]]))
         return total, of_images, psnr, ssim[0] if ssim else None
 
 
@@ -143,9 +137,8 @@ def render_quality(
                 fitted, _ = fit_held_out(image, view, target, parameters)
                 found["psnr"].append(target.psnr_of(fitted))
                 found["ssim"].append(target.ssim_of(fitted))
-    rows = gather_numbers(found, own, names).values()
-    psnr, ssim = torch.stack([torch.stack(row).mean() for row in rows]).tolist()
-    return psnr, ssim
+    psnr, ssim = sum_numbers([float(sum(row)) for row in found.values()])
+    return psnr / len(names), ssim / len(names)
 
 
 def fit_held_out(

@@ -6,7 +6,7 @@ Ranks share out the views of a scene, or its cells.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -82,23 +82,6 @@ def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[T
     ]
     sums = iter(sum_over_ranks(chosen))
     return [next(sums) if is_any else None for is_any in is_found]
-
-
-def gather_numbers(
-    found: Mapping[str, Sequence[Tensor]], own: Collection[str], names: Sequence[str]
-) -> dict[str, list[Tensor]]:
-    """What the ranks have `found` of views: numbers by kind, one of each view called `names`.
-
-    Those given are of this rank's `own` views, in the order of these.
-    """
-    if rank_count() == 1:
-        return {kind: list(numbers) for kind, numbers in found.items()}
-    table = torch.zeros(len(found), len(names), dtype=torch.float64)
-    places = [place for place, name in enumerate(names) if name in own]
-    for row, numbers in zip(table, found.values(), strict=True):
-        for place, number in zip(places, numbers, strict=True):
-            row[place] = number
-    return dict(zip(found, map(list, sum_over_ranks([table])[0]), strict=True))
 
 
 def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:
