@@ -168,7 +168,10 @@ def find_curvatures(
                 for name in views:
                     found[name].append(change_of(lit, world, name))
         for name, changes in found.items():
-            jacobians[name].append(_by_entry(torch.stack(changes), _count(p)).flatten(1))
+            columns, count = torch.stack(changes), _count(p)
+            if len(columns) < count:  # all colors have changed at once
+                columns = columns * torch.eye(count).to(columns)[..., None, None]
+            jacobians[name].append(columns.flatten(1))
 
     with torch.no_grad():
         is_lit = any(p.view in rendered for p in numbers if p.view is not None)
@@ -249,13 +252,6 @@ def _ways(p: Parameter, value: Tensor) -> Tensor:
     if kind_of(p.name).is_color:
         return torch.ones_like(value)[None]
     return torch.eye(value.numel()).to(value).view(-1, *value.shape)
-
-
-def _by_entry(changes: Tensor, count: int) -> Tensor:
-    """The pictures [count, 3, h, w] that each entry changes, of `changes` [m, 3, h, w]."""
-    if len(changes) == count:
-        return changes
-    return changes * torch.eye(count).to(changes)[..., None, None]
 
 
 class Gauge:

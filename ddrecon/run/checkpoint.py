@@ -163,8 +163,7 @@ def _leaves(tree: Any, path: str) -> dict[str, Any]:
 def _shorten(value: Any) -> str:
     if value is ABSENT:
         return "absent"
-    text = json.dumps(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return json.dumps(value)[:LONGEST]
 
 
 def _digest(path: Path) -> str:

@@ -45,7 +45,8 @@ def diagnose(
     seen = [view for view in views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
     overfit = find_overfit(seen, quality)
-    usual, share = usual_gain(trained, images), _promised_share(rows, sure=0)
+    gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
+    usual, share = median(gains) if len(gains) > 2 else 1.0, _promised_share(rows, sure=0)
     # What is not yet explained is no picture's fault as long as going on may explain it: that is
     # what the loss loses in as many iterations again, be it by chance. It is all where a run is too
     # short to tell, and where renders as a whole lack the usual gain.
@@ -73,12 +74,6 @@ def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float
         f"overfit: views held out are {mean(train) - mean(test):.1f} dB worse than those trained "
         "on; raise optimize.parameters.density.tv, add views, or look for cameras that are off"
     )
-
-
-def usual_gain(views: Sequence[View], images: Mapping[str, Tensor]) -> float:
-    """By what factor most pictures are brighter than their renders; 1 of fewer than three."""
-    gains = [_gain(view, images[view.name], 1.0)[0] for view in views]
-    return median(gains) if len(gains) > 2 else 1.0
 
 
 def find_exposure(
