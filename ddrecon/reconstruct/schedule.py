@@ -9,7 +9,6 @@ iterations is used up; the last part only at rest, or after `MOST` iterations in
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import torch
@@ -39,9 +38,10 @@ class Schedule:
         self.planned = tuning.PLANNED if self.is_auto else int(settings.iterations)
         self.most = tuning.MOST if self.is_auto else self.planned
         self.refine_at = settings.refine_at
-        # Whole passes over all views, so that a window does not tell one view from another.
-        passes = count // math.gcd(count, min(settings.views_per_iteration or count, count))
-        self.window = math.ceil(tuning.WINDOW / passes) * passes
+        # As nearly whole passes as can be, so that a window hardly tells one view from another.
+        drawn = min(settings.views_per_iteration or count, count)
+        windows = range(tuning.WINDOW, tuning.WINDOW + count // drawn + 1)
+        self.window = min(windows, key=lambda window: window * drawn % count)
         self.progress = Progress()
 
     def is_over(self, iteration: int) -> bool:

@@ -63,9 +63,9 @@ def test_a_loss_at_rest_ends_a_part_after_two_windows() -> None:
 
 def test_a_window_tells_no_view_from_another() -> None:
     """Views whose losses differ a hundredfold are drawn in turn, and none comes down."""
-    schedule = schedule_of(count=50, drawn=3)
-    stages = drive(schedule, lambda made: 100.0 if made % 50 < 17 else 1.0)
-    assert schedule.window == 50 and stages == [0] * 100 + [1] * 100 + [2] * 200
+    schedule = schedule_of(count=50, drawn=4)
+    stages = drive(schedule, lambda made: 100.0 if made % 25 < 8 else 1.0)
+    assert schedule.window == 25 and stages == [0] * 50 + [1] * 50 + [2] * 100
 
 
 def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
