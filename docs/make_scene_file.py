@@ -365,7 +365,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "noise": (
                 "How pictures err, for `loss: photon`, which estimates it unless given, and for "
-                "`iterations: auto`, which then ends when it alone is left."
+                "`ddrecon uncertainty`."
             ),
             "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
             "derivatives": (

@@ -21,10 +21,9 @@ from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.light.reduced import reduced_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.settings import ParameterSettings, RenderSettings
+from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -76,23 +75,6 @@ def test_layout_in_memory_changes_nothing(is_cellwise: bool):
     found = differentiate(scene, {name: reorder(value) for name, value in values.items()})
     for one, other in zip(found, known, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_step_takes_any_layout(engine: str):
-    use_engine(engine)
-    scene, gradient = every_light(), random_values(*SHAPE, seed=4) - 0.5
-
-    def step(value: Tensor, gradient: Tensor) -> Tensor:
-        parameter = Parameter("density", ParameterSettings(), 0.1, value, scene.volume.grid)
-        parameter.step(gradient, 1.0, 1.0)
-        return parameter.value.detach()
-
-    known = step(scene.volume.density, gradient)
-    assert torch.equal(step(reorder(scene.volume.density), gradient), known)
-    # Its size is added up in the order of memory.
-    other = step(scene.volume.density, reorder(gradient))
-    torch.testing.assert_close(other, known, rtol=1e-14, atol=1e-14)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -18,9 +18,6 @@ from ddrecon.errors import UsageError
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
 
-SAMPLES = 16
-"""Of the posterior, unless another number is asked for."""
-
 
 @click.command()
 @SCENE
@@ -136,12 +133,7 @@ def render(
     metavar="K",
     help="Write pictures every K iterations.",
 )
-@click.option(
-    "--uncertainty",
-    "has_uncertainty",
-    is_flag=True,
-    help="Then also say how sure the result is, as ddrecon uncertainty does.",
-)
+@click.option("--uncertainty", "has_uncertainty", is_flag=True, hidden=True)
 @SHARE
 @DTYPE
 @REPORT
@@ -157,35 +149,24 @@ def optimize(
     has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
+    if has_uncertainty:
+        raise click.UsageError(f"--uncertainty: say `ddrecon uncertainty {output} -o DIR` after it")
     if iterations is not None:
         session = session.with_override(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
-    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
-    from ddrecon.uncertainty.folder import uncertainty_lines
 
     built, environment = session.build(scene_file), session.environment()
     require_sharing(built)
     if not is_first():
-        run = follow_run(built, scene_file, resume=resume, preview_every=preview_every)
-        if has_uncertainty:
-            follow_uncertainty(run, SAMPLES, Request(run.seed))
+        follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         return
     choice = {"may_exist": overwrite, "resume": resume}
     with open_run(built, scene_file, output, environment, **choice) as (run, folder):
-        is_last = not has_uncertainty
-        summary = drive_run(run, folder, preview_every, session.is_quiet, is_last)
-        lines = summary_lines(summary, output)
-        if has_uncertainty:
-            sure = output / "uncertainty"
-            sure.mkdir(exist_ok=True)
-            choice = {"has_samples": False, "resume": False, "is_quiet": session.is_quiet}
-            record = drive_uncertainty(run, sure, SAMPLES, Request(run.seed), **choice)
-            lines += uncertainty_lines(record, sure)
-            summary |= {"uncertainty": record}
-    session.show(summary, lines)
+        summary = drive_run(run, folder, preview_every, session.is_quiet)
+    session.show(summary, summary_lines(summary, output))
 
 
 @click.command()
@@ -195,7 +176,7 @@ def optimize(
 @click.option(
     "--samples",
     type=click.IntRange(min=2),
-    default=SAMPLES,
+    default=16,
     show_default=True,
     metavar="N",
     help="Samples of the posterior in all, also after --resume.",

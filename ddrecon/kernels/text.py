@@ -39,10 +39,6 @@ _PACKETS = Path(__file__).with_name("packets.h").read_text(encoding="utf-8")
 LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
 """Items in a packet on a processor (`packets.h`)."""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
-BLOCK = """
-const int begin = item * length, end = begin + length < total ? begin + length : total;
-"""
-"""Before a text: its item does the numbers `begin` to `end` of a `total`, `length` of them."""
 
 
 class TextKernel:

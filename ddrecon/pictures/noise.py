@@ -41,10 +41,6 @@ class Noise:
             variance = variance + (self.step / display_slope(values)) ** 2 / 12
         return variance.sqrt()
 
-    def averaged(self, count: float) -> Noise:
-        """The noise of means of `count` pixels each."""
-        return Noise(self.read / count**0.5, self.shot / count, self.step / count**0.5)
-
 
 def estimate_noise(image: Tensor, step: float) -> Noise:
     """The noise of `image` [3, h, w], found from how its pixels differ from their neighbors.

@@ -21,9 +21,17 @@ from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.reconstruct.shares import share_pictures
-from ddrecon.renderer import solve_light, view_picture
+from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import with_values
+
+
+def change_of(light_field: LightField, world: Scene, name: str) -> Tensor:
+    """How the picture [3, h, w] of the view called `name` changes in `world`, of dual numbers."""
+    derivatives = world.optimize.derivatives if world.optimize else "all"
+    picture = view_picture(light_field, world, world.view(name), derivatives)
+    tangent = forward_ad.unpack_dual(picture).tangent
+    return torch.zeros_like(picture) if tangent is None else tangent.clone()
 
 
 class Curvature:
@@ -101,7 +109,6 @@ class Curvature:
         """
         changes, scene = self.split(vector), scene or self.scene
         known = [k for k in ("lights", "views") if getattr(scene, k) is not getattr(self.scene, k)]
-        derivatives = scene.optimize.derivatives if scene.optimize else "all"
         with torch.no_grad(), forward_ad.dual_level():
             duals = {
                 name: forward_ad.make_dual(value, changes[name])
@@ -110,13 +117,7 @@ class Curvature:
             }
             world = with_values(scene, duals)
             light_field = solve_light(world, self.new_memory())
-
-            def change_of(view: View) -> Tensor:
-                picture = view_picture(light_field, world, world.view(view.name), derivatives)
-                tangent = forward_ad.unpack_dual(picture).tangent
-                return torch.zeros_like(picture) if tangent is None else tangent.clone()
-
-            return share_pictures(scene, change_of)
+            return share_pictures(scene, lambda view: change_of(light_field, world, view.name))
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

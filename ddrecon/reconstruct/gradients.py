@@ -62,12 +62,13 @@ def differentiate(
         (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E3.2).
-    reached = [pair for pair in zip(tensors, leaf_bars, strict=True) if pair[1] is not None]
+    pairs = zip(tensors, leaf_bars, strict=True)
+    reached = [(tensor, bar) for tensor, bar in pairs if bar is not None]
     # Nobody else holds it on its way: its memory is free as soon as it has been of use.
-    del light_field, tensors, leaves, inputs, sums, leaf_bars
+    del light_field, tensors, leaves, inputs, sums, leaf_bars, pairs
     if reached:
-        bars = [bar for _, bar in reached]
-        product = _Product.apply(bars, *(tensor for tensor, _ in reached))
+        # As cotangents of their own, bars would have torch import a system for algebra.
+        product = torch.stack([(bar * tensor).sum() for tensor, bar in reached]).sum()
         reached.clear()
         through_light = torch.autograd.grad(product, list(values.values()), allow_unused=True)
         # The derivative is the sum of both ways.
@@ -108,24 +109,6 @@ def _differentiate_views(
         images.append(image.detach())
         loss = loss + view_loss.detach()
     return images, loss, sums
-
-
-class _Product(torch.autograd.Function):
-    """Zero, in place of sum_i <bar_i, tensor_i>, whose derivatives by the tensors it has: the bars.
-
-    Handing bars to torch.autograd.grad itself would import a system for algebra, for half a second.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, bars: list[Tensor], *tensors: Tensor) -> Tensor:
-        ctx.bars = bars
-        return tensors[0].new_zeros(())
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple[Any, ...]:
-        bars = tuple(ctx.bars)
-        ctx.bars.clear()
-        return None, *bars
 
 
 def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 from torch import Tensor
@@ -13,8 +12,6 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.ghosts import Ghosts
-from ddrecon.slabs.slab import Slab, own_slab
 
 
 def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
@@ -79,22 +76,6 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
     else:
         resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
     return resampled.view(*field.shape[:-3], *grid.shape)
-
-
-def resample_solutions(
-    solutions: Mapping[tuple[str, int], Tensor], before: Grid, grid: Grid
-) -> dict[tuple[str, int], Tensor]:
-    """`solutions` on `grid`, which were on the grid `before`; of slabs where ranks share cells."""
-    old, new = own_slab(before), own_slab(grid)
-
-    def carried(field: Tensor) -> Tensor:
-        if isinstance(old, Slab):
-            ghosts = Ghosts.of(old)
-            field = ghosts.gather(ghosts.own(field))
-        field = resample(field, grid)
-        return Ghosts.of(new).cut(field) if isinstance(new, Slab) else field
-
-    return {kind: carried(field) for kind, field in solutions.items()}
 
 
 def _view_at_level(view: View, factor: int) -> View:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ddrecon.display import Displayed
 from ddrecon.scene import Scene
@@ -15,8 +15,7 @@ class Row:
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
-    views are None where none was rendered, and SSIMs where they were not looked at. `chi_square` is
-    that of the images per pixel, None where their noise is not known.
+    views are None where none was rendered, and SSIMs where they were not looked at.
     """
 
     iteration: int
@@ -31,30 +30,10 @@ class Row:
     penalty: float
     ssim: float | None = None
     test_ssim: float | None = None
-    chi_square: float | None = None
 
 
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
-
-
-def sum_rows(total: Row, row: Row) -> Row:
-    """`total` of the rows before `row`, and `row`.
-
-    It is `row` with all solver iterations so far, and where it lacks SSIM or the quality of test
-    views, the last that is known.
-    """
-    known = {
-        name: getattr(total, name)
-        for name in ("test_psnr", "ssim", "test_ssim")
-        if getattr(row, name) is None
-    }
-    return replace(
-        row,
-        **known,
-        forward_iterations=total.forward_iterations + row.forward_iterations,
-        adjoint_iterations=total.adjoint_iterations + row.adjoint_iterations,
-    )
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from time import perf_counter
 from typing import Any
 
@@ -23,8 +23,7 @@ from ddrecon.ranks import cells_are_shared, from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
-from ddrecon.reconstruct.levels import resample_solutions
-from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
+from ddrecon.reconstruct.log import NO_ROWS, Result, Row
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
 from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
@@ -65,7 +64,7 @@ class Reconstruction:
         settings, train = self.problem.settings, self.problem.train
         self.parameters = start_parameters(scene, settings)
         self.numbers = NumberSteps(train, self.parameters)
-        self.schedule = Schedule(settings, {view.name: view.weight for view in train.views})
+        self.schedule = Schedule(settings, len(train.views))
         self.total = NO_ROWS
         self.misfit = 1.0
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
@@ -113,16 +112,14 @@ class Reconstruction:
         level, power = self.level, self.problem.power
         views, count = level.train.views, self.problem.settings.views_per_iteration
         drawn = pick_views(len(views), count, self.iteration, self.seed)
-        compared = Comparison(
-            [views[i] for i in drawn], level.targets, self._is_test_due, level.noise_targets
-        )
+        compared = Comparison([views[i] for i in drawn], level.targets, self._is_test_due)
         # Differentiate: the objective and its derivative by every parameter.
         values = {parameter.name: parameter.value for parameter in self.parameters}
         objective = self._differentiate(values, compared)
         loss, gradients = add_penalties(objective, self.parameters, power)
         # Check: a derivative that is not finite would spoil the parameters for good.
         read = compared.read(objective, loss, gradients, self.parameters)
-        total, of_images, of_views = read
+        total, of_images, psnr, ssim = read
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         # Solutions are not in it: solves only begin there.
         self.before_step = None
@@ -132,11 +129,7 @@ class Reconstruction:
         self.misfit = math.sqrt(of_images / power) if power else 1.0
         self._step(values, gradients, compared)
         # Judge: is there more to be done, here or at all?
-        names = [view.name for view in compared.views]
-        by_view = {kind: dict(zip(names, row, strict=True)) for kind, row in of_views.items()}
-        losses, chi_squares = by_view["loss"], by_view.get("chi_square", {})
-        self.schedule.note(self.iteration, losses, chi_squares, total - of_images)
-        means = {kind: sum(row) / len(row) for kind, row in of_views.items()}
+        self.schedule.note(self.iteration, total)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim = None, None
@@ -151,16 +144,19 @@ class Reconstruction:
             loss=total,
             data_loss=of_images,
             penalty=total - of_images,
-            psnr=means["psnr"],
+            psnr=psnr,
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
             cells=level.train.volume.grid.cells,
-            ssim=means.get("ssim"),
+            ssim=ssim,
             test_ssim=test_ssim,
-            chi_square=means.get("chi_square"),
         )
-        self.total = sum_rows(self.total, row)
+        # Sum: the solvers' iterations, and quality as last known.
+        known = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
+        counts = "forward_iterations", "adjoint_iterations"
+        sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
+        self.total = replace(row, **known, **sums)
         return row
 
     def current_scene(self) -> Scene:
@@ -197,11 +193,11 @@ class Reconstruction:
             self.memory.last[kind] = field.to(self.problem.scene.volume.density)
 
     def _enter_stage(self, stage: int) -> None:
-        """Takes scenes, parameters and solutions to the resolution of `stage`."""
+        """Takes scenes and parameters to the resolution of `stage`."""
         self.stage, self.level = stage, self.problem.at(stage)
-        before, volume = self.parameters[0].grid, self.level.train.volume
-        self.memory.last = resample_solutions(self.memory.last, before, volume.grid)
-        self.numbers.curvatures = {}  # which belong to another resolution
+        volume = self.level.train.volume
+        # These belong to another resolution.
+        self.memory.last, self.numbers.curvatures = {}, {}
         for parameter in self.parameters:
             if parameter.grid != volume.grid:
                 parameter.refine(volume.grid)
@@ -217,7 +213,6 @@ class Reconstruction:
             return differentiate(self.level.train, names, values, compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
-            compared.gather()
             compared.require_finite()
             raise
         finally:

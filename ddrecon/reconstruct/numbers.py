@@ -24,11 +24,11 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.curvature import Curvature, change_of
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import has_slabs, own_views
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import LightField, solve_light
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
 from ddrecon.variables.values import with_values
@@ -99,7 +99,11 @@ class NumberSteps:
             at = places[p.name]
             block = matrix[at[:, None], at]
             if p in self.calibrated:
-                prior = weigh_calibration(p, block, unit[at], point.scene)
+                # As strong as what the picture says of a shift in the image by `TRUST`.
+                of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2
+                camera = next(v.camera for v in point.scene.views if v.name == p.view)
+                prior = calibration_prior(camera, p.grid).cpu() * of_shifts
+                prior = prior * unit[at] * unit[at][:, None]
                 right[at] -= prior @ (p.value.detach().double().cpu() / unit[at])
                 block = block + prior
             least = tuning.LEAST * block.diagonal().max() + torch.finfo(torch.float32).tiny
@@ -149,7 +153,6 @@ def find_curvatures(
     scene, values = point.scene, point.values
     own = own_views(scene, names)
     rendered = names if has_slabs(scene) else own
-    derivatives = scene.optimize.derivatives if scene.optimize else "all"
     jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
 
     def light_of(world: Scene) -> LightField:
@@ -163,11 +166,12 @@ def find_curvatures(
                 world = with_values(scene, {**values, **moving})
                 lit = light_of(world) if light is None else light
                 for name in views:
-                    picture = view_picture(lit, world, world.view(name), derivatives)
-                    tangent = forward_ad.unpack_dual(picture).tangent
-                    found[name].append(picture * 0 if tangent is None else tangent.clone())
+                    found[name].append(change_of(lit, world, name))
         for name, changes in found.items():
-            jacobians[name].append(_by_entry(torch.stack(changes), _count(p)).flatten(1))
+            columns, count = torch.stack(changes), _count(p)
+            if len(columns) < count:  # all colors have changed at once
+                columns = columns * torch.eye(count).to(columns)[..., None, None]
+            jacobians[name].append(columns.flatten(1))
 
     with torch.no_grad():
         is_lit = any(p.view in rendered for p in numbers if p.view is not None)
@@ -213,7 +217,6 @@ def _sum_between(
 
 
 def _shown_by(view: str, numbers: Sequence[Parameter]) -> list[Parameter]:
-    """Those of `numbers` that the picture of `view` shows."""
     return [p for p in numbers if p.view is None or p.view == view]
 
 
@@ -249,13 +252,6 @@ def _ways(p: Parameter, value: Tensor) -> Tensor:
     if kind_of(p.name).is_color:
         return torch.ones_like(value)[None]
     return torch.eye(value.numel()).to(value).view(-1, *value.shape)
-
-
-def _by_entry(changes: Tensor, count: int) -> Tensor:
-    """The pictures [count, 3, h, w] that each entry changes, of `changes` [m, 3, h, w]."""
-    if len(changes) == count:
-        return changes
-    return changes * torch.eye(count).to(changes)[..., None, None]
 
 
 class Gauge:
@@ -318,18 +314,6 @@ def _common_motion(view: View, scene: Scene) -> Tensor:
     if view.camera.is_perspective:
         motion[3:, 6] = axes.T @ away
     return motion
-
-
-def weigh_calibration(pose: Parameter, curvature: Tensor, unit: Tensor, scene: Scene) -> Tensor:
-    """The second derivative [6, 6] of what the calibration of a camera adds to its view's loss.
-
-    It is as strong as what the picture, by the loss's `curvature` [6, 6], says of a shift in the
-    image by `TRUST`; both are in the `unit` [6] of the twist `pose`, its rates.
-    """
-    assert pose.view is not None
-    of_shifts = curvature.diagonal()[3:5].mean() / PIXELS**2
-    prior = calibration_prior(scene.view(pose.view).camera, scene.volume.grid).cpu()
-    return prior * unit * unit[:, None] * (tuning.TRUST**2 * of_shifts)
 
 
 def calibration_prior(camera: Camera, grid: Grid) -> Tensor:

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
-from ddrecon.ranks import cells_are_shared
+from ddrecon.ranks import cells_are_shared, sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import gather_numbers, own_views
+from ddrecon.reconstruct.shares import own_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
@@ -32,8 +32,8 @@ def target_of(view: View) -> Tensor:
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    With `has_similarity` by SSIM as well, and by chi^2 where there are `noise_targets`. `pictures`
-    are this rank's images so far, by name, `found` their numbers in that order, by kind.
+    With `has_similarity` by SSIM as well. `pictures` are this rank's images so far, by name,
+    `found` their numbers in that order, by kind.
     """
 
     def __init__(
@@ -41,11 +41,10 @@ class Comparison:
         views: Sequence[View],
         targets: Mapping[str, Target],
         has_similarity: bool = False,
-        noise_targets: Mapping[str, Target] | None = None,
     ):
-        self.views, self.targets, self.noise_targets = views, targets, noise_targets or {}
-        kinds = {"loss": True, "psnr": True, "ssim": has_similarity, "chi_square": noise_targets}
-        self.found: dict[str, list[Tensor]] = {kind: [] for kind, is_so in kinds.items() if is_so}
+        self.views, self.targets = views, targets
+        kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]
+        self.found: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
         self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
@@ -60,24 +59,18 @@ class Comparison:
         self.found["psnr"].append(target.psnr_of(seen))
         if "ssim" in self.found:
             self.found["ssim"].append(target.ssim_of(seen))
-        if "chi_square" in self.found:
-            self.found["chi_square"].append(self.noise_targets[view.name].loss_of(seen))
         return value
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""
         return view.weight / sum(view.weight for view in self.views)
 
-    def gather(self) -> None:
-        """Learns what other ranks have compared, of which they keep the pictures."""
-        names = [view.name for view in self.views]
-        self.found = gather_numbers(self.found, list(self.pictures), names)
-
     def require_finite(self) -> None:
-        """Raises NotFiniteError where a loss is not finite."""
-        for view, loss in zip(self.views, self.found["loss"], strict=False):
+        """Raises NotFiniteError where the loss of a view of this rank's is not finite."""
+        own = [view.name for view in self.views if view.name in self.pictures]
+        for name, loss in zip(own, self.found["loss"], strict=False):
             if not math.isfinite(loss):
-                raise NotFiniteError(f"the loss of view {view.name} is not finite")
+                raise NotFiniteError(f"the loss of view {name} is not finite")
 
     def read(
         self,
@@ -85,25 +78,23 @@ class Comparison:
         loss: Tensor,
         gradients: Mapping[str, Tensor],
         parameters: Sequence[Parameter],
-    ) -> tuple[float, float, dict[str, list[float]]]:
-        """The `loss` of an iteration, its part of the images, and numbers of each view by kind.
+    ) -> tuple[float, float, float, float | None]:
+        """The `loss` of an iteration, its part of the images, their mean PSNR [dB], and SSIM.
 
-        They are its loss, "psnr" [dB], "ssim" where that was looked at, and "chi_square" per pixel
-        where noise is known; all are read at once, with the extremes of `gradients`. Raises
-        NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
+        The last is None where it was not looked at. All are read at once, with the extremes of
+        `gradients`. Raises NotFiniteError where a loss, or a derivative by one of the `parameters`,
+        is not finite.
         """
-        self.gather()
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
         groups = [[loss, objective.loss], extremes, *self.found.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
         (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
-        of_views = dict(zip(self.found, rows, strict=True))
-        if not all(math.isfinite(number) for number in of_views["loss"] + ends):
+        if not all(map(math.isfinite, [total, *ends])):
             self.require_finite()
             require_finite(parameters, gradients)
-        shares = map(self.share, self.views)
-        losses = [x / share for x, share in zip(of_views["loss"], shares, strict=True)]
-        return total, of_images, of_views | {"loss": losses}
+            raise NotFiniteError("the loss is not finite")
+        psnr, *ssim = (one / len(self.views) for one in sum_numbers([sum(row) for row in rows[1:]]))
+        return total, of_images, psnr, ssim[0] if ssim else None
 
 
 def add_penalties(
@@ -146,9 +137,8 @@ def render_quality(
                 fitted, _ = fit_held_out(image, view, target, parameters)
                 found["psnr"].append(target.psnr_of(fitted))
                 found["ssim"].append(target.ssim_of(fitted))
-    rows = gather_numbers(found, own, names).values()
-    psnr, ssim = torch.stack([torch.stack(row).mean() for row in rows]).tolist()
-    return psnr, ssim
+    psnr, ssim = sum_numbers([float(sum(row)) for row in found.values()])
+    return psnr / len(names), ssim / len(names)
 
 
 def fit_held_out(
@@ -161,41 +151,30 @@ def fit_held_out(
     do harm to a picture that is far off: then the exposure alone is found, or none.
     """
     sizes = {p.key: len(p.value) for p in parameters if p.view is not None and p.key in RESPONSE}
-    exposure, offset = (
-        picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
+    known = {
+        key: picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
         for key, default in RESPONSE.items()
-    )
-    known = {"exposure": exposure, "offset": offset}
-    light = (picture - offset.view(-1, 1, 1)) / exposure.view(-1, 1, 1)
-    tried = [(picture, {key: known[key].expand(size) for key, size in sizes.items()})]
-    for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
-        if sizes.keys() >= set(keys):
-            fit = fit_response(light, target, known, {key: sizes[key] for key in keys})
-            shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
-            tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
-    return max(tried, key=lambda each: float(target.psnr_of(each[0])))
-
-
-def fit_response(
-    light: Tensor, target: Target, known: Mapping[str, Tensor], sizes: Mapping[str, int]
-) -> dict[str, Tensor]:
-    """The exposure and offset by which `light` [3, h, w] is nearest to `target`.
-
-    By least squares, weighed as the target's loss weighs small errors. Those in `sizes`, of so many
-    entries, 1 or 3, are found; the others are `known`. A background behind the volume counts as if
-    it were exposed with it.
-    """
+    }
+    exposure, offset = (known[key].view(-1, 1, 1) for key in ("exposure", "offset"))
+    # A background behind the volume counts as if it were exposed with it.
+    light = (picture - offset) / exposure
     basis = {"exposure": light, "offset": torch.ones_like(light)}
     weight = target.slope if target.seen is None else target.slope * target.seen
-    right, columns = target.image, list[Tensor]()
-    for key, part in basis.items():
-        if key in sizes:
-            each = torch.eye(3).to(light) if sizes[key] == 3 else light.new_ones(1, 3)
-            columns.append(each[..., None, None] * part)
-        else:
-            right = right - known[key].view(-1, 1, 1) * part
-    matrix = (torch.cat(columns) * weight).flatten(1).double().cpu()
-    normal, right = matrix @ matrix.T, matrix @ (right * weight).flatten().double().cpu()
-    # What a picture does not show, such as the exposure of black, is 0.
-    found = (torch.linalg.pinv(normal, hermitian=True) @ right).to(light)
-    return {**known, **dict(zip(sizes, found.split(list(sizes.values())), strict=True))}
+    tried = [(picture, {key: known[key].expand(size) for key, size in sizes.items()})]
+    for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
+        if not sizes.keys() >= set(keys):
+            continue
+        # By least squares, weighed as the target's loss weighs small errors.
+        ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
+        columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
+        rest = sum(known[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
+        matrix, right = (
+            (part * weight).double().cpu().flatten(-3) for part in (columns, target.image - rest)
+        )
+        # What a picture does not show, such as the exposure of black, is 0.
+        found = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
+        parts = found.to(light).split([sizes[key] for key in keys])
+        fit = known | dict(zip(keys, parts, strict=True))
+        shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
+        tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
+    return max(tried, key=lambda each: float(target.psnr_of(each[0])))

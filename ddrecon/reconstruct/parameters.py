@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.losses import KNEE, compress, total_variation
 from ddrecon.reconstruct import tuning
@@ -60,12 +59,9 @@ class Parameter:
         """
         if not self.tv:
             return self.value.new_zeros(())
-        variation = total_variation
-        if current_engine() == "warp":
-            from ddrecon.reconstruct.fused.passes import total_variation as variation
         value = self.value / self.unit
         seen = value if self.knee is None else compress(value, self.knee)
-        return (power * self.tv) * variation(seen, self.grid)
+        return (power * self.tv) * total_variation(seen, self.grid)
 
     @property
     def largest_rate(self) -> float:
@@ -92,17 +88,11 @@ class Parameter:
             stiffness = stiffness_diagonal(before / self.unit, self.grid, self.knee)
             factor = tuning.STIFFNESS * rate * power * self.tv / self.unit**2
             smallest = torch.add(smallest, stiffness, alpha=factor)
-        if current_engine() == "warp":
-            from ddrecon.reconstruct.fused.passes import step_adam
-
-            many = self.moments, self.steps, rate, smallest, (self.low, self.high)
-            value, self.moments = step_adam(before, gradient, *many)
-        else:
-            first = self.moments[0].lerp(gradient, 1 - keep[0])
-            second = self.moments[1].mul(keep[1]).addcmul_(gradient, gradient, value=1 - keep[1])
-            size = (second.sqrt() / weights[1] ** 0.5) + smallest
-            value = before - gradient.lerp(first, keep[0]) / size * (rate / weights[0])
-            value, self.moments = value.clamp_(self.low, self.high), (first, second)
+        first = self.moments[0].lerp(gradient, 1 - keep[0])
+        second = self.moments[1].mul(keep[1]).addcmul_(gradient, gradient, value=1 - keep[1])
+        size = (second.sqrt() / weights[1] ** 0.5) + smallest
+        value = before - gradient.lerp(first, keep[0]) / size * (rate / weights[0])
+        value, self.moments = value.clamp_(self.low, self.high), (first, second)
         if self.support is not None:
             value.mul_(self.support)
         self.value = value.requires_grad_()

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.losses import ROUNDING, compress, compressed_slope
 
@@ -75,12 +74,7 @@ def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> 
     That is the diagonal of R (E11.2); None is without compression.
     """
     seen = field if knee is None else compress(field, knee)
-    if current_engine() == "warp":
-        from ddrecon.reconstruct.fused.passes import variation_diagonal
-
-        diagonal = variation_diagonal(seen, grid)
-    else:
-        diagonal = Roughness.about(seen, grid, 1.0).diagonal()
+    diagonal = Roughness.about(seen, grid, 1.0).diagonal()
     return diagonal if knee is None else diagonal.mul_(compressed_slope(field, knee).square_())
 
 

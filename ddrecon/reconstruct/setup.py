@@ -61,8 +61,8 @@ class Problem:
 
     def at(self, stage: int) -> Level:
         """It at the resolution of `stage`."""
-        factor, fine = self.factors[stage], self.train
-        train, test = (scene_at_level(scene, factor) for scene in (fine, self.test))
+        factor = self.factors[stage]
+        train, test = (scene_at_level(scene, factor) for scene in (self.train, self.test))
         if self.support is not None:
             cells = self.support.on(train.volume.grid)
             train, test = (
@@ -70,7 +70,7 @@ class Problem:
                 for scene in (train, test)
             )
         targets, shown = (targets_of(scene, self.loss, self.noises) for scene in (train, test))
-        return Level(train, test, targets, shown, noise_targets(train, fine, self.noises))
+        return Level(train, test, targets, shown)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,6 @@ class Level:
     test: Scene
     targets: Mapping[str, Target]
     test_targets: Mapping[str, Target]
-    noise_targets: Mapping[str, Target]
 
 
 def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
@@ -178,32 +177,16 @@ def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
 
 
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
-    """The noise of the picture of each view of `scene`, by name, where it is known, else nothing.
+    """The noise of the picture of each view of `scene`, by name, if `loss` compares by it.
 
-    It is known where the scene gives that of every training view, or where `loss` compares by it:
-    then it is estimated from pictures where it is not given.
+    It is estimated from pictures where it is not given.
     """
-    if loss != "photon" and not all(v.is_test or given_noise(v, settings) for v in scene.views):
+    if loss != "photon":
         return {}
     return {
         view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
         for view in scene.views
     }
-
-
-def noise_targets(level: Scene, scene: Scene, noises: Mapping[str, Noise]) -> dict[str, Target]:
-    """What tells chi^2 of the views of `level`, which is `scene` with fewer pixels, by name.
-
-    `noises` are those of the views of `scene`: larger pixels are means, and have less of it.
-    """
-    targets = {}
-    for view, fine in zip(level.views, scene.views, strict=True):
-        if noise := noises.get(view.name):
-            count = fine.camera.size[0] * fine.camera.size[1]
-            averaged = noise.averaged(count / (view.camera.size[0] * view.camera.size[1]))
-            image = target_of(view)
-            targets[view.name] = Target.of(image, view.mask, "photon", averaged)
-    return targets
 
 
 def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:

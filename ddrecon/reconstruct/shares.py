@@ -6,7 +6,7 @@ Ranks share out the views of a scene, or its cells.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -48,39 +48,25 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     One that is named twice is rendered twice, by the same rank.
     """
     pixels = {name: math.prod(scene.view(name).camera.size) for name in names}
-    owners = assign([names.count(name) * count for name, count in pixels.items()], rank_count())
-    own = [name for name, owner in zip(pixels, owners, strict=True) if owner == own_rank()]
+    # By turns, those of most pixels first, so that all end at about one time.
+    own = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
     return [name for name in names if name in own]
 
 
 def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[str, Tensor]:
     """The pictures [3, h, w] of the views of `scene`, by name, on all ranks.
 
-    Each is what `picture_of` gives one of them. Of cells in slabs all ranks look at all views.
+    Each is what `picture_of` gives one of them.
     """
     names = [view.name for view in scene.views]
-    rendered = names if has_slabs(scene) else own_views(scene, names)
+    rendered = own_views(scene, names)
     pictures = [
         picture_of(view)
         if view.name in rendered
         else scene.volume.density.new_zeros(3, *view.camera.size)
         for view in scene.views
     ]
-    pictures = pictures if has_slabs(scene) else sum_over_ranks(pictures)
-    return dict(zip(names, pictures, strict=True))
-
-
-def assign(costs: Sequence[float], ranks: int) -> list[int]:
-    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
-
-    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
-    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
-    """
-    owners, loads = [0] * len(costs), [0.0] * ranks
-    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
-        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
-        loads[owners[job]] += costs[job]
-    return owners
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
@@ -96,23 +82,6 @@ def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[T
     ]
     sums = iter(sum_over_ranks(chosen))
     return [next(sums) if is_any else None for is_any in is_found]
-
-
-def gather_numbers(
-    found: Mapping[str, Sequence[Tensor]], own: Collection[str], names: Sequence[str]
-) -> dict[str, list[Tensor]]:
-    """What the ranks have `found` of views: numbers by kind, one of each view called `names`.
-
-    Those given are of this rank's `own` views, in the order of these.
-    """
-    if rank_count() == 1:
-        return {kind: list(numbers) for kind, numbers in found.items()}
-    table = torch.zeros(len(found), len(names), dtype=torch.float64)
-    places = [place for place, name in enumerate(names) if name in own]
-    for row, numbers in zip(table, found.values(), strict=True):
-        for place, number in zip(places, numbers, strict=True):
-            row[place] = number
-    return dict(zip(found, map(list, sum_over_ranks([table])[0]), strict=True))
 
 
 def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
-FORMAT = 7
+FORMAT = 8
 """What a checkpoint holds; counts up when that changes."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
@@ -135,38 +135,37 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def differences(old: Any, new: Any, path: str = "") -> list[str]:
+def differences(old: Any, new: Any) -> list[str]:
     """The differences between two trees of mappings, lists and plain values, a text for each.
 
-    A text reads `key.path is A there, B now`; both trees stand at `path`.
+    A text reads `key.path is A there, B now`.
     """
-    one, other = _children(old), _children(new)
-    if one is None or other is None:
-        return [f"{path} is {_shorten(old)} there, {_shorten(new)} now"] if old != new else []
-    pairs = {key: (one.get(key, ABSENT), other.get(key, ABSENT)) for key in [*one, *other]}
+    one, other = _leaves(old, ""), _leaves(new, "")
+    pairs = {path: (one.get(path, ABSENT), other.get(path, ABSENT)) for path in one | other}
     return [
-        text
-        for key, pair in pairs.items()
-        for text in differences(*pair, f"{path}.{key}" if path else str(key))
+        f"{path[1:]} is {_shorten(there)} there, {_shorten(now)} now"
+        for path, (there, now) in pairs.items()
+        if there != now
     ]
 
 
-def _children(tree: Any) -> Mapping[Any, Any] | None:
-    """By name or number; None of a plain value, as which a list of numbers counts."""
+def _leaves(tree: Any, path: str) -> dict[str, Any]:
+    """The plain values in `tree` by path; a list of numbers, or nothing, counts as one."""
     if isinstance(tree, list) and any(isinstance(entry, Mapping) for entry in tree):
-        return dict(enumerate(tree))
-    return tree if isinstance(tree, Mapping) else None
+        tree = dict(enumerate(tree))
+    if not isinstance(tree, Mapping) or not tree:
+        return {path: tree}
+    leaves = [_leaves(branch, f"{path}.{key}") for key, branch in tree.items()]
+    return {at: leaf for part in leaves for at, leaf in part.items()}
 
 
 def _shorten(value: Any) -> str:
     if value is ABSENT:
         return "absent"
-    text = json.dumps(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return json.dumps(value)[:LONGEST]
 
 
 def _digest(path: Path) -> str:
-    """The SHA-256 of the file at `path`, or of those of all files in the folder `path`."""
     if path.is_dir():
         return hashlib.sha256(
             "".join(_digest(entry) for entry in sorted(path.iterdir())).encode()

@@ -45,11 +45,17 @@ def diagnose(
     seen = [view for view in views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
     overfit = find_overfit(seen, quality)
-    # What is not yet explained is no picture's fault as long as going on may explain it.
-    least = max(EXPLAINED, find_share_to_go(rows, usual_gain(trained, images)))
+    gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
+    usual, share = median(gains) if len(gains) > 2 else 1.0, _promised_share(rows, sure=0)
+    # What is not yet explained is no picture's fault as long as going on may explain it: that is
+    # what the loss loses in as many iterations again, be it by chance. It is all where a run is too
+    # short to tell, and where renders as a whole lack the usual gain.
+    least = 1.0
+    if share is not None and abs(math.log(usual)) <= math.log(GAIN):
+        least = max(EXPLAINED, share)
     told = {
         "overfit": overfit,
-        "exposure": find_exposure(trained, images, least),
+        "exposure": find_exposure(trained, images, usual, least),
         "cameras": find_shift(trained, images, least),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
@@ -70,28 +76,14 @@ def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float
     )
 
 
-def find_share_to_go(rows: Sequence[Row], usual: float) -> float:
-    """The part of the misfit that going on may explain, 0 to 1.
-
-    That is what the loss loses in as many iterations again, be it by chance. It is all where a run
-    is too short to tell, and where renders as a whole lack the `usual` gain.
-    """
-    share = _promised_share(rows, sure=0)
-    return 1.0 if share is None or abs(math.log(usual)) > math.log(GAIN) else min(share, 1.0)
-
-
-def usual_gain(views: Sequence[View], images: Mapping[str, Tensor]) -> float:
-    """By what factor most pictures are brighter than their renders; 1 of fewer than three."""
-    gains = [_gain(view, images[view.name], 1.0)[0] for view in views]
-    return median(gains) if len(gains) > 2 else 1.0
-
-
-def find_exposure(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
-    """Whether some picture is brighter or darker, as a whole, than the others say.
+def find_exposure(
+    views: Sequence[View], images: Mapping[str, Tensor], usual: float, least: float
+) -> str | None:
+    """Whether some picture is brighter or darker, as a whole, than by the `usual` gain.
 
     A factor is to explain more than the part `least` of what the picture leaves.
     """
-    odd, usual = {}, usual_gain(views, images)
+    odd = {}
     for view in views:
         gain, explained = _gain(view, images[view.name], usual)
         if abs(math.log(gain / usual)) > math.log(GAIN) and explained > least:

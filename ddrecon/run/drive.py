@@ -15,7 +15,7 @@ from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.progress import bar_settings
-from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
+from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
@@ -84,8 +84,8 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
 
 def follow_run(
     scene: Scene, scene_file: SceneFile, *, resume: bool, preview_every: int | None
-) -> Reconstruction:
-    """This rank's part of a run of `scene` that the first rank drives, and alone writes; done.
+) -> None:
+    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes.
 
     Where ranks share cells, that is also a part of the pictures that the first one writes.
     """
@@ -101,23 +101,16 @@ def follow_run(
                 raise KeyboardInterrupt
     if cells_are_shared():
         find_results(run)
-    return run
 
 
 def drive_run(
-    run: Reconstruction,
-    folder: RunFolder,
-    preview_every: int | None,
-    is_quiet: bool,
-    is_last: bool = True,
+    run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool
 ) -> dict[str, Any]:
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
-    `preview_every` counts iterations between pictures. Unless this `is_last` of what they do, ranks
-    stay together.
-    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
-    before it is passed on. So do a divergence and the end of another rank; any other failure leaves
-    the checkpoints written so far.
+    `preview_every` counts iterations between pictures. An interrupt (SIGINT or SIGTERM) takes
+    effect between two iterations, and writes a checkpoint before it is passed on. So do a
+    divergence and the end of another rank; any other failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
@@ -155,10 +148,8 @@ def drive_run(
     if cells_are_shared():
         return folder.finish(run)
     # What is left the first rank does by itself.
-    if is_last:
-        leave_ranks()
-    with alone():
-        return folder.finish(run)
+    leave_ranks()
+    return folder.finish(run)
 
 
 def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:

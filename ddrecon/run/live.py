@@ -85,7 +85,6 @@ class LiveRun:
             self.maker.join()
 
     def _remake(self) -> None:
-        """Makes volume and views as the last checkpoint has them."""
         start, path = monotonic(), self.folder / "scene.yaml"
         # What cannot be shown now may be with the next checkpoint.
         with suppress(DdreconError):

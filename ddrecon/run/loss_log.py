@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.errors import DataWarning
-from ddrecon.io.files.atomic import flush, refusals, replace_file
+from ddrecon.io.files.atomic import refusals, replace_file
 from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
@@ -34,10 +34,6 @@ class LossLog:
         """Adds one row."""
         with refusals(self.path), self.path.open("a", newline="") as stream:
             csv.writer(stream).writerow(_cells(row))
-
-    def flush(self) -> None:
-        """Returns when all rows are on the disk."""
-        flush(self.path)
 
     def rows(self, made: int | None = None) -> list[Row]:
         """What was written, but for what cannot be read; with `made` up to that iteration.

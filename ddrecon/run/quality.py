@@ -14,7 +14,7 @@ from ddrecon.pictures.scales import COMPARED, LINEAR
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.reconstruct.setup import choose_loss, targets_of
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.kinds import is_of_volume
@@ -23,7 +23,7 @@ from ddrecon.variables.values import value_of
 
 @dataclass(frozen=True)
 class Findings:
-    """The `scene` as found, the light in it, and of each view with a target its image and quality.
+    """The `scene` as found, and of each view with a target its image and quality.
 
     That is, by name, its split, PSNR and SSIM, and of a test view the exposure it was given to
     compare it. `given` are the fields of the scene file in whose place others were found, by name.
@@ -31,7 +31,6 @@ class Findings:
 
     scene: Scene
     given: Mapping[str, Tensor]
-    light_field: LightField
     images: Mapping[str, Tensor]
     quality: Mapping[str, Mapping[str, Any]]
 
@@ -56,7 +55,7 @@ def find_results(run: Reconstruction) -> Findings:
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
             }
-    return Findings(scene, _given_fields(run.problem.scene), light_field, images, quality)
+    return Findings(scene, _given_fields(run.problem.scene), images, quality)
 
 
 def _given_fields(scene: Scene) -> dict[str, Tensor]:

@@ -139,7 +139,6 @@ def _names(has_components: bool, has_derivatives: bool) -> list[str]:
 def _images(
     light_field: LightField, scene: Scene, view: View, names: Sequence[str]
 ) -> dict[str, Tensor]:
-    """The images of `view` by these `names`."""
     picture = view_picture(light_field, scene, view)
     found = {"": picture}
     if PARTS[0] in names:

@@ -10,7 +10,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from ddrecon.engine import name_engines
@@ -78,7 +77,6 @@ def write_run_report(
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
-    """The sentence below the title."""
     cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
     test = ""
     if summary["test_psnr"] is not None:
@@ -120,7 +118,6 @@ def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
 
 
 def _stills(fields: dict[str, Tensor]) -> str:
-    """Slices and projections of every field."""
     parts = [
         paragraph(
             "Across z, x and y from left to right; y, or z, is up. The largest value is white;"
@@ -178,14 +175,10 @@ def view_section(findings: Findings) -> list[str]:
 
 def _figure(findings: Findings, view: View, white: float, most: int) -> str:
     target, render = (
-        _displayed(image, white, most) for image in (target_of(view), findings.images[view.name])
+        webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
+        for image in (target_of(view), findings.images[view.name])
     )
-    caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
-    return pair(webp_of(target), webp_of(render), caption)
-
-
-def _displayed(image: Tensor, white: float, most: int) -> np.ndarray:
-    return srgb.encode_bytes(pixels(shrink(image, most)) / white)
+    return pair(target, render, f"{view.name}: {_quality_text(findings.quality[view.name])}")
 
 
 def _view_table(findings: Findings) -> str:

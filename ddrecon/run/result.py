@@ -95,7 +95,6 @@ def describe_result(
 
 
 def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:
-    """Puts what was found of a medium into its `section`."""
     if any(set(pair) & set(values) for pair in PAIRS):
         for name in (*PAIRS[0], *PAIRS[1]):
             section.pop(name, None)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import refusals, remove_temporaries, write_json
+from ddrecon.io.files.atomic import flush, refusals, remove_temporaries, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -118,7 +118,7 @@ class RunFolder:
         """
         if self.saved != run.iteration:
             start = monotonic()
-            self.log.flush()
+            flush(self.log.path)
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 
@@ -189,7 +189,6 @@ class RunFolder:
         return parameters
 
     def _pictures(self, found: Findings, mark: str) -> None:
-        """Writes pictures of views and fields."""
         folder = self.path / "previews"
         for name, value in fields_of(found.scene).items():
             write_preview(folder / f"{name}.slices{mark}.png", slices(value))
@@ -237,7 +236,6 @@ RUN_FILES = (
     *("loss.csv", "report.html", *CHECKPOINT_FILES),
     *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
     *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
-    *(f"uncertainty/{name}" for name in SAMPLE_FILES),
 )
 """What files of `ddrecon optimize` are called, but for those named after media and views."""
 

@@ -82,7 +82,6 @@ def follow_uncertainty(run: Reconstruction, samples: int, request: Request) -> N
 
 
 def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) -> Uncertainty:
-    """The samples of `run` so far, as `state` has them."""
     errors = None if state is None else PictureErrors(**state["errors"])
     # Before anything takes long: there may be nothing to rank.
     shots = candidates_of(run.level.train, request.next_view) if request.next_view else []
@@ -93,7 +92,6 @@ def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) 
 
 
 def _draw(found: Uncertainty, samples: int, keep: Callable[[Sample], None], is_quiet: bool) -> None:
-    """Draws what `found` lacks of so many `samples`, and keeps each."""
     bar = tqdm(total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet))
     with defer_interrupt() as asked, bar:
         while found.count < samples:

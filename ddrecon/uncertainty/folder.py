@@ -44,12 +44,13 @@ def write_found(found: Uncertainty, path: Path, seconds: float) -> dict[str, Any
             "deviation": float(deviation.square().mean().sqrt()),
             "told": float(stated["told"][name].mean()),
         }
+    known = "the scene" if found.errors.is_known else "residuals"
     record = {
         "samples": found.count,
         "seconds": seconds,
         "products": found.products,
         "residual": found.residual,
-        "noise": found.errors.described(),
+        "noise": vars(found.errors) | {"from": known},
         "fields": fields,
         "numbers": found.described_numbers(),
         "correlations": found.correlations().tolist() if found.tabled else [],
@@ -123,7 +124,15 @@ def write_uncertainty_report(
         ]
         head = ["picture", "of the variance of all cells, at least"]
         sections.append(section("Next picture", table(head, rows)))
-    sections.append(section("How", *_how(record)))
+    error = 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
+    how = (
+        f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
+        " Told is the part of a cell's variance that pictures took away from what smoothing"
+        " alone leaves open, in the mean of the cells around.",
+        "All this is about the optimum that was found, for pictures that err by noise alone:"
+        " what the model of light lacks is not in it.",
+    )
+    sections.append(section("How", *map(paragraph, how)))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
     noise = record["noise"]
     lead = (
@@ -136,7 +145,6 @@ def write_uncertainty_report(
 def _field(
     name: str, stated: Mapping[str, Mapping[str, Tensor]], numbers: Mapping[str, float]
 ) -> list[str]:
-    """Slices of a field."""
     mean, deviation, told = (stated[kind][name] for kind in ("mean", "std", "told"))
     white, strongest = find_white_value(mean), find_white_value(deviation)
     pictures = [
@@ -154,20 +162,4 @@ def _field(
             " Slices across z, x and y from left to right."
         ),
         f'<div class="views">{shown}</div>',
-    ]
-
-
-def _how(record: Mapping[str, Any]) -> list[str]:
-    """What stands behind the numbers."""
-    error = 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
-    return [
-        paragraph(
-            f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
-            " Told is the part of a cell's variance that pictures took away from what smoothing"
-            " alone leaves open, in the mean of the cells around."
-        ),
-        paragraph(
-            "All this is about the optimum that was found, for pictures that err by noise alone:"
-            " what the model of light lacks is not in it."
-        ),
     ]

@@ -235,7 +235,6 @@ class Posterior:
         return (max(float(residual @ guess), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
     def _within(self, change: Tensor) -> Tensor:
-        """`change`, cut where a bound is."""
         return torch.maximum(torch.minimum(change, self.high), self.low)
 
     def _without_gauge(self, vector: Tensor) -> Tensor:
@@ -338,7 +337,6 @@ class Information:
         return self.curvature.join(parts)
 
     def _probe(self, generator: torch.Generator) -> Tensor:
-        """J^T W^(1/2) times random signs."""
         images = self.curvature.images
         signs = {
             name: weight.sqrt() * normal_like(images[name], generator).sign()

@@ -51,10 +51,6 @@ class PictureErrors:
     told: float | None
     is_known: bool
 
-    def described(self) -> dict[str, Any]:
-        """As plain values."""
-        return {**vars(self), "from": "the scene" if self.is_known else "residuals"}
-
 
 class Uncertainty:
     """Samples of the posterior about where `run` is, and the sums they leave.

@@ -237,7 +237,6 @@ def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tensors(light: Light) -> list[str]:
-    """The names of the numbers of `light` that can be varied."""
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
@@ -327,7 +326,6 @@ def _replace_light(light: Light, owner: str, values: Mapping[str, Tensor], scene
 
 
 def _view_parts(view: View) -> list[str]:
-    """What of `view` can be varied."""
     lens = ["focal", "principal_point"] if view.camera.is_perspective else []
     lens += ["distortion"] if view.camera.distortion is not None else []
     return ["camera", *lens, *RESPONSE]

@@ -47,6 +47,7 @@ render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
 optimize scene.yaml -o out --iterations 0 => 2 -D optimize.iterations=0: optimize.iterations: must
 optimize scene.yaml -o out --iterations some => 2 -D optimize.iterations=some: optimize.iterations:
+optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty out -o
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op

@@ -94,12 +94,3 @@ def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
         assert "last.pt: " in told and "going on from run/checkpoints/previous.pt" in told
         with pytest.warns(DataWarning, match="going on from"):
             assert '<section id="volume">' in LiveRun(finished).page()
-
-
-def test_a_run_says_it_at_its_end(
-    folder: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ddrecon.cli.scene_commands.SAMPLES", 2)
-    short = ["-D", "optimize.iterations=1", *FAST]
-    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--uncertainty", *short)
-    assert json.loads((folder / "run/uncertainty/uncertainty.json").read_text())["samples"] == 2

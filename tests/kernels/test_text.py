@@ -10,9 +10,10 @@ from media import random_values
 pytest.importorskip("warp")
 
 from ddrecon.errors import UsageError
-from ddrecon.kernels.text import BLOCK, TextKernel, cut, include
+from ddrecon.kernels.text import TextKernel, cut, include
 
 TEXT = """
+const int begin = item * length, end = begin + length < total ? begin + length : total;
 for (int i = begin; i < end; ++i) {
     F sum = shift;
     for (int k = 0; k < 2; ++k) if (fields[k]) sum += weights[k] * fields[k][i];
@@ -25,7 +26,7 @@ GIVEN = "int length, total; F shift, *fields[2], *out; double *weights; bool *is
 
 @pytest.fixture(scope="module")
 def kernel() -> TextKernel:
-    return TextKernel("weighted_sum", 64, BLOCK + TEXT, GIVEN, "out is_large")
+    return TextKernel("weighted_sum", 64, TEXT, GIVEN, "out is_large")
 
 
 def given(fields: list[torch.Tensor | None], weights: torch.Tensor, shift: float = 0.0) -> dict:

@@ -51,12 +51,6 @@ def test_a_picture_too_small_to_tell_has_read_noise_only() -> None:
     assert estimate_noise(torch.rand(3, 2, 9), 0.0).shot == 0
 
 
-def test_means_of_pixels_err_by_the_root_of_their_count_less() -> None:
-    noise, values = Noise(0.02, 1e-3, 1 / 255), torch.linspace(0, 1, 9)
-    expected = noise.deviation(values) / 3
-    torch.testing.assert_close(noise.averaged(9).deviation(values), expected)
-
-
 def test_the_slope_of_display_is_its_derivative() -> None:
     values = torch.linspace(1e-4, 0.999, 400, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(display(values).sum(), values)

@@ -2,10 +2,10 @@
 
     python forked.py JOBS FOLDER
 
-JOBS is a JSON list of {"ranks": N, "arguments": [...], "failing": [...], "samples": S}. What rank
+JOBS is a JSON list of {"ranks": N, "arguments": [...], "failing": [...]}. What rank
 R of job J prints goes to FOLDER/J.R.out and J.R.err; FOLDER/codes.json has the exit codes, job by
 job. "failing" [rank, iteration, how] ends a rank before that iteration: "killed", or by an error.
-So many "samples" are what `optimize --uncertainty` draws. With "seeds": true each rank has its own.
+With "seeds": true each rank has its own.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +25,14 @@ import torch
 import torch._decomp.decompositions_for_jvp
 import torch._dynamo
 
-import ddrecon.cli.scene_commands
-
 # What commands import is imported once, before there are several processes. So is, above, what
 # pictures and derivatives in forward mode need.
-import ddrecon.cli.session
-import ddrecon.run.render_folder
-import ddrecon.scene_file.build
-import ddrecon.scene_file.doubts
-import ddrecon.uncertainty.drive
 from ddrecon.cli import main
 from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction
 
+for name in ("cli.session", "run.render_folder", "scene_file.doubts", "uncertainty.drive"):
+    import_module(f"ddrecon.{name}")
 PIL.Image.init()
 
 LOADED = set(sys.modules)
@@ -71,7 +67,6 @@ def do(job: dict[str, Any], rank: int) -> int:
     """The exit code of one rank."""
     if job.get("failing", [None])[0] == rank:
         fail_before(*job["failing"][1:])
-    ddrecon.cli.scene_commands.SAMPLES = job.get("samples", 0)
     seed = ["--seed", str(rank)] if job.get("seeds") else []
     try:
         main([*job["arguments"], *seed], standalone_mode=False)

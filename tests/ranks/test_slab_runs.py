@@ -19,19 +19,11 @@ def sure(ranks: int, output: str, *options: str) -> Job:
     return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
 
-def told(ranks: int, output: str, *options: str) -> Job:
-    simple = ["-D", "optimize.parameters={density: {init: 0.4, tv: 1e-3}}", "--uncertainty"]
-    known = ["-D", "optimize.noise={read: 0.05}", "-D", "diffusion.model=none"]
-    return job(ranks, output, *TALL, *simple, *known, *options, samples=2)
-
-
 JOBS = {
     "one": job(1, "one"),
     "sure": sure(1, "sure", "--samples", "3"),
     "sure begun": sure(1, "doubts", "--samples", "2"),
     "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
-    "told": told(1, "told"),
-    "told in cells": told(2, "told in cells", *CELLS),
     "whole": job(1, "whole", *TALL, *ROUNDS),
     "warm": job(1, "warm", *WARM),
     "warm cells": job(2, "warm cells", *WARM, *CELLS),
@@ -87,13 +79,3 @@ def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:
     for known, found in zip(one, other, strict=True):
         for key, value in np.load(known).items():
             np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-7)
-
-
-def test_ranks_say_at_the_end_of_a_run_how_sure_it_is(runs: Runs) -> None:
-    outputs = "told", "told in cells"
-    assert [runs.codes[output] for output in outputs] == [[0], [0, 0]]
-    one, other = (sorted((runs.folder / at).rglob("density*.npz")) for at in outputs)
-    assert [path.name for path in one] == [path.name for path in other] and len(one) == 4
-    for known, found in zip(one, other, strict=True):
-        for key, value in np.load(known).items():
-            np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-6)

@@ -63,15 +63,9 @@ VARIED = [
 
 def moved(value: Tensor) -> Tensor:
     """`value` a little larger, everywhere by another amount."""
-    return (
-        value
-        * (
-            1.1
-            + 0.1
-            * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)
-        )
-        + 0.01
-    )
+    generator = torch.Generator().manual_seed(0)
+    random = torch.rand(value.shape, generator=generator, dtype=value.dtype)
+    return value * (1.1 + 0.1 * random) + 0.01
 
 
 def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g: 0.3") -> Any:
@@ -106,14 +100,16 @@ def test_a_result_renders_as_what_was_found(
 ) -> None:
     # Both ways to give cross sections, by turns.
     found = finished(tmp_path, list(CROSS_SECTIONS.values())[number % 2], parameters)
-    again = load_scene(tmp_path / "out" / RESULT)
+    # Wherever its folder lies.
+    folder = (tmp_path / "out").rename(tmp_path / "moved")
+    again = load_scene(folder / RESULT)
     assert again.optimize is None and [view.name for view in again.views] == ["front", "side"]
     for view in ("front", "side"):
         wanted = render(found, view)
         assert torch.allclose(
             render(again, view), wanted, rtol=1e-4, atol=1e-5 * float(wanted.max())
         )
-    assert {"density", *fields} <= {path.stem for path in (tmp_path / "out" / "volumes").iterdir()}
+    assert {"density", *fields} <= {path.stem for path in (folder / "volumes").iterdir()}
 
 
 @pytest.mark.parametrize(
@@ -135,12 +131,6 @@ def test_a_result_has_the_phase_function_that_was_found(
     assert type(again) is type(found)
     for one, other in zip(again.numbers, found.numbers, strict=True):
         torch.testing.assert_close(one, other.detach(), rtol=1e-6, atol=0)
-
-
-def test_a_result_does_not_depend_on_where_its_folder_lies(tmp_path: Path) -> None:
-    finished(tmp_path, CROSS_SECTIONS["sigma_a, sigma_s"], "density: {}")
-    (tmp_path / "out").rename(tmp_path / "moved")
-    assert load_scene(tmp_path / "moved" / RESULT).volume.density.std() > 0
 
 
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
