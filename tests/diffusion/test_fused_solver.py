@@ -66,11 +66,6 @@ def test_grids_are_those_of_torch(form: str):
     operator = uneven(shape, sides)
     source = random_values(2, *shape, seed=4) - 0.5
     assert_near(cycle(operator, source), Level.of(operator).cycle(source), 1e-12)
-    level, axes = Level.of(operator), []
-    while isinstance(level, Level):
-        axes.append(tuple(way.axis - 1 for way in level.ways))
-        level = level.coarser
-    assert tuple(axes) == operator.once(Hierarchy.of).axes
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)

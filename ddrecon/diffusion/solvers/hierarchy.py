@@ -90,7 +90,7 @@ class Level:
         """The grid of `operator` and all coarser ones."""
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
-        for axis in _strong_axes(matrix):
+        for axis in strong_axes(matrix):
             way, operator = coarsen(operator, axis)
             ways.append(way)
         return Level(matrix, taken, tuple(ways), _coarser(operator))
@@ -151,7 +151,7 @@ def _coarser(operator: Operator) -> Level | Coarsest | Gathered:
     return Coarsest.of(operator) if has_few else Level.of(operator)
 
 
-def _strong_axes(matrix: ScaledMatrix) -> list[int]:
+def strong_axes(matrix: ScaledMatrix) -> list[int]:
     """The axes to coarsen, all that have more than one cell and are not weak."""
     axes = [axis for axis in AXES if matrix.scale.shape[axis] > 1]
     means = [matrix.conductances[axis - 1].mean() for axis in axes]

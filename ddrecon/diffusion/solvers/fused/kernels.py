@@ -30,16 +30,14 @@ MAKING = _names("prepare.h", "Step")
 
 @functools.cache
 def prepare_kernel(bits: int) -> TextKernel:
-    """A step of making a hierarchy, for a share of the cells of a color."""
+    """A step of making a hierarchy, in a row of cells."""
     text = """
-    const Maker<F> make(table, matrix, is_each, scratch, item);
-    prepare(make, step, stage, last, item, parts, strengths);
+    const Row row(item, width, rows, colors);
+    const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
+    prepare(row, mesh, step, axis, ny, finer, matrix, made);
     """
-    given = """
-    int step, stage, last, parts, is_each[4]; long *table; F *matrix[4], *scratch;
-    double *strengths
-    """
-    return TextKernel("prepare", bits, text, given, "scratch strengths", f"{_ROOM}/prepare.h")
+    given = "int width, rows, colors, nz, ny, nx, step, axis, finer[3]; F *matrix[4], *made[6]"
+    return TextKernel("prepare", bits, text, given, "made", f"{_ROOM}/prepare.h")
 
 
 @functools.cache

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, margin, shares_of
+from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, margin, room, shares_of
 from ddrecon.diffusion.solvers.fused.kernels import ACTS, SLOTS, SUMS, VECTORS, solve_kernel
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.kernels.spare import trim_freed_memory
@@ -81,10 +81,10 @@ class Run:
         self.colors, (_, y, x) = len(source), source.shape[1:]
         cells, self.edge = source[0].numel(), margin(x)
         self.shares, self.threads = shares_of(cells, self.colors, source)
-        self.size = -(-self.colors * cells // 16) * 16 + self.edge
+        self.size = room(self.colors * cells, x)
         self.vectors = source.new_empty(VECTORS["VECTORS"] * self.size + self.edge)
         self.coarser = source.new_zeros(self.colors * hierarchy.coarser)
-        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * self.edge)
+        slots = SLOTS * (room(y * x, x) + self.edge)
         self.scratch = source.new_empty(self.colors * self.shares * slots)
         self.sums = source.new_empty(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
