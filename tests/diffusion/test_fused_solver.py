@@ -39,8 +39,7 @@ def solve(
 def cycle(operator: Operator, source: Tensor) -> Tensor:
     """One cycle of the fused kernels for `source` as the residual."""
     use_engine("warp")
-    made = operator.once(Hierarchy.of)
-    run = fused.Run(made, source / made.scale, None, -1.0)
+    run = fused.Run(operator, source / operator.once(Hierarchy.of).scale, None, -1.0)
     run.iterate(1)
     return run.vector("P").clone()
 

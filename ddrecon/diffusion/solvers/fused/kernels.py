@@ -49,12 +49,12 @@ def solve_kernel(bits: int) -> TextKernel:
         {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
         tolerance, tiny, matrices, colors, shares, color, part, 0}};
     F *const mine = coarser + color * share, *const memory = scratch + item * scratch_size;
-    iterate(solve, act, first, last, source, guess, mine, memory);
+    iterate(solve, act, first, last, mine, memory);
     """
     given = """
     int act, first, last, parts, matrices, colors, shares; double tolerance, tiny, *sums;
     long *table, first_vector, vector_size, scratch_size, share;
-    F *vectors, *scratch, *coarser, *source, *guess
+    F *vectors, *scratch, *coarser
     """
     made = "vectors scratch sums coarser"
     return TextKernel("multigrid", bits, text, given, made, f"{_ROOM}/gradients.h")

@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/kernels/numbers.h"
-// The grids of a hierarchy, slice by slice (`fused/hierarchy.py`), and one step on a slice. This is compiled
-// for processors alone: on a GPU torch's operations solve.
+// The grids of a hierarchy, slice by slice (`fused/hierarchy.py`), and one step on a slice. This is
+// compiled for processors alone: on a GPU torch's operations solve.
 
 #define APART __attribute__((noinline)) // compiled once, however often it is called
 

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.fused.product import subtract_product
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, margin, room, shares_of
 from ddrecon.diffusion.solvers.fused.kernels import ACTS, SLOTS, SUMS, VECTORS, solve_kernel
@@ -65,7 +66,7 @@ def _solve(
     made: Tensor,
 ) -> Solution:
     """The solution, written to `made`."""
-    run = Run(operator.once(Hierarchy.of), source, guess, tolerance)
+    run = Run(operator, source, guess, tolerance)
     count, residual = run.iterate(most)
     torch.mul(run.vector("Y"), run.hierarchy.scale, out=made)  # u = S y
     return Solution(made, count, residual)
@@ -74,10 +75,9 @@ def _solve(
 class Run:
     """A solve under way: its vectors, and the launches that change them."""
 
-    def __init__(
-        self, hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float
-    ):
-        self.hierarchy, self.source, self.tolerance = hierarchy, source, tolerance
+    def __init__(self, operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float):
+        hierarchy = self.hierarchy = operator.once(Hierarchy.of)
+        self.source, self.tolerance = source, tolerance
         self.colors, (_, y, x) = len(source), source.shape[1:]
         cells, self.edge = source[0].numel(), margin(x)
         self.shares, self.threads = shares_of(cells, self.colors, source)
@@ -86,24 +86,45 @@ class Run:
         self.coarser = source.new_zeros(self.colors * hierarchy.coarser)
         slots = SLOTS * (room(y * x, x) + self.edge)
         self.scratch = source.new_empty(self.colors * self.shares * slots)
-        self.sums = source.new_empty(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
+        self.sums = source.new_zeros(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
         given = {
             "table": hierarchy.table, "first_vector": self.edge, "vector_size": self.size,
             "scratch_size": slots, "share": hierarchy.coarser, "tolerance": tolerance,
             "tiny": self.tiny, "matrices": hierarchy.colors, "colors": self.colors,
-            "shares": self.shares, "source": source, "guess": guess,
+            "shares": self.shares,
         }  # fmt: skip
         made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
         made["coarser"] = self.coarser
         self.kernel = solve_kernel(8 * source.element_size()).bind(given, made)
+        self._start(operator, guess)
+
+    def _start(self, operator: Operator, guess: Tensor | None) -> None:
+        """y and r from a guess; of colors that it does not help, from zero."""
+        y, r, scale = self.vector("Y"), self.vector("R"), self.hierarchy.scale
+        # Beside the residual lie numbers that the cycle reads, and multiplies by zero.
+        first = self.edge + VECTORS["R"] * self.size
+        self.vectors[first - self.edge : first] = 0
+        self.vectors[first + r.numel() : first + self.size] = 0
+        torch.mul(scale, self.source, out=r)
+        reached = norm = torch.linalg.vector_norm(r, dim=(1, 2, 3))
+        if guess is None:
+            y.zero_()
+        else:
+            matrix = operator.loss, *operator.conductances
+            torch.div(guess, scale, out=y)
+            torch.mul(scale, subtract_product(self.source, guess, *matrix), out=r)
+            reached = torch.linalg.vector_norm(r, dim=(1, 2, 3))
+            useless = ~(reached < norm)
+            if useless.any():
+                y[useless], r[useless] = 0, (scale * self.source)[useless]
+                reached = torch.where(useless, norm, reached)
+        self.sums[SUMS["RESIDUAL"], :, 0] = reached.double() ** 2
+        self.sums[SUMS["SOURCE_NORM"], :, 0] = norm.double() ** 2
 
     def iterate(self, most: int) -> tuple[int, float]:
         """How many iterations it took, of at most so many, and the relative residual left."""
         is_one, done, residual = self.shares == 1, 0, math.inf
-        # In all colors first: beside a color's residual the cycle reads others', times zero.
-        for act in ("START", "CHOOSE"):
-            self._launch(act, 0, 0)
         while residual > self.tolerance and done < most:
             end = min(done + (TOGETHER if is_one else 1), most)
             for act in ("SOLVE",) if is_one else SHARED:
