@@ -121,20 +121,6 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
     assert_near(first.value, alone.value, 1e-12)
 
 
-@pytest.mark.parametrize("colors", [1, 3])
-def test_cotangents_are_those_of_torch(colors: int):
-    shape = (5, 6, 7)
-    operator = patchy_box(shape)
-    operator = Operator(tuple(c[:1] for c in operator.conductances), random_values(colors, *shape))
-    adjoint, light = (random_values(colors, *shape, seed=seed) - 0.5 for seed in (5, 6))
-    use_engine("torch")
-    known = operator.cotangents(adjoint, light)
-    use_engine("warp")
-    for one, other in zip(operator.cotangents(adjoint, light), known, strict=True):
-        assert one.shape == other.shape
-        assert_near(one, other, 1e-14)
-
-
 def test_derivatives_of_a_solve():
     """Adjoint and tangent by the fused solver are transposes of each other."""
     shape = (4, 5, 3)

@@ -115,12 +115,14 @@ def fill(ghosts: Ghosts | None, u: Tensor) -> Tensor:
     return u if ghosts is None else ghosts.fill(u)
 
 
-def give_up(name: str, iterations: int, residual: float) -> SolveError:
-    """The error of a solve that did not converge."""
-    return SolveError(
+def require_reached(name: str, solution: Solution, tolerance: float) -> Solution:
+    """`solution`; raises SolveError where it did not converge."""
+    if solution.residual <= tolerance:
+        return solution
+    raise SolveError(
         f"{name} did not reach its tolerance",
-        iterations,
-        residual,
+        solution.iterations,
+        solution.residual,
         "raise diffusion.tolerance or use --dtype float64",
     )
 

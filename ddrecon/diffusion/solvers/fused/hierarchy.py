@@ -8,23 +8,38 @@ hold zero. A row of the table says of each stage how many cells it has and where
 
 from __future__ import annotations
 
+import functools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, lower_cells
-from ddrecon.diffusion.solvers.fused.kernels import COLUMNS, MAKING, prepare_kernel
 from ddrecon.diffusion.solvers.hierarchy import FEW_CELLS, Coarsest, strong_axes
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.text import TextKernel
 
+ROOM = "diffusion/solvers/fused"
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 STAGES = 128
 """More than there can be: each halves the cells along an axis."""
+
+
+def read_names(header: str, enum: str) -> dict[str, int]:
+    """The names of an `enum` in a `header`, with their numbers."""
+    text = Path(__file__).with_name(header).read_text(encoding="utf-8")
+    (names,) = re.findall(rf"enum {enum} \{{([^}}]*)\}}", text)
+    return {name.strip(): number for number, name in enumerate(names.split(","))}
+
+
+COLUMNS = read_names("levels.h", "Column")
+MAKING = read_names("prepare.h", "Step")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,3 +161,15 @@ def _run(step: str, matrix: list[Tensor], made: list[Tensor], axis: int = 1) -> 
     rest = [None] * (6 - len(made))
     kernel = prepare_kernel(8 * matrix[0].element_size())
     kernel.launch(colors * nz * ny, given, {"made": [*made, *rest]})
+
+
+@functools.cache
+def prepare_kernel(bits: int) -> TextKernel:
+    """A step of making a hierarchy, in a row of cells."""
+    text = """
+    const Row row(item, width, rows, colors);
+    const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
+    prepare(row, mesh, step, axis, ny, finer, matrix, made);
+    """
+    given = "int width, rows, colors, nz, ny, nx, step, axis, finer[3]; F *matrix[4], *made[6]"
+    return TextKernel("prepare", bits, text, given, "made", f"{ROOM}/prepare.h")

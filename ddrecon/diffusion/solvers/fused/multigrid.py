@@ -6,6 +6,7 @@ are.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -13,11 +14,23 @@ from torch import Tensor
 
 from ddrecon.diffusion.fused.product import subtract_product
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, margin, room, shares_of
-from ddrecon.diffusion.solvers.fused.kernels import ACTS, SLOTS, SUMS, VECTORS, solve_kernel
+from ddrecon.diffusion.solvers.fused.hierarchy import (
+    ROOM,
+    Hierarchy,
+    margin,
+    read_names,
+    room,
+    shares_of,
+)
+from ddrecon.diffusion.solvers.hierarchy import STEPS
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.kernels.spare import trim_freed_memory
+from ddrecon.kernels.text import TextKernel
 
+SUMS, VECTORS = read_names("levels.h", "Sum"), read_names("levels.h", "Vector")
+ACTS = read_names("gradients.h", "Act")
+SLOTS = 13
+"""Slices that a share of a leg keeps."""
 TOGETHER = 16
 """So many iterations are one launch where threads do not share them."""
 SHARED = "DOWN", "COARSER", "UP", "DIRECT", "ADVANCE"
@@ -148,3 +161,23 @@ class Run:
         items = self.colors * parts
         threads = min(self.threads, items)
         self.kernel.launch(items, threads, act=ACTS[act], first=first, last=last, parts=parts)
+
+
+@functools.cache
+def solve_kernel(bits: int) -> TextKernel:
+    """An `act` of a solve, for one of the parts of the slices of a color."""
+    text = f"""
+    const int color = item / parts, part = item - color * parts;
+    const Solve<F> solve = {{
+        {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
+        tolerance, tiny, matrices, colors, shares, color, part, 0}};
+    F *const mine = coarser + color * share, *const memory = scratch + item * scratch_size;
+    iterate(solve, act, first, last, mine, memory);
+    """
+    given = """
+    int act, first, last, parts, matrices, colors, shares; double tolerance, tiny, *sums;
+    long *table, first_vector, vector_size, scratch_size, share;
+    F *vectors, *scratch, *coarser
+    """
+    made = "vectors scratch sums coarser"
+    return TextKernel("multigrid", bits, text, given, made, f"{ROOM}/gradients.h")
