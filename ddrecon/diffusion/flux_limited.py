@@ -38,7 +38,7 @@ from ddrecon.diffusion.operator import (
     difference,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.scaled import Solution, norm
+from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -237,7 +237,8 @@ def iterate_picard(
         operator, lacking = defect(u)
         step = DAMPING * solve.solver(operator, lacking, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
-        change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
+        size, length = (torch.linalg.vector_norm(each, dim=(1, 2, 3)) for each in (u, step))
+        change = float((length / size.clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
         raise SolveError(
             f"flux-limited diffusion ({kind}) did not reach its tolerance",

@@ -10,8 +10,7 @@ from media import dense_matrix, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
-from ddrecon.diffusion.solvers.coarsening import coarsen
-from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
+from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level, coarsen
 from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
 from ddrecon.grid import Grid
 

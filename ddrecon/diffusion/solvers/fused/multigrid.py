@@ -50,39 +50,23 @@ def solve(
     """
     made = source.new_empty(source.shape)
     guess = None if guess is None or guess.shape != source.shape else guess
+
+    def solve_part(operator: Operator, own: slice) -> tuple[int, float]:
+        run = Run(operator, source[own], None if guess is None else guess[own], tolerance)
+        count, residual = run.iterate(most)
+        torch.mul(run.vector("Y"), run.hierarchy.scale, out=made[own])  # u = S y
+        return count, residual
+
     if source[0].numel() < ALONE:
-        return _solve(operator, source, guess, tolerance, most, made)
+        return Solution(made, *solve_part(operator, slice(None)))
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
-    found = [
-        _solve(
-            operator.of_color(color),
-            source[color : color + 1],
-            None if guess is None else guess[color : color + 1],
-            tolerance,
-            most,
-            made[color : color + 1],
-        )
-        for color in range(len(source))
-    ]
+    counts, residuals = zip(
+        *(solve_part(operator.of_color(c), slice(c, c + 1)) for c in range(len(source))),
+        strict=True,
+    )
     # max() would pass over what is not a number.
-    worst = float(torch.tensor([part.residual for part in found], dtype=torch.float64).max())
-    return Solution(made, max(part.iterations for part in found), worst)
-
-
-def _solve(
-    operator: Operator,
-    source: Tensor,
-    guess: Tensor | None,
-    tolerance: float,
-    most: int,
-    made: Tensor,
-) -> Solution:
-    """The solution, written to `made`."""
-    run = Run(operator, source, guess, tolerance)
-    count, residual = run.iterate(most)
-    torch.mul(run.vector("Y"), run.hierarchy.scale, out=made)  # u = S y
-    return Solution(made, count, residual)
+    return Solution(made, max(counts), float(torch.tensor(residuals, dtype=torch.float64).max()))
 
 
 class Run:

@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/diffusion/fused/mesh.h"
 // A hierarchy is made, a row at a time: scaled matrices and coarser ones. The formulas are those of
-// `solvers/scaled.py`, `hierarchy.py` and `coarsening.py`. A matrix has conductances along z, y and
+// `solvers/scaled.py` and `hierarchy.py`. A matrix has conductances along z, y and
 // x, and the loss; faces lie at the cell below them, and those on the box are zero.
 
 namespace ddrecon {
