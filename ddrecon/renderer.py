@@ -16,11 +16,9 @@ from torch import Tensor
 from ddrecon.cameras import Camera, Rays
 from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
-from ddrecon.diffusion.flux_limited import solve_flux_limited
+from ddrecon.diffusion.flux_limited import LIMITERS, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.limiters import LIMITERS
-from ddrecon.diffusion.paper.iteration import iterate_jacobi
-from ddrecon.diffusion.paper.printed import solve_printed
+from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import UsageError

@@ -8,7 +8,7 @@ from dataclasses import fields
 import pytest
 
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES

@@ -10,6 +10,11 @@ implicit function theorem, with J = dr/du, which is not symmetric:
 Both are solved by the same damped iteration with the same A. Linearized at the fixed point it is
 the Picard iteration, so one converges where the other does. Source: Koerner et al. 2014,
 arXiv:1403.8105.
+
+A limiter is lambda(R) in D = lambda(R) / kappa with R = |grad L0| / (kappa L0): D falls where light
+falls off fast, so that no more flows than radiance allows. It is written in the steepness
+q = |grad L0| / L0 [1/u] so that it is finite where either vanishes: `limiter(kappa, q^2) -> D` [u],
+smooth in both. `LIMITERS` is the table the scene file chooses from.
 """
 
 from __future__ import annotations
@@ -24,7 +29,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.conservative import axis_flux
 from ddrecon.diffusion.implicit import SolverWithMemory
-from ddrecon.diffusion.limiters import Limiter
 from ddrecon.diffusion.operator import (
     AXES,
     Operator,
@@ -34,13 +38,16 @@ from ddrecon.diffusion.operator import (
     difference,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.scaled import Solution, norm
+from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import keep
 
+Limiter = Callable[[Tensor, Tensor], Tensor]
+SERIES_BELOW = 0.04
+"""R^2 below this takes lambda from its series, since coth R and 1 / R cancel there."""
 DAMPING = 0.7
 MAX_ITERATIONS = 1000
 INNER_TOLERANCE = 0.05
@@ -49,6 +56,29 @@ VACUUM = 0.1
 """Optical thickness across the shortest side that empty space is given, so that D stays finite."""
 DARKNESS = 1e-6
 """Light below this part of its mean counts as even, so that steepness is finite without light."""
+
+
+def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
+    """lambda = (coth R - 1/R) / R: 1/3 in dense media, 1/R in empty space.
+
+    Source: Levermore and Pomraning 1981, doi:10.1086/159157, in the form of scattering albedo 1.
+    """
+    square = steepness_square / extinction**2
+    is_small = square < SERIES_BELOW
+    small, large = torch.where(is_small, square, 0), torch.where(is_small, 1, square).sqrt()
+    series = 1 / 3 - small * (1 / 45 - small * (2 / 945 - small * (1 / 4725 - small * (2 / 93555))))
+    return torch.where(is_small, series, (1 / torch.tanh(large) - 1 / large) / large) / extinction
+
+
+def marshak(extinction: Tensor, steepness_square: Tensor) -> Tensor:
+    """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows.
+
+    That is what E2.6 lets out of a surface.
+    """
+    return 1 / torch.sqrt(9 * extinction**2 + 4 * steepness_square)
+
+
+LIMITERS: dict[str, Limiter] = {"marshak": marshak, "levermore_pomraning": levermore_pomraning}
 
 
 @dataclass(frozen=True)
@@ -207,7 +237,8 @@ def iterate_picard(
         operator, lacking = defect(u)
         step = DAMPING * solve.solver(operator, lacking, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
-        change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
+        size, length = (torch.linalg.vector_norm(each, dim=(1, 2, 3)) for each in (u, step))
+        change = float((length / size.clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
         raise SolveError(
             f"flux-limited diffusion ({kind}) did not reach its tolerance",

@@ -159,7 +159,10 @@ def _check(
     generator: torch.Generator,
 ) -> GradientCheck:
     """The check of `values` along a random direction, and by `samples` entries of each of them."""
-    steps = {name: _steps_of(name, value) for name, value in values.items()}
+    steps = {
+        name: [step * (float(value.abs().max()) or 1.0) for step in kind_of(name).difference_steps]
+        for name, value in values.items()
+    }
     # The direction is as long as the longest steps: those along it are parts of 1.
     direction = {
         name: 2 * (random_like(value, generator) - 0.5) * steps[name][0]
@@ -184,12 +187,6 @@ def _check(
     return GradientCheck(
         label, tangent, abs(tangent - adjoint) / max(abs(adjoint), tiny), tuple(entries)
     )
-
-
-def _steps_of(name: str, value: Tensor) -> list[float]:
-    """The steps of finite differences for the parameter `name` at `value`."""
-    largest = float(value.abs().max()) or 1.0
-    return [step * largest for step in kind_of(name).difference_steps]
 
 
 def _tangent(loss: Loss, values: Values, direction: Values) -> float:

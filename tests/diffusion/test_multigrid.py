@@ -10,10 +10,8 @@ from media import dense_matrix, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
-from ddrecon.diffusion.solvers.coarsening import coarsen
-from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
+from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level, coarsen
 from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
-from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.grid import Grid
 
 SHAPES = [(1, 1, 1), (1, 1, 9), (1, 12, 17), (2, 3, 40), (7, 8, 9), (16, 5, 11)]
@@ -162,12 +160,3 @@ def test_conductances_shared_by_colors_may_be_given_once():
     torch.testing.assert_close(
         multigrid(shared, source, None, 1e-9).value, multigrid(spread, source, None, 1e-9).value
     )
-
-
-def test_what_is_made_of_an_operator_is_made_once(monkeypatch: pytest.MonkeyPatch):
-    operator, source = uneven((6, 9, 7)), random_values(2, 6, 9, 7)
-    multigrid(operator, source, None, 1e-6)
-    made = operator.once(Level.of)
-    assert made.matrix is operator.once(ScaledMatrix.of)
-    multigrid(operator, 2 * source, None, 1e-6)
-    assert operator.once(Level.of) is made

@@ -114,7 +114,7 @@ def test_a_solve_that_does_not_converge_says_so(solve, system, monkeypatch):
     monkeypatch.setattr(sys.modules[solve.__module__], "MAX_ITERATIONS", 1)
     with pytest.raises(SolveError, match=solve.__name__) as caught:
         solve(operator, source, None, 1e-12)
-    assert 0 < caught.value.iterations <= 10 and caught.value.residual > 1e-12
+    assert 0 < caught.value.iterations <= 100 and caught.value.residual > 1e-12
 
 
 @pytest.mark.parametrize("where", ["source", "loss"])

@@ -5,7 +5,7 @@ namespace ddrecon {
 
 // What is BEGUN less A u of E2.7. The `matrix` is the loss, then conductances
 // along z, y and x: in each color, or in one that all share.
-template <bool BEGUN, class F> INLINE void subtract_product(
+template <class F> INLINE void subtract_product(
     const Row& row, const Mesh<F>& mesh, const int* is_each, const F* const* matrix, const F* light,
     const F* begun, F* found) {
     const F *u = light + row.at, *before = begun + row.at, *faces[3];
@@ -21,10 +21,7 @@ template <bool BEGUN, class F> INLINE void subtract_product(
         for (int k = 0; k < 6; ++k)
             sum += mesh.at_face(faces[k / 2], k / 2, k % 2, i) *
                    (u[i] - mesh.beyond(u, k / 2, k % 2, i));
-        if constexpr (BEGUN)
-            out[i] = before[i] - sum;
-        else
-            out[i] = -sum;
+        out[i] = before[i] - sum;
     }
 }
 

@@ -14,13 +14,7 @@ from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 
 def subtract_product(
-    u: Tensor,
-    loss: Tensor,
-    z: Tensor,
-    y: Tensor,
-    x: Tensor,
-    *,
-    begun: Tensor | None = None,
+    begun: Tensor, u: Tensor, loss: Tensor, z: Tensor, y: Tensor, x: Tensor
 ) -> Tensor:
     """What is `begun` less A u [C, z, y, x], for the `loss` and the conductances along all axes."""
     found, matrix = u.new_empty(u.shape), (loss, z, y, x)
@@ -32,8 +26,7 @@ def subtract_product(
         "begun": begun, "width": width, "rows": rows, "colors": colors,
         "nz": nz, "ny": ny, "nx": nx,
     }  # fmt: skip
-    kernel = product_kernel(begun is not None, 8 * u.element_size())
-    kernel.launch(colors * rows, given, {"found": found})
+    product_kernel(8 * u.element_size()).launch(colors * rows, given, {"found": found})
     return found
 
 
@@ -48,7 +41,7 @@ class _Imbalance(torch.autograd.Function):
 
     @staticmethod
     def forward(right: Tensor, u: Tensor, *matrix: Tensor) -> Tensor:
-        return subtract_product(u, *matrix, begun=right)
+        return subtract_product(right, u, *matrix)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -58,7 +51,8 @@ class _Imbalance(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, ...]:
         u, *matrix = ctx.saved_tensors
-        return bar, subtract_product(bar, *matrix), *Operator.of({}, *matrix).cotangents(bar, u)
+        u_bar = subtract_product(torch.zeros_like(bar), bar, *matrix)
+        return bar, u_bar, *Operator.of({}, *matrix).cotangents(bar, u)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
@@ -69,20 +63,19 @@ class _Imbalance(torch.autograd.Function):
                 for value, d_value in zip((u, u, *matrix), changes, strict=True)
             )
             # dS - A du - dA u
-            found = subtract_product(d_u, *matrix, begun=d_right)
-            return subtract_product(u, *d_matrix, begun=found)
+            return subtract_product(subtract_product(d_right, d_u, *matrix), u, *d_matrix)
 
         d_imbalance: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_imbalance
 
 
 @functools.cache
-def product_kernel(is_begun: bool, bits: int) -> TextKernel:
+def product_kernel(bits: int) -> TextKernel:
     """The kernel of what is begun less A u; loss and conductances have all colors or one."""
-    text = f"""
+    text = """
     const Row row(item, width, rows, colors);
     const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
-    subtract_product<{int(is_begun)}>(row, mesh, is_each, matrix, light, begun, found);
+    subtract_product(row, mesh, is_each, matrix, light, begun, found);
     """
     given = """
     int width, rows, colors, nz, ny, nx, is_each[4]; F *matrix[4], *light, *begun, *found

@@ -6,7 +6,6 @@ its residual falls below `tolerance` times that of its right side, for every col
 write it, enter it here.
 """
 
-from ddrecon.diffusion.solvers.jacobi import jacobi
-from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, multigrid
+from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, jacobi, multigrid
 
 SOLVERS = {"multigrid": multigrid, "conjugate_gradient": conjugate_gradient, "jacobi": jacobi}

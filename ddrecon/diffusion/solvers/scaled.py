@@ -59,7 +59,9 @@ class ScaledMatrix:
 
     def inner(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner product per color, `[C, 1, 1, 1]`."""
-        return inner(a, b) if self.ghosts is None else self.ghosts.inner(a, b)
+        if self.ghosts is not None:
+            return self.ghosts.inner(a, b)
+        return (a * b).sum((1, 2, 3), keepdim=True)
 
     def norm(self, a: Tensor) -> Tensor:
         """Euclidean norm per color, `[C, 1, 1, 1]`."""
@@ -115,21 +117,13 @@ def fill(ghosts: Ghosts | None, u: Tensor) -> Tensor:
     return u if ghosts is None else ghosts.fill(u)
 
 
-def give_up(name: str, iterations: int, residual: float) -> SolveError:
-    """The error of a solve that did not converge."""
-    return SolveError(
+def require_reached(name: str, solution: Solution, tolerance: float) -> Solution:
+    """`solution`; raises SolveError where it did not converge."""
+    if solution.residual <= tolerance:
+        return solution
+    raise SolveError(
         f"{name} did not reach its tolerance",
-        iterations,
-        residual,
+        solution.iterations,
+        solution.residual,
         "raise diffusion.tolerance or use --dtype float64",
     )
-
-
-def inner(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product per color, `[C, 1, 1, 1]`."""
-    return (a * b).sum((1, 2, 3), keepdim=True)
-
-
-def norm(a: Tensor) -> Tensor:
-    """Euclidean norm per color, `[C, 1, 1, 1]`."""
-    return inner(a, a).sqrt()

@@ -1,13 +1,13 @@
 #pragma once
 #include "ddrecon/diffusion/solvers/fused/cycle.h"
-// Conjugate gradients (`solvers/multigrid.py`): start, directions, steps.
+// Conjugate gradients (`solvers/multigrid.py`): directions and steps.
 
 namespace ddrecon {
 
-// What a launch does, of a color's shares: residual of a guess, which start is better, the cycle's
-// way down, its coarser levels (one share does them all), its way up, a direction, a step along it;
-// or whole iterations, of a color that is one share.
-enum Act { START, CHOOSE, DOWN, COARSER, UP, DIRECT, ADVANCE, SOLVE };
+// What a launch does, of a color's shares: the cycle's way down, its coarser levels (one share does
+// them all), its way up, a direction, a step along it; or whole iterations, of a color that is one
+// share.
+enum Act { DOWN, COARSER, UP, DIRECT, ADVANCE, SOLVE };
 
 // A share of the slices of a color, from which on `cell` are `count` cells.
 template <class F> struct Share {
@@ -23,63 +23,6 @@ template <class F> struct Share {
           cell(from * level.slice),
           count((to - from) * level.slice) {}
 };
-template <class F> APART void multiply(
-    const F* __restrict a, const F* __restrict b, F* __restrict product, Size count) {
-    for (Size i = 0; i < count; ++i) product[i] = a[i] * b[i];
-}
-template <class F> INLINE void clear(F* values, Size count) {
-    for (Size i = 0; i < count; ++i) values[i] = F(0);
-}
-
-// y and r from a guess, or from zero where that is null.
-template <class F>
-APART void start(const Solve<F>& solve, const Share<F>& own, const F* source, const F* guess) {
-    const Level<F>& l = own.level;
-    const Slots<F>& slot = own.slot;
-    F *const y = solve.vector(Y), *const r = solve.vector(R);
-    // Beside the residual lie numbers that the cycle reads, and multiplies by zero.
-    if (solve.color == 0 && solve.part == 0) clear(r - slot.margin, slot.margin);
-    if (solve.color == solve.colors - 1 && solve.part == solve.shares - 1)
-        clear(r + l.cells, slot.margin);
-    double square = 0.0, norm = 0.0;
-    if (guess) slot.clear(4);
-    int ready = own.from > 0 ? own.from - 1 : 0;
-    for (int z = own.from; z < own.to; ++z) {
-        const Size here = z * l.slice;
-        F* const right = slot(4);
-        multiply(l.scale + here, source + here, right, l.slice);
-        norm += inner(right, right, l.slice);
-        if (!guess) {
-            for (Size i = 0; i < l.slice; ++i) r[here + i] = right[i], y[here + i] = F(0);
-            continue;
-        }
-        for (; ready <= z + 1 && ready < l.nz; ++ready) {
-            F* __restrict v = slot.ring(0, ready);
-            const F* __restrict s = l.scale + ready * l.slice, * __restrict g =
-                                                                   guess + ready * l.slice;
-            for (Size i = 0; i < l.slice; ++i) v[i] = g[i] / s[i];
-        }
-        stencil(l, slot, 0, z, right, F(-1), F(1), F(1), r + here);
-        const F* v = slot.ring(0, z);
-        for (Size i = 0; i < l.slice; ++i) y[here + i] = v[i];
-        square += inner(r + here, r + here, l.slice);
-    }
-    solve.sum(SOURCE_NORM) = norm;
-    solve.sum(RESIDUAL_ODD) = guess ? square : norm;
-    solve.sum(COUNT) = 0.0;
-}
-
-// From zero after all, where the guess is no better.
-template <class F>
-APART void choose(const Solve<F>& solve, const Share<F>& own, const F* source, const F* guess) {
-    const bool helps = !guess || root(solve.total(RESIDUAL_ODD)) < root(solve.total(SOURCE_NORM));
-    if (!helps) {
-        multiply(
-            own.level.scale + own.cell, source + own.cell, solve.vector(R) + own.cell, own.count);
-        clear(solve.vector(Y) + own.cell, own.count);
-    }
-    solve.sum(RESIDUAL) = solve.sum(helps ? RESIDUAL_ODD : SOURCE_NORM);
-}
 
 // d, and q = A d.
 template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own) {
@@ -132,12 +75,8 @@ template <class F> APART void advance(const Solve<F>& solve, const Share<F>& own
     solve.sum(RESIDUAL + later) = square;
 }
 
-template <class F> INLINE void act(
-    const Solve<F>& solve, int what, const Share<F>& own, const F* source, const F* guess, F* mine,
-    F* memory) {
-    if (what == START) return start(solve, own, source, guess);
-    // Before a solve has begun there are no sums yet.
-    if (what == CHOOSE) return choose(solve, own, source, guess);
+template <class F>
+INLINE void act(const Solve<F>& solve, int what, const Share<F>& own, F* mine, F* memory) {
     if (solve.is_done()) {
         if (what == ADVANCE)
             solve.sum(RESIDUAL + solve.later()) = solve.sum(RESIDUAL + solve.now());
@@ -150,16 +89,14 @@ template <class F> INLINE void act(
     if (what == ADVANCE) advance(solve, own);
 }
 // In iteration `first`, or in all up to `last`.
-template <class F> INLINE void iterate(
-    Solve<F> solve, int what, int first, int last, const F* source, const F* guess, F* mine,
-    F* memory) {
+template <class F>
+INLINE void iterate(Solve<F> solve, int what, int first, int last, F* mine, F* memory) {
     const Share<F> own(solve, memory);
-    const Size before = solve.color * own.level.cells;
     const bool is_all = what == SOLVE;
     for (int i = first; i < (is_all ? last : first + 1); ++i) {
         solve.iteration = i;
         for (int k = is_all ? DOWN : what; k <= (is_all ? ADVANCE : what); ++k)
-            act(solve, k, own, source + before, guess ? guess + before : guess, mine, memory);
+            act(solve, k, own, mine, memory);
     }
 }
 

@@ -8,32 +8,43 @@ hold zero. A row of the table says of each stage how many cells it has and where
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, islice
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, lower_cells
-from ddrecon.diffusion.solvers.fused.kernels import COLUMNS, MAKING, prepare_kernel
-from ddrecon.diffusion.solvers.hierarchy import FEW_CELLS, STRONG, Coarsest
-from ddrecon.kernels.compiling import clear_in_rehearsal
+from ddrecon.diffusion.solvers.hierarchy import FEW_CELLS, Coarsest, strong_axes
+from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.text import TextKernel
 
+ROOM = "diffusion/solvers/fused"
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 STAGES = 128
 """More than there can be: each halves the cells along an axis."""
-_NAMES = list(COLUMNS)
-MATRIX, COARSENED, SCALED = _NAMES[5:9], _NAMES[9:11], _NAMES[11:16]
-"""Arrays of stages beyond the finest, of those that are coarsened, and of levels."""
+
+
+def read_names(header: str, enum: str) -> dict[str, int]:
+    """The names of an `enum` in a `header`, with their numbers."""
+    text = Path(__file__).with_name(header).read_text(encoding="utf-8")
+    (names,) = re.findall(rf"enum {enum} \{{([^}}]*)\}}", text)
+    return {name.strip(): number for number, name in enumerate(names.split(","))}
+
+
+COLUMNS = read_names("levels.h", "Column")
+MAKING = read_names("prepare.h", "Step")
 
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
-    """The grids of an operator of so many `colors`, by levels that coarsen these `axes`.
+    """The grids of an operator of so many `colors`.
 
     `scale`: S of the finest grid [colors, z, y, x]; `coarser`: how many numbers right sides and
     solutions of coarser levels are, in each color of a solve; `memory`: what the table points to.
@@ -41,7 +52,6 @@ class Hierarchy:
 
     colors: int
     table: Tensor
-    axes: tuple[tuple[int, ...], ...]
     scale: Tensor
     coarser: int
     memory: list[Tensor]
@@ -49,10 +59,45 @@ class Hierarchy:
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
         """All grids of `operator`."""
-        making = _Making(operator)
-        while axes := making.strong_axes():
-            making.coarsen(axes)
-        return making.end()
+        matrix = _lay_out(operator)
+        table, memory = torch.zeros(STAGES, COLUMNS["COLUMNS"], dtype=torch.int64), list[Tensor]()
+        rows, stage, coarser = table.numpy(), 0, margin(matrix[0].shape[3])
+
+        def write(name: str, *values: int | Tensor) -> None:
+            """Numbers, or where arrays lie, in the stage's row from this column on."""
+            memory.extend(value for value in values if isinstance(value, Tensor))
+            for column, value in enumerate(values, COLUMNS[name]):
+                rows[stage, column] = value.data_ptr() if isinstance(value, Tensor) else value
+
+        def write_size() -> None:
+            write("NZ", *matrix[0].shape[1:], -1, -1)
+
+        write_size()
+        while not stage or matrix[0][0].numel() > FEW_CELLS:
+            *faces, scale, _ = level = _new_arrays(matrix[0], matrix[0].shape, 5)
+            for step in ("SCALE_CELLS", "SCALE_FACES"):
+                _run(step, matrix, level)
+            write("SZ", *level)
+            first = stage
+            for axis in strong_axes(ScaledMatrix(scale, _compact(faces))):
+                halved = [(n + 1) // 2 if a == axis else n for a, n in enumerate(matrix[0].shape)]
+                coarse, weights = (_new_arrays(matrix[0], halved, count) for count in (4, 2))
+                for step in ("WEIGH", "COARSEN"):
+                    _run(step, matrix, [*coarse, *weights], axis)
+                write("AXIS", axis - 1)
+                write("BELOW", *weights)
+                stage, matrix = stage + 1, coarse
+                write_size()
+            if stage == first:
+                break
+            rows[first, COLUMNS["NEXT"]] = stage
+            size = room(matrix[0][0].numel(), matrix[0].shape[3])
+            write("SOURCE", coarser, coarser + size)
+            coarser += 2 * size
+        else:
+            coarsest = Operator(_compact(matrix[:3]), matrix[3])
+            write("INVERSE", Coarsest.of(coarsest).inverse.contiguous())
+        return Hierarchy(len(matrix[0]), table, memory[3], coarser, memory)
 
 
 def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
@@ -73,131 +118,58 @@ def margin(width: int) -> int:
     return (width + 16) // 16 * 16
 
 
-class _Arrays:
-    """Arrays of numbers `like` these, between margins."""
-
-    def __init__(self, like: Tensor, width: int):
-        self.like, self.margin = like, margin(width)
-        self.blocks: list[Tensor] = []
-
-    def take(self, counts: Sequence[int]) -> Iterator[int]:
-        """The addresses of new arrays of so many numbers."""
-        sizes = [-(-count // 16) * 16 + self.margin for count in counts]
-        self.blocks.append(self.like.new_empty(sum(sizes) + self.margin))
-        clear_in_rehearsal(self.blocks[-1:])
-        begin, size = self.blocks[-1].data_ptr(), self.like.element_size()
-        places = accumulate(sizes, initial=self.margin)
-        return (begin + place * size for place in places)
-
-    def view(self, address: int, block: int, *shape: int) -> Tensor:
-        """The array at this address, in one of the blocks."""
-        memory = self.blocks[block]
-        begin = (address - memory.data_ptr()) // memory.element_size()
-        return memory[begin : begin + math.prod(shape)].view(shape)
+def room(cells: int, width: int) -> int:
+    """How many numbers an array of so many takes with the margin before it."""
+    return -(-cells // 16) * 16 + margin(width)
 
 
-class _Making:
-    """A hierarchy that is being made, down to a `stage` of this `shape`."""
+def _new_arrays(like: Tensor, shape: Sequence[int], count: int) -> list[Tensor]:
+    """So many arrays beside each other, each after a margin of zeros, with another behind all."""
+    before, cells = margin(shape[-1]), math.prod(shape)
+    size = room(cells, shape[-1])
+    block = like.new_empty(count * size + before)
+    rows = block[: count * size].view(count, size)
+    rows[:, :before] = block[-before:] = 0
+    return [row[before : before + cells].view(*shape) for row in rows]
 
-    def __init__(self, operator: Operator):
-        loss, matrix = operator.loss, (*operator.conductances, operator.loss)
-        self.stage, self.shape = 0, tuple(loss.shape[1:])
-        self.colors = max(map(len, matrix))
-        cells, width = math.prod(self.shape), self.shape[2]
-        self.shares, self.threads = shares_of(cells, self.colors, loss)
-        self.kept, self.work = _Arrays(loss, width), _Arrays(loss, width)
-        self.axes: list[tuple[int, ...]] = []
-        self.coarser = self.kept.margin
-        self.table = torch.zeros(STAGES, COLUMNS["COLUMNS"], dtype=torch.int64)
-        self.rows = self.table.numpy()
-        items = self.colors * self.shares
-        self.strengths = loss.new_zeros(items, 3, dtype=torch.float64)
-        is_each = [len(tensor) == self.colors for tensor in matrix]
-        given = {"table": self.table, "matrix": matrix, "is_each": is_each}
-        scratch = loss.new_empty(items * 3 * (width + 3))
-        made = {"scratch": scratch, "strengths": self.strengths}
-        self.kernel = prepare_kernel(8 * loss.element_size()).bind(given, made)
-        self._put("NZ", [*self.shape, -1, -1])
-        self._put("SZ", islice(self.kept.take([self.colors * cells] * len(SCALED)), len(SCALED)))
-        self._run(0)
 
-    def strong_axes(self) -> tuple[int, ...]:
-        """The axes to coarsen next; none where there are few cells."""
-        if self.axes and math.prod(self.shape) <= FEW_CELLS:
-            return ()
-        items = self.colors * (1 if self.axes else self.shares)
-        sums = self.strengths[:items].sum(0).tolist()
-        # Sums over faces, of which there are n - 1 for n cells.
-        means = {axis: sums[axis] * n / (n - 1) for axis, n in enumerate(self.shape) if n > 1}
-        most = max(means.values(), default=0.0)
-        return tuple(axis for axis, mean in means.items() if not mean < STRONG * most)
+def _lay_out(operator: Operator) -> list[Tensor]:
+    """Conductances and loss of `operator`, of as many colors as one of them has."""
+    given = (*operator.conductances, operator.loss)
+    colors = max(map(len, given))
+    arrays = _new_arrays(operator.loss, (colors, *operator.loss.shape[1:]), 4)
+    for axis, array, faces in zip(AXES, arrays[:3], operator.conductances, strict=True):
+        lower_cells(array, axis).copy_(faces)
+        array.select(axis, -1).zero_()
+    arrays[3].copy_(operator.loss)
+    return arrays
 
-    def coarsen(self, axes: tuple[int, ...]) -> None:
-        """The stages of a level that coarsens these `axes`, down to the next level."""
-        shapes = [self.shape]
-        for axis in axes:
-            last = enumerate(shapes[-1])
-            shapes.append(tuple((n + 1) // 2 if other == axis else n for other, n in last))
-        counts = [self.colors * math.prod(shape) for shape in shapes[1:]]
-        cells = counts[-1] // self.colors
-        scaled = SCALED if cells > FEW_CELLS else []
-        kept = self.kept.take(
-            [count for count in counts for _ in COARSENED] + counts[-1:] * len(scaled)
-        )
-        work = self.work.take([count for count in counts for _ in MATRIX])
-        first = self.stage
-        for axis, self.shape in zip(axes, shapes[1:], strict=True):
-            self._put("AXIS", [axis])
-            self._put(COARSENED[0], islice(kept, len(COARSENED)))
-            self.stage += 1
-            self._put("NZ", [*self.shape, -1, -1, *islice(work, len(MATRIX))])
-        self.rows[first, COLUMNS["NEXT"]] = self.stage
-        self._put("SZ", islice(kept, len(scaled)))
-        size = -(-cells // 16) * 16 + self.kept.margin
-        self._put("SOURCE", [self.coarser, self.coarser + size])
-        self.coarser += 2 * size
-        self.axes.append(axes)
-        self._run(first)
 
-    def end(self) -> Hierarchy:
-        """The hierarchy, when its coarsest grid has been solved."""
-        shape, colors = self.shape, self.colors
-        if self.axes:
-            # Faces lie at the cell below them.
-            *faces, lost = (self.work.view(self._at(name), -1, colors, *shape) for name in MATRIX)
-            z, y, x = (lower_cells(c, axis) for axis, c in zip(AXES, faces, strict=True))
-            inverse = Coarsest.of(Operator((z, y, x), lost)).inverse
-            self._put("INVERSE", islice(self.kept.take([inverse.numel()]), 1))
-            self.kept.view(self._at("INVERSE"), -1, *inverse.shape).copy_(inverse)
-        self.stage = 0
-        scale = self.kept.view(self._at("SCALE"), 0, colors, *self.kept.like.shape[1:])
-        axes = tuple(self.axes)
-        return Hierarchy(colors, self.table, axes, scale, self.coarser, self.kept.blocks)
+def _compact(faces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """`faces` along z, y and x without those on the box (views)."""
+    z, y, x = (lower_cells(array, axis) for axis, array in zip(AXES, faces, strict=True))
+    return z, y, x
 
-    def _put(self, name: str, values: Iterable[int]) -> None:
-        """Writes `values` of the stage from this column on."""
-        begin, row = COLUMNS[name], list(values)
-        self.rows[self.stage, begin : begin + len(row)] = row
 
-    def _at(self, name: str) -> int:
-        return int(self.rows[self.stage, COLUMNS[name]])
+def _run(step: str, matrix: list[Tensor], made: list[Tensor], axis: int = 1) -> None:
+    """A `step` of making a grid, whose arrays are `made`, of the same or a finer one's `matrix`."""
+    colors, nz, ny, nx = made[0].shape
+    given = {
+        "width": nx, "rows": nz * ny, "colors": colors, "nz": nz, "ny": ny, "nx": nx,
+        "step": MAKING[step], "axis": axis - 1, "finer": matrix[0].shape[1:], "matrix": matrix,
+    }  # fmt: skip
+    rest = [None] * (6 - len(made))
+    kernel = prepare_kernel(8 * matrix[0].element_size())
+    kernel.launch(colors * nz * ny, given, {"made": [*made, *rest]})
 
-    def _run(self, first: int) -> None:
-        """Coarsens the stages from `first` on, and scales the last where it is a level's.
 
-        Threads share each step of the finest level.
-        """
-        last, parts = self.stage, self.shares
-        if parts > 1 and first == 0:
-            steps = [(name, s, s + 1) for s in range(last) for name in ("WEIGHTS", "COARSE_CELLS")]
-            steps += [(name, 0, 0) for name in ("SCALE_CELLS", "SCALE_FACES") if last == 0]
-            for name, stage, end in steps:
-                self._launch(name, stage, end, parts)
-            first = last
-        if first > 0 or parts == 1:
-            self._launch("ALL", first, last, 1)
-
-    def _launch(self, step: str, stage: int, last: int, parts: int) -> None:
-        items = self.colors * parts
-        threads = min(self.threads, items)
-        self.kernel.launch(items, threads, step=MAKING[step], stage=stage, last=last, parts=parts)
+@functools.cache
+def prepare_kernel(bits: int) -> TextKernel:
+    """A step of making a hierarchy, in a row of cells."""
+    text = """
+    const Row row(item, width, rows, colors);
+    const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
+    prepare(row, mesh, step, axis, ny, finer, matrix, made);
+    """
+    given = "int width, rows, colors, nz, ny, nx, step, axis, finer[3]; F *matrix[4], *made[6]"
+    return TextKernel("prepare", bits, text, given, "made", f"{ROOM}/prepare.h")

@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/kernels/numbers.h"
-// The grids of a hierarchy, slice by slice (`stages.py`), and one step on a slice. This is compiled
-// for processors alone: on a GPU torch's operations solve.
+// The grids of a hierarchy, slice by slice (`fused/hierarchy.py`), and one step on a slice. This is
+// compiled for processors alone: on a GPU torch's operations solve.
 
 #define APART __attribute__((noinline)) // compiled once, however often it is called
 
@@ -11,12 +11,11 @@ typedef long long Size;
 
 // What the table says of each stage: how many cells it has; along which AXIS they become pairs, or
 // -1, the coarsest; where a level begins the stage of the NEXT one, else -1; and where arrays lie,
-// as addresses. Of conductances and loss of A; weights of the coarsening; the scaled matrix; the
-// inverse of the coarsest. Right side and solution of a level lie so far into a color's `coarser`.
+// as addresses. Of weights of the coarsening; the scaled matrix; the inverse of the coarsest. Right
+// side and solution of a level lie so far into a color's `coarser`.
 // clang-format off
 enum Column {
-    NZ, NY, NX, AXIS, NEXT, CZ, CY, CX, LOSS, BELOW, ABOVE, SZ, SY, SX, SCALE, TAKEN, INVERSE,
-    SOURCE, U, COLUMNS
+    NZ, NY, NX, AXIS, NEXT, BELOW, ABOVE, SZ, SY, SX, SCALE, TAKEN, INVERSE, SOURCE, U, COLUMNS
 };
 // clang-format on
 

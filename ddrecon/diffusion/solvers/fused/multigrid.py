@@ -6,17 +6,31 @@ are.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.fused.product import subtract_product
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, margin, shares_of
-from ddrecon.diffusion.solvers.fused.kernels import ACTS, SLOTS, SUMS, VECTORS, solve_kernel
+from ddrecon.diffusion.solvers.fused.hierarchy import (
+    ROOM,
+    Hierarchy,
+    margin,
+    read_names,
+    room,
+    shares_of,
+)
+from ddrecon.diffusion.solvers.hierarchy import STEPS
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.kernels.spare import trim_freed_memory
+from ddrecon.kernels.text import TextKernel
 
+SUMS, VECTORS = read_names("levels.h", "Sum"), read_names("levels.h", "Vector")
+ACTS = read_names("gradients.h", "Act")
+SLOTS = 13
+"""Slices that a share of a leg keeps."""
 TOGETHER = 16
 """So many iterations are one launch where threads do not share them."""
 SHARED = "DOWN", "COARSER", "UP", "DIRECT", "ADVANCE"
@@ -36,74 +50,78 @@ def solve(
     """
     made = source.new_empty(source.shape)
     guess = None if guess is None or guess.shape != source.shape else guess
+
+    def solve_part(operator: Operator, own: slice) -> tuple[int, float]:
+        run = Run(operator, source[own], None if guess is None else guess[own], tolerance)
+        count, residual = run.iterate(most)
+        torch.mul(run.vector("Y"), run.hierarchy.scale, out=made[own])  # u = S y
+        return count, residual
+
     if source[0].numel() < ALONE:
-        return _solve(operator, source, guess, tolerance, most, made)
+        return Solution(made, *solve_part(operator, slice(None)))
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
-    found = [
-        _solve(
-            operator.of_color(color),
-            source[color : color + 1],
-            None if guess is None else guess[color : color + 1],
-            tolerance,
-            most,
-            made[color : color + 1],
-        )
-        for color in range(len(source))
-    ]
+    counts, residuals = zip(
+        *(solve_part(operator.of_color(c), slice(c, c + 1)) for c in range(len(source))),
+        strict=True,
+    )
     # max() would pass over what is not a number.
-    worst = float(torch.tensor([part.residual for part in found], dtype=torch.float64).max())
-    return Solution(made, max(part.iterations for part in found), worst)
-
-
-def _solve(
-    operator: Operator,
-    source: Tensor,
-    guess: Tensor | None,
-    tolerance: float,
-    most: int,
-    made: Tensor,
-) -> Solution:
-    """The solution, written to `made`."""
-    run = Run(operator.once(Hierarchy.of), source, guess, tolerance)
-    count, residual = run.iterate(most)
-    torch.mul(run.vector("Y"), run.hierarchy.scale, out=made)  # u = S y
-    return Solution(made, count, residual)
+    return Solution(made, max(counts), float(torch.tensor(residuals, dtype=torch.float64).max()))
 
 
 class Run:
     """A solve under way: its vectors, and the launches that change them."""
 
-    def __init__(
-        self, hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float
-    ):
-        self.hierarchy, self.source, self.tolerance = hierarchy, source, tolerance
+    def __init__(self, operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float):
+        hierarchy = self.hierarchy = operator.once(Hierarchy.of)
+        self.source, self.tolerance = source, tolerance
         self.colors, (_, y, x) = len(source), source.shape[1:]
         cells, self.edge = source[0].numel(), margin(x)
         self.shares, self.threads = shares_of(cells, self.colors, source)
-        self.size = -(-self.colors * cells // 16) * 16 + self.edge
+        self.size = room(self.colors * cells, x)
         self.vectors = source.new_empty(VECTORS["VECTORS"] * self.size + self.edge)
         self.coarser = source.new_zeros(self.colors * hierarchy.coarser)
-        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * self.edge)
+        slots = SLOTS * (room(y * x, x) + self.edge)
         self.scratch = source.new_empty(self.colors * self.shares * slots)
-        self.sums = source.new_empty(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
+        self.sums = source.new_zeros(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
         given = {
             "table": hierarchy.table, "first_vector": self.edge, "vector_size": self.size,
             "scratch_size": slots, "share": hierarchy.coarser, "tolerance": tolerance,
             "tiny": self.tiny, "matrices": hierarchy.colors, "colors": self.colors,
-            "shares": self.shares, "source": source, "guess": guess,
+            "shares": self.shares,
         }  # fmt: skip
         made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
         made["coarser"] = self.coarser
         self.kernel = solve_kernel(8 * source.element_size()).bind(given, made)
+        self._start(operator, guess)
+
+    def _start(self, operator: Operator, guess: Tensor | None) -> None:
+        """y and r from a guess; of colors that it does not help, from zero."""
+        y, r, scale = self.vector("Y"), self.vector("R"), self.hierarchy.scale
+        # Beside the residual lie numbers that the cycle reads, and multiplies by zero.
+        first = self.edge + VECTORS["R"] * self.size
+        self.vectors[first - self.edge : first] = 0
+        self.vectors[first + r.numel() : first + self.size] = 0
+        torch.mul(scale, self.source, out=r)
+        reached = norm = torch.linalg.vector_norm(r, dim=(1, 2, 3))
+        if guess is None:
+            y.zero_()
+        else:
+            matrix = operator.loss, *operator.conductances
+            torch.div(guess, scale, out=y)
+            torch.mul(scale, subtract_product(self.source, guess, *matrix), out=r)
+            reached = torch.linalg.vector_norm(r, dim=(1, 2, 3))
+            useless = ~(reached < norm)
+            if useless.any():
+                y[useless], r[useless] = 0, (scale * self.source)[useless]
+                reached = torch.where(useless, norm, reached)
+        self.sums[SUMS["RESIDUAL"], :, 0] = reached.double() ** 2
+        self.sums[SUMS["SOURCE_NORM"], :, 0] = norm.double() ** 2
 
     def iterate(self, most: int) -> tuple[int, float]:
         """How many iterations it took, of at most so many, and the relative residual left."""
         is_one, done, residual = self.shares == 1, 0, math.inf
-        # In all colors first: beside a color's residual the cycle reads others', times zero.
-        for act in ("START", "CHOOSE"):
-            self._launch(act, 0, 0)
         while residual > self.tolerance and done < most:
             end = min(done + (TOGETHER if is_one else 1), most)
             for act in ("SOLVE",) if is_one else SHARED:
@@ -127,3 +145,23 @@ class Run:
         items = self.colors * parts
         threads = min(self.threads, items)
         self.kernel.launch(items, threads, act=ACTS[act], first=first, last=last, parts=parts)
+
+
+@functools.cache
+def solve_kernel(bits: int) -> TextKernel:
+    """An `act` of a solve, for one of the parts of the slices of a color."""
+    text = f"""
+    const int color = item / parts, part = item - color * parts;
+    const Solve<F> solve = {{
+        {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
+        tolerance, tiny, matrices, colors, shares, color, part, 0}};
+    F *const mine = coarser + color * share, *const memory = scratch + item * scratch_size;
+    iterate(solve, act, first, last, mine, memory);
+    """
+    given = """
+    int act, first, last, parts, matrices, colors, shares; double tolerance, tiny, *sums;
+    long *table, first_vector, vector_size, scratch_size, share;
+    F *vectors, *scratch, *coarser
+    """
+    made = "vectors scratch sums coarser"
+    return TextKernel("multigrid", bits, text, given, made, f"{ROOM}/gradients.h")

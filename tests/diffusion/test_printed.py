@@ -1,9 +1,13 @@
-"""The paper's own scheme: second order in smooth media, exact derivatives of itself."""
+"""The paper's own scheme: second order in smooth media, exact derivatives of itself.
+
+And its Algorithm 3: where it stops, and what it says where it diverges.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -11,18 +15,31 @@ from typing import Any
 import pytest
 import torch
 from media import box_grid, convergence_order, half_empty, make_scene, random_values
-from printed_media import DARK, make_printed, smooth_scene, solving
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.paper.operator import PrintedOperator, Stencils, extend
-from ddrecon.diffusion.paper.printed import Ghosts, solve_printed, solve_printed_system
+from ddrecon.diffusion import printed
+from ddrecon.diffusion.closures import CLOSURES, FLOOR
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
+from ddrecon.diffusion.printed import (
+    Ghosts,
+    PrintedOperator,
+    Stencils,
+    convolve,
+    extend,
+    iterate_jacobi,
+    solve_printed,
+    solve_printed_system,
+)
+from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, keep_medium
 from ddrecon.renderer import render, solve_light
+from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
+DARK = torch.zeros(1, 1, 1, 1, dtype=torch.float64)
 SHAPES = [(3, 2, 4), (1, 2, 3), (1, 1, 1)]
 TO_ROUNDING: dict[str, Any] = {
     "eps": 1e-5,
@@ -32,6 +49,31 @@ TO_ROUNDING: dict[str, Any] = {
     "nondet_tol": 1e-10,
     "fast_mode": True,
 }
+
+
+def solving(tolerance: float = 1e-14, memory: SolveMemory | None = None) -> SolverWithMemory:
+    return SolverWithMemory(iterate_jacobi, tolerance, memory or SolveMemory())
+
+
+def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
+    """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
+    kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
+    stencils = Stencils.on(grid, kappa)
+    diagonal = 3 * random_values(colors, *grid.shape, seed=2) + kappa * sum(
+        2 / h**2 for h in grid.spacing
+    )
+    echo = Ghosts.of(kappa, Moments(torch.zeros_like(kappa)), DARK, stencils).echo
+    return PrintedOperator(stencils, diagonal, convolve(extend(kappa), stencils.coefficients), echo)
+
+
+def smooth_scene(cells: int = 6, **changes: Any) -> Scene:
+    """A medium that varies slowly and touches its box, in beams and ambient light."""
+    grid = Grid((cells, cells, cells), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
+    z, y, x = grid.centers(torch.zeros(1, dtype=torch.float64))
+    density = 1 + 0.4 * torch.sin(2 * z + x) * torch.cos(y)
+    lights = {"directional": (3.0, 2.0, 1.0), "ambient": (0.3, 0.4, 0.5)}
+    settings = {"g": 0.4, "scheme": "printed"} | lights | changes
+    return make_scene(density, grid=grid, **settings)
 
 
 def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
@@ -181,31 +223,6 @@ def test_a_manufactured_solution_is_approached_at_second_order():
     assert convergence_order([1 / cells for cells in counts], fluxes) >= 1.4, fluxes
 
 
-@pytest.mark.parametrize(
-    ("lights", "least"),
-    [({"directional": None}, 1.9), ({"ambient": None}, 1.3)],
-    ids=["ambient", "directional"],
-)
-def test_both_schemes_agree_as_the_grid_refines(lights: dict[str, None], least: float):
-    """At second order; beams have layers at the faces they enter by, which these grids only begin
-    to resolve.
-    """
-
-    def disagreement(cells: int) -> float:
-        scenes = (
-            smooth_scene(cells, scheme=scheme, closure="smooth", tolerance=1e-8, **lights)
-            for scheme in ("printed", "conservative")
-        )
-        ours, theirs = (solve_light(scene, SolveMemory()).diffuse.mean for scene in scenes)
-        return float((ours - theirs).norm() / theirs.norm())
-
-    counts = [6, 9, 12]
-    apart = [disagreement(cells) for cells in counts]
-    assert (
-        convergence_order([1 / cells for cells in counts], apart) >= least and apart[-1] < 2e-3
-    ), apart
-
-
 @pytest.mark.parametrize("g", [0.0, 0.5])
 def test_a_white_furnace_is_white(g: float):
     scene = make_scene(
@@ -286,3 +303,145 @@ def test_both_derivatives_of_an_image_agree_with_differences(name: str):
 
     value = value_of(scene, name).detach().clone().requires_grad_()
     assert torch.autograd.gradcheck(image, value, **TO_ROUNDING)
+
+
+def exact(operator: PrintedOperator, source: Tensor) -> Tensor:
+    shape = operator.stencils.grid.shape
+    columns = (
+        torch.eye(math.prod(shape), dtype=torch.float64)
+        .view(-1, 1, *shape)
+        .expand(-1, source.shape[0], -1, -1, -1)
+    )
+    matrix = torch.stack([operator.apply(column).flatten(1) for column in columns], 2)
+    return torch.linalg.solve(matrix, source.flatten(1)).view_as(source)
+
+
+@pytest.mark.parametrize("is_transposed", [False, True])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-8, 1e-13])
+def test_the_tolerance_is_a_relative_residual(tolerance: float, is_transposed: bool):
+    operator = replace(make_printed(box_grid((4, 5, 3))), is_transposed=is_transposed)
+    source = random_values(2, 4, 5, 3, seed=3) - 0.5
+    solution = iterate_jacobi(operator, source, None, tolerance)
+    residual = (source - operator.apply(solution.value)) / operator.diagonal
+    assert 0 < solution.residual <= tolerance
+    assert float(residual.norm() / (source / operator.diagonal).norm()) < 2 * tolerance
+    torch.testing.assert_close(
+        solution.value, exact(operator, source), rtol=1e3 * tolerance, atol=1e2 * tolerance
+    )
+
+
+def test_a_tolerance_below_rounding_ends_all_the_same():
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3, seed=3)
+    solution = iterate_jacobi(operator, source, None, 1e-30)
+    torch.testing.assert_close(solution.value, exact(operator, source), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("has_guess", [False, True])
+def test_a_color_without_source_stays_dark(has_guess: bool):
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3, seed=3)
+    source[0] = 0
+    value = iterate_jacobi(
+        operator, source, random_values(2, 4, 5, 3) if has_guess else None, 1e-8
+    ).value
+    assert not value[0].any() and bool(value[1].any())
+
+
+def test_a_random_start_is_the_same_in_every_run():
+    first, second = (SolveMemory(is_warm=False) for _ in range(2))
+    assert torch.equal(render(smooth_scene(), memory=first), render(smooth_scene(), memory=second))
+    torch.manual_seed(5)
+    render(smooth_scene(), memory=first)
+    assert (
+        first.records[0].iterations == first.records[1].iterations == second.records[0].iterations
+    )
+
+
+def test_a_warm_start_takes_fewer_iterations():
+    """All three kinds are recorded; tangents, which have nothing in common, start anew."""
+    scene, memory = smooth_scene(tolerance=1e-6), SolveMemory()
+    for step in (0.0, 1e-3):
+        density = (scene.volume.density * (1 + step)).requires_grad_()
+        moved = replace(scene, volume=replace(scene.volume, density=density))
+        render(moved, memory=memory).sum().backward()
+    with forward_ad.dual_level():
+        density = forward_ad.make_dual(scene.volume.density, scene.volume.density)
+        render(replace(scene, volume=replace(scene.volume, density=density)), memory=memory)
+    assert [record.kind for record in memory.records] == ["forward", "adjoint"] * 2 + [
+        "forward",
+        "tangent",
+    ]
+    cold, warm = memory.records[:2], memory.records[2:4]
+    assert all(b.iterations < 0.7 * a.iterations for a, b in zip(cold, warm, strict=True))
+
+
+@pytest.fixture
+def ball() -> Callable[..., Scene]:
+    """A ball 0.7 `sigma` optical depths thick in empty space, its surface `width` cells wide."""
+
+    def make(sigma: float, width: float, floor: float = FLOOR) -> Scene:
+        grid = Grid((16, 16, 16), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+        radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
+        density = (16 * (0.35 - radius) / width + 0.5).clamp(0, 1)
+        optics = {"sigma_a": (0.01 * sigma,), "sigma_s": (0.99 * sigma,)}
+        return make_scene(
+            density, grid=grid, **optics, scheme="printed", tolerance=1e-4, floor=floor
+        )
+
+    return make
+
+
+def kappa_of(scene: Scene) -> Tensor:
+    return (
+        3
+        * CLOSURES["smooth"](
+            keep_medium(scene.volume).transport_extinction, scene.volume.grid, scene.diffusion.floor
+        )[0]
+    )
+
+
+def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
+    """At a floor of 0.1; the cell named is the one whose neighbors differ most, by more than 4 of
+    its own kappa.
+    """
+    scene = ball(20.0, 2.0, floor=0.1)
+    with pytest.raises(SolveError, match=r"and above 4 .*diffusion\.scheme=conservative") as caught:
+        solve_light(scene, SolveMemory())
+    told = re.match(
+        r"kappa changes by a factor ([\d.]+) between neighbors at cell \((\d+), (\d+), (\d+)\)",
+        str(caught.value),
+    )
+    assert told is not None
+    factor, (x, y, z) = float(told[1]), (int(index) for index in told.groups()[1:])
+    kappa = torch.nn.functional.pad(kappa_of(scene)[None], (1,) * 6, mode="replicate")[0]
+    beside = [
+        (kappa[z + 2, y + 1, x + 1], kappa[z, y + 1, x + 1]),
+        (kappa[z + 1, y + 2, x + 1], kappa[z + 1, y, x + 1]),
+    ]
+    beside += [(kappa[z + 1, y + 1, x + 2], kappa[z + 1, y + 1, x])]
+    ratio = max(float((a - b).abs() / kappa[z + 1, y + 1, x + 1]) for a, b in beside)
+    assert factor > 4 and factor == pytest.approx(ratio, abs=0.06)
+    assert caught.value.iterations < 200 and caught.value.exit_code == 4
+
+
+def test_divergence_that_the_criterion_does_not_explain_is_not_blamed_on_it():
+    operator = make_printed(box_grid((4, 5, 3)))
+    with pytest.raises(SolveError, match=r"diverged, although kappa changes by a factor [0-3]\."):
+        iterate_jacobi(
+            replace(operator, diagonal=operator.diagonal / 3), random_values(2, 4, 5, 3), None, 1e-8
+        )
+
+
+def test_slow_convergence_ends_with_an_error(monkeypatch):
+    monkeypatch.setattr(printed, "MAX_ITERATIONS", 4)
+    with pytest.raises(SolveError, match="did not reach its tolerance after 4 iterations"):
+        iterate_jacobi(make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3), None, 1e-8)
+
+
+@pytest.mark.parametrize("where", ["source", "diagonal", "coefficients"])
+def test_a_system_that_is_not_finite_is_an_error(where: str):
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3)
+    {"source": source, "diagonal": operator.diagonal, "coefficients": operator.coefficients}[where][
+        0, 0, 0, 0
+    ] = float("nan")
+    with pytest.raises(SolveError, match="not finite"):
+        iterate_jacobi(operator, source, None, 1e-8)

@@ -1,1 +1,0 @@
-"""The scheme the paper prints, for comparison."""
