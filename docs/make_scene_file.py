@@ -338,8 +338,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
                 "where there are none: without model `p1` or scheme `conservative`. It is 1 as "
-                "well where a cell is thicker than 2 optical depths and a given g is above 0. Beyond "
-                "0.77 it is 4 with degree 5."
+                "well where a cell is thicker than 2 optical depths and a given g is above 0. "
+                "Beyond 0.77 it is 4 with degree 5."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 "
