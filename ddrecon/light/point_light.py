@@ -144,7 +144,7 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
     fraction = _gauss_pairs(pairs).to(field)[:, None]
     inside = _part_inside(grid, position, ends)
     ways = ends - inside[:, None] * (ends - position), ends, inside * distance
-    if is_fused(position):
+    if is_fused(position) and not position.requires_grad:
         from ddrecon.light.fused.point_light import integrate_ways
 
         return integrate_ways(field, grid, *ways, fraction)
