@@ -128,13 +128,14 @@ def attenuate(
     [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Also the
     mass up to cells' centers [K, z, y, x] of each beam where it `has_mass`.
     """
-    count, (_, moments, colors) = 1, weights.shape
+    field, (_, moments, colors) = medium.extinction.field, weights.shape
+    quarter = moments * colors // (4 * len(field))
     if is_fused_whole(medium.grid, directions):
         from ddrecon.light.fused.receive import MOST_BEAMS
 
-        field = medium.extinction.field
-        eighth = moments * colors // (8 * len(field))
-        count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
+        count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
+    else:
+        count = max(1, quarter // 8)
     sums: Sequence[Tensor] = ()
     masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
@@ -164,9 +165,10 @@ def attenuate_few(
             given = entered, steps, weights.expand(-1, -1, colors)
             received = receive(field, scale.flatten().expand(colors), *given)
         else:
-            tau = extinction.mean_transmittance(entered[0], steps[0])
-            sums = tau * weights[0][..., None, None, None]
-            received = *sums[:4], *([sums[4:]] if len(sums) > 4 else [])
+            tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
+            sums = torch.einsum("lmc,lczyx->mczyx", weights, tau)
+            few, *others = sums.split([4, len(sums) - 4]) if len(sums) > 4 else [sums]
+            received = *few.unbind(), *others
         masses = zip(entered, steps, strict=True) if has_mass else ()
         return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
 

@@ -55,12 +55,19 @@ template <class F, int CHUNK> struct Receiver {
                 INDEPENDENT
                 for (int t = 0; t < count; ++t) seen[i][t] = visible(s * e[t], along * f[t]);
             }
+            // Four beams at a time; beyond the last, weights and light are 0.
+            for (int i = lights; i % 4; ++i)
+                for (int t = 0; t < count; ++t) seen[i][t] = N(F(0));
             for (int a = 0; a < moments; ++a) {
-                N sums[CHUNK];
+                N sums[CHUNK], own[4];
                 for (int t = 0; t < count; ++t) sums[t] = N(F(0));
-                for (int i = 0; i < lights; ++i) {
-                    const N own = weights[weight(i, a, c)];
-                    for (int t = 0; t < count; ++t) sums[t] += own * seen[i][t];
+                for (int i = 0; i < lights; i += 4) {
+                    for (int j = 0; j < 4; ++j)
+                        own[j] = i + j < lights ? N(weights[weight(i + j, a, c)]) : N(F(0));
+                    INDEPENDENT
+                    for (int t = 0; t < count; ++t)
+                        sums[t] += own[0] * seen[i][t] + own[1] * seen[i + 1][t] +
+                                   own[2] * seen[i + 2][t] + own[3] * seen[i + 3][t];
                 }
                 F* __restrict out = moment(made, a, c) + begin;
                 for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);

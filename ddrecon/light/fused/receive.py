@@ -12,10 +12,10 @@ from torch import Tensor
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
-CHUNK = 512
+CHUNK = 256
 """Cells that one item does on a processor; on a GPU it is one."""
-MOST_BEAMS = 16
-"""So many beams at most are received at once."""
+MOST_BEAMS = 48
+"""So many beams at most are received at once: a multiple of four."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 
