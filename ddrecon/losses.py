@@ -48,13 +48,8 @@ def huber(error: Tensor, target: Target) -> Tensor:
 
     Huber 1964, doi:10.1214/aoms/1177703732.
     """
-    return (
-        2
-        * torch.nn.functional.huber_loss(
-            error / target.scale, torch.zeros_like(error), reduction="none", delta=HUBER
-        )
-        * target.scale**2
-    )
+    part = (error / target.scale).abs()
+    return torch.where(part < HUBER, part**2, HUBER * (2 * part - HUBER)) * target.scale**2
 
 
 def relative_l2(error: Tensor, target: Target) -> Tensor:
@@ -170,16 +165,6 @@ class Target:
     def _mean(self, values: Tensor) -> Tensor:
         """The mean of `values` [3, h, w] over the numbers that count."""
         return (values if self.seen is None else values * self.seen).sum() / self.count
-
-
-def image_loss(
-    loss: str, image: Tensor, target: Tensor, mask: Tensor | None, noise: Noise | None = None
-) -> Tensor:
-    """The mean of `loss` over the pixels and colors of `image` [3, h, w] against `target`.
-
-    Pixels where `mask` [h, w] is 0 do not count; None counts all.
-    """
-    return Target.of(target, mask, loss, noise).loss_of(image)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:

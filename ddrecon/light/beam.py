@@ -42,33 +42,15 @@ class Beam:
 
     def scatter(
         self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
-    ) -> tuple[Tensor, Tensor | float]:
-        """The integral of `scattering` over each segment of view rays, and the phase function p.
+    ) -> Tensor:
+        """The integral of `scattering` p over each segment of view rays, `[N - 1, K or C, R]`.
 
-        Their product is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]:
-        kappa_s per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C,
-        R]. With a forward peak of depth `peak` [N, C, R] at the nodes (E8.7), or where it differs
-        from cell to cell, it changes along the ray: then the integral holds it, and the factor is
-        1.
+        That is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s per
+        unit of its scale, at the `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
         """
-        cosine = self.cosine(nodes.direction)
-        if peak is None and isinstance(seen, SeenPhase):
-            return nodes.integral(scattering), seen.value(cosine)
-        if peak is None:
-            return nodes.integral(scattering * seen.value(cosine)), 1.0
-        return nodes.integral(scattering * seen.along(peak, cosine)), 1.0
-
-    def cosine(self, direction: Tensor) -> Tensor:
-        """Cosine [R] between the light and what leaves along view rays of `direction` [R, 3]."""
-        return leaving_cosine(direction, self.direction)
-
-
-def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
-    """Cosine [R] between light that travels along `travel` [3] and what leaves along view rays.
-
-    These look along `direction` [R, 3].
-    """
-    return -(direction @ travel)
+        cosine = -(nodes.direction @ self.direction)
+        phase = seen.value(cosine) if peak is None else seen.along(peak, cosine)
+        return nodes.integral(scattering * phase)
 
 
 def follow_beams(

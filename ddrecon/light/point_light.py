@@ -56,8 +56,8 @@ class PointBeam:
 
     def scatter(
         self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
-    ) -> tuple[Tensor, Tensor | float]:
-        """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
+    ) -> Tensor:
+        """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`.
 
         Arguments as of `Beam.scatter`. Scattering times p is linear between nodes.
         """
@@ -71,7 +71,7 @@ class PointBeam:
         # ray's distance from it: int ds / (d^2 + s^2) = atan(s / d) / d.
         distance = across.sqrt()
         angle = torch.atan2(distance * nodes.lengths, across + along[1:] * along[:-1])
-        return nodes.integral(scattering * phase, angle / distance), 1.0
+        return nodes.integral(scattering * phase, angle / distance)
 
     def passing(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """How view rays pass the light: from `origin` [R, 3] along unit `direction` [R, 3].
