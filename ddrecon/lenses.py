@@ -33,7 +33,7 @@ def ray_through(model: str, coefficients: Tensor, image: Tensor) -> Tensor:
     if model == "opencv":
         place = _solve(_opencv, coefficients, image)
         return torch.cat([place, torch.ones_like(place[:, :1])], 1)
-    distance = _length(image)
+    distance = image.norm(dim=1, keepdim=True)
     angle = _solve(_fisheye, coefficients, distance)
     return torch.cat([image * _quotient(angle.sin(), distance), angle.cos()], 1)
 
@@ -43,7 +43,7 @@ def distort(model: str, coefficients: Tensor, ray: Tensor) -> Tensor:
     sideways, forward = ray[:, :2], ray[:, 2:]
     if model == "opencv":
         return _opencv(coefficients, sideways / forward)[0]
-    length = _length(sideways)
+    length = sideways.norm(dim=1, keepdim=True)
     moved = _fisheye(coefficients, torch.atan2(length, forward))[0]
     return sideways * _quotient(moved, length)
 
@@ -109,9 +109,3 @@ def _quotient(value: Tensor, length: Tensor) -> Tensor:
     """`value / length`, and 1 on the axis, where both are 0."""
     is_axis = length == 0
     return torch.where(is_axis, 1, value / torch.where(is_axis, 1, length))
-
-
-def _length(places: Tensor) -> Tensor:
-    """The distance of `places` [R, 2] from the axis, [R, 1], whose derivative there is 0."""
-    square = (places**2).sum(1, keepdim=True)
-    return torch.where(square > 0, torch.where(square > 0, square, 1).sqrt(), 0)

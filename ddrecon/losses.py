@@ -34,8 +34,11 @@ WHITE = 1 - 1e-4
 
 
 def l2(error: Tensor, target: Target) -> Tensor:
-    """The square of each entry of `error`."""
-    return error**2
+    """The square of each entry of `error`, by the slope of the scale at the target.
+
+    That is 1 but for the loss `photon`, whose errors are in units of the noise there (E9.2).
+    """
+    return (error * target.slope) ** 2
 
 
 def l1(error: Tensor, target: Target) -> Tensor:
@@ -68,12 +71,7 @@ def display(error: Tensor, target: Target) -> Tensor:
     does not err.
     """
     error = torch.where(target.image >= WHITE, error.clamp(max=0), error)
-    return (error * target.slope) ** 2
-
-
-def photon(error: Tensor, target: Target) -> Tensor:
-    """The square of `error` in units of the noise at the target (E9.2)."""
-    return (error * target.slope) ** 2
+    return l2(error, target)
 
 
 LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
@@ -82,7 +80,7 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
     "huber": huber,
     "relative_l2": relative_l2,
     "display": display,
-    "photon": photon,
+    "photon": l2,
 }
 
 

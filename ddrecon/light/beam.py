@@ -118,28 +118,29 @@ def attenuate(
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
     else:
         count = max(1, quarter // 8)
-    sums: Sequence[Tensor] = ()
+    sums: Tensor | None = None
     masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
         parts, more = attenuate_few(medium, *some, has_mass)
-        sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
+        sums = parts if sums is None else sums + parts
         masses += more
-    mean, *others = sums
-    flux = (others[0], others[1], others[2]) if others else None
-    return Moments(mean, flux, others[3] if len(others) > 3 else None), masses
+    assert sums is not None
+    if len(sums) == 1:
+        return Moments(sums[0]), masses
+    # Cut, not indexed: on the way back this is put together once.
+    first, higher = sums.split([4, len(sums) - 4])
+    mean, z, y, x = first.unbind()
+    return Moments(mean, (z, y, x), higher if len(higher) else None), masses
 
 
 def attenuate_few(
     medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool = False
-) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-    """What is received of a few beams, for the mean, for each component of the flux, for all else.
-
-    And masses, as `attenuate` has them.
-    """
+) -> tuple[Tensor, list[Tensor]]:
+    """What is received of a few beams, [moments, C, z, y, x], and their masses."""
     extinction, is_fused = medium.extinction, is_fused_whole(medium.grid, directions)
     field, scale = extinction.field, extinction.scale
 
-    def use(entered: Tensor, steps: Tensor) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    def use(entered: Tensor, steps: Tensor) -> tuple[Tensor, list[Tensor]]:
         if is_fused:
             from ddrecon.light.fused.receive import receive
 
@@ -148,9 +149,7 @@ def attenuate_few(
             received = receive(field, scale.flatten().expand(colors), *given)
         else:
             tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
-            sums = torch.einsum("lmc,lczyx->mczyx", weights, tau)
-            few, *others = sums.split([4, len(sums) - 4]) if len(sums) > 4 else [sums]
-            received = *few.unbind(), *others
+            received = torch.einsum("lmc,lczyx->mczyx", weights, tau)
         masses = zip(entered, steps, strict=True) if has_mass else ()
         return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
 
