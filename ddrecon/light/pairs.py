@@ -27,7 +27,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam, unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import Shear, cross_grid, sum_mass_to_cells
+from ddrecon.light.shear import Shear, cross_grid, sum_masses
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
@@ -93,17 +93,16 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     _, direction = unit_directions(light.direction)
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     is_uniform = extinction.field is medium.scattering.field and not medium.is_cellwise
-    ways = (direction, -direction) if is_uniform else (direction,)
-    (entered, step), *behind = (
-        sum_mass_to_cells(extinction.field, medium.grid, way, extinction.mass_bound) for way in ways
-    )
+    ways = torch.stack([direction, -direction] if is_uniform else [direction])
+    crossing = extinction.field, medium.grid, ways, extinction.mass_bound
+    (entered, *behind), (step, *_) = recompute(sum_masses, *crossing)
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     turned = backward_fraction(medium)
 
     def find_shares() -> tuple[Tensor, Tensor, Tensor]:
         tau = extinction.mean_transmittance(entered, step)
         if is_uniform:
-            return tau, *_pair(medium, entered, behind[0][0], step, turned)
+            return tau, *_pair(medium, entered, behind[0], step, turned)
         back = turned * medium.scattering.value
         forth, against = turn_in_cells(extinction.value, back, medium.grid, direction)
         return tau, tau * forth, tau * against
