@@ -23,8 +23,8 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
 MOST_NUMBERS = 1 << 23
-"""So many numbers of masses are held at once, or an eighth of the moments' where that is more:
-cells then receive the light of several beams in one pass.
+"""So many numbers of masses are held at once, or a quarter of the moments' where that is more:
+cells then receive the light of several beams in one pass. torch's operations hold more of each.
 """
 
 
