@@ -7,7 +7,6 @@ target with `up` up. World vectors here are (x, y, z); `cast_rays` hands them on
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -106,15 +105,6 @@ class Rays:
         distance = (z**2 + y**2 + x**2).sqrt().clamp(min=torch.finfo(self.eye.dtype).tiny)
         return z / distance, y / distance, x / distance
 
-    @staticmethod
-    def join(bundles: Sequence[Rays]) -> Rays:
-        """All rays of some `bundles` of one camera, bundle by bundle."""
-        return Rays(
-            torch.cat([b.origin for b in bundles]),
-            torch.cat([b.direction for b in bundles]),
-            bundles[0].eye,
-        )
-
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world matrix `[3, 4]` of a camera at `origin` that looks at `target`.
@@ -143,13 +133,15 @@ def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
     return [((i + 0.5) / rows, (j + 0.5) / columns) for i in range(rows) for j in range(columns)]
 
 
-def cast_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
-    """The rays through every pixel, row by row, R = height * width.
+def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:
+    """The rays through every pixel, row by row, R = height * width for each of `offsets`.
 
-    `offset`: where they pass through their pixels, as parts of it (row, column).
+    These say where rays pass through their pixels, as parts of it (row, column): without any, in
+    the middle.
     """
     right, up, backward, origin = camera.pose.unbind(1)
-    x, y = image_places(camera, offset).unbind(1)
+    places = [image_places(camera, offset) for offset in offsets or [(0.5, 0.5)]]
+    x, y = torch.cat(places).unbind(1)
     if not camera.is_perspective:
         plane = x[:, None] * right - y[:, None] * up
         return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)

@@ -22,8 +22,6 @@ from torch import Tensor
 
 MOST_STEPS = 50
 """Newton steps at most; three or four are enough for any lens that is sold."""
-WAY = 16
-"""Places on the way from the axis to a direction where distortion must not have folded over."""
 
 
 def ray_through(model: str, coefficients: Tensor, image: Tensor) -> Tensor:
@@ -35,7 +33,7 @@ def ray_through(model: str, coefficients: Tensor, image: Tensor) -> Tensor:
     if model == "opencv":
         place = _solve(_opencv, coefficients, image)
         return torch.cat([place, torch.ones_like(place[:, :1])], 1)
-    distance = _length(image)
+    distance = image.norm(dim=1, keepdim=True)
     angle = _solve(_fisheye, coefficients, distance)
     return torch.cat([image * _quotient(angle.sin(), distance), angle.cos()], 1)
 
@@ -45,25 +43,9 @@ def distort(model: str, coefficients: Tensor, ray: Tensor) -> Tensor:
     sideways, forward = ray[:, :2], ray[:, 2:]
     if model == "opencv":
         return _opencv(coefficients, sideways / forward)[0]
-    length = _length(sideways)
+    length = sideways.norm(dim=1, keepdim=True)
     moved = _fisheye(coefficients, torch.atan2(length, forward))[0]
     return sideways * _quotient(moved, length)
-
-
-def is_folded(model: str, coefficients: Tensor, image: Tensor) -> Tensor:
-    """At which of the places `image` [R, 2] two directions meet, or none: bool [R]."""
-    distortion = _opencv if model == "opencv" else _fisheye
-    target = image if model == "opencv" else _length(image)
-    place = _solve(distortion, coefficients, target)
-    residual = (distortion(coefficients, place)[0] - target).abs().amax(1)
-    folded = ~(residual <= 1e-4 * (1 + target.abs().amax(1)))
-    if model == "fisheye":
-        folded |= place[:, 0].abs() >= torch.pi
-    # Distortion is one to one as far as its determinant stays positive all the way from the axis.
-    for part in range(1, WAY + 1):
-        slopes = distortion(coefficients, place * (part / WAY))[1]
-        folded |= ~(_determinant(slopes) > 0)
-    return folded
 
 
 Distortion = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -114,28 +96,16 @@ def _solve(distortion: Distortion, coefficients: Tensor, target: Tensor) -> Tens
 
 def _divide(vector: Tensor, slopes: Tensor) -> Tensor:
     """The `[R, n]` that `slopes` [R, n, n] map to `vector`; 0 where they are singular."""
-    determinant = _determinant(slopes)
-    inverse = torch.where(determinant.abs() > 1e-6, 1 / determinant, 0)[:, None]
     if vector.shape[1] == 1:
-        return vector * inverse
-    (a, b), (c, d) = (row.unbind(-1) for row in slopes.unbind(1))
-    x, y = vector.unbind(1)
-    return torch.stack([d * x - b * y, a * y - c * x], 1) * inverse
-
-
-def _determinant(slopes: Tensor) -> Tensor:
-    if slopes.shape[-1] == 1:
-        return slopes[:, 0, 0]
-    return slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]
+        determinant, crossed = slopes[:, 0], vector
+    else:
+        (a, b), (c, d) = (row.split(1, -1) for row in slopes.unbind(1))
+        x, y = vector.split(1, 1)
+        determinant, crossed = a * d - b * c, torch.cat([d * x - b * y, a * y - c * x], 1)
+    return crossed * torch.where(determinant.abs() > 1e-6, 1 / determinant, 0)
 
 
 def _quotient(value: Tensor, length: Tensor) -> Tensor:
     """`value / length`, and 1 on the axis, where both are 0."""
     is_axis = length == 0
     return torch.where(is_axis, 1, value / torch.where(is_axis, 1, length))
-
-
-def _length(places: Tensor) -> Tensor:
-    """The distance of `places` [R, 2] from the axis, [R, 1], whose derivative there is 0."""
-    square = (places**2).sum(1, keepdim=True)
-    return torch.where(square > 0, torch.where(square > 0, square, 1).sqrt(), 0)

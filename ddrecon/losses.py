@@ -34,8 +34,11 @@ WHITE = 1 - 1e-4
 
 
 def l2(error: Tensor, target: Target) -> Tensor:
-    """The square of each entry of `error`."""
-    return error**2
+    """The square of each entry of `error`, by the slope of the scale at the target.
+
+    That is 1 but for the loss `photon`, whose errors are in units of the noise there (E9.2).
+    """
+    return (error * target.slope) ** 2
 
 
 def l1(error: Tensor, target: Target) -> Tensor:
@@ -48,13 +51,8 @@ def huber(error: Tensor, target: Target) -> Tensor:
 
     Huber 1964, doi:10.1214/aoms/1177703732.
     """
-    return (
-        2
-        * torch.nn.functional.huber_loss(
-            error / target.scale, torch.zeros_like(error), reduction="none", delta=HUBER
-        )
-        * target.scale**2
-    )
+    part = (error / target.scale).abs()
+    return torch.where(part < HUBER, part**2, HUBER * (2 * part - HUBER)) * target.scale**2
 
 
 def relative_l2(error: Tensor, target: Target) -> Tensor:
@@ -73,12 +71,7 @@ def display(error: Tensor, target: Target) -> Tensor:
     does not err.
     """
     error = torch.where(target.image >= WHITE, error.clamp(max=0), error)
-    return (error * target.slope) ** 2
-
-
-def photon(error: Tensor, target: Target) -> Tensor:
-    """The square of `error` in units of the noise at the target (E9.2)."""
-    return (error * target.slope) ** 2
+    return l2(error, target)
 
 
 LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
@@ -87,7 +80,7 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
     "huber": huber,
     "relative_l2": relative_l2,
     "display": display,
-    "photon": photon,
+    "photon": l2,
 }
 
 
@@ -170,16 +163,6 @@ class Target:
     def _mean(self, values: Tensor) -> Tensor:
         """The mean of `values` [3, h, w] over the numbers that count."""
         return (values if self.seen is None else values * self.seen).sum() / self.count
-
-
-def image_loss(
-    loss: str, image: Tensor, target: Tensor, mask: Tensor | None, noise: Noise | None = None
-) -> Tensor:
-    """The mean of `loss` over the pixels and colors of `image` [3, h, w] against `target`.
-
-    Pixels where `mask` [h, w] is 0 do not count; None counts all.
-    """
-    return Target.of(target, mask, loss, noise).loss_of(image)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:

@@ -10,7 +10,7 @@ import torch
 from media import make_camera, make_scene, random_values
 
 from ddrecon.cameras import Camera, cast_rays, image_places
-from ddrecon.lenses import distort, is_folded, ray_through
+from ddrecon.lenses import distort, ray_through
 from ddrecon.renderer import render
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import with_values
@@ -78,25 +78,6 @@ def test_without_distortion_it_is_a_pinhole_or_a_perfect_fisheye(model: str) -> 
     cosine = ray[:, 2] / ray.norm(dim=1)
     off = places.norm(dim=1)
     torch.testing.assert_close(cosine, off.cos() if model == "fisheye" else off.atan().cos())
-
-
-def test_folding_is_seen_where_the_slope_along_the_radius_is_zero() -> None:
-    """r (1 + k1 r^2) turns back at r^2 = -1 / (3 k1), where it is two thirds of r."""
-    lens = torch.tensor([-0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
-    turn = 2 / 3 * (2 / 3) ** 0.5
-    places = torch.tensor([[0.99 * turn, 0], [0, 1.01 * turn], [0.99 * turn, 0.3], [0, 0]])
-    assert is_folded("opencv", lens, places.double()).tolist() == [False, True, True, False]
-    bent = torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64)
-    turn = 2 / 3 * (10 / 3) ** 0.5
-    places = torch.tensor([[0.99 * turn, 0], [1.01 * turn, 0]]).double()
-    assert is_folded("fisheye", bent, places).tolist() == [False, True]
-
-
-def test_folding_is_seen_beyond_a_branch_that_rises_again() -> None:
-    """r (1 - r^2 + 0.4 r^4) falls between two rises: what lies beyond is seen twice or thrice."""
-    lens = torch.tensor([-1.0, 0.4, 0, 0, 0, 0], dtype=torch.float64)
-    places = torch.tensor([[0.2, 0.0], [1.5, 0.0]], dtype=torch.float64)
-    assert is_folded("opencv", lens, places).tolist() == [False, True]
 
 
 def lens_camera(model: str | None, **changes: object) -> Camera:

@@ -23,8 +23,8 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
 MOST_NUMBERS = 1 << 23
-"""So many numbers of masses are held at once, or an eighth of the moments' where that is more:
-cells then receive the light of several beams in one pass.
+"""So many numbers of masses are held at once, or a quarter of the moments' where that is more:
+cells then receive the light of several beams in one pass. torch's operations hold more of each.
 """
 
 
@@ -42,33 +42,15 @@ class Beam:
 
     def scatter(
         self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
-    ) -> tuple[Tensor, Tensor | float]:
-        """The integral of `scattering` over each segment of view rays, and the phase function p.
+    ) -> Tensor:
+        """The integral of `scattering` p over each segment of view rays, `[N - 1, K or C, R]`.
 
-        Their product is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]:
-        kappa_s per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C,
-        R]. With a forward peak of depth `peak` [N, C, R] at the nodes (E8.7), or where it differs
-        from cell to cell, it changes along the ray: then the integral holds it, and the factor is
-        1.
+        That is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s per
+        unit of its scale, at the `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
         """
-        cosine = self.cosine(nodes.direction)
-        if peak is None and isinstance(seen, SeenPhase):
-            return nodes.integral(scattering), seen.value(cosine)
-        if peak is None:
-            return nodes.integral(scattering * seen.value(cosine)), 1.0
-        return nodes.integral(scattering * seen.along(peak, cosine)), 1.0
-
-    def cosine(self, direction: Tensor) -> Tensor:
-        """Cosine [R] between the light and what leaves along view rays of `direction` [R, 3]."""
-        return leaving_cosine(direction, self.direction)
-
-
-def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
-    """Cosine [R] between light that travels along `travel` [3] and what leaves along view rays.
-
-    These look along `direction` [R, 3].
-    """
-    return -(direction @ travel)
+        cosine = -(nodes.direction @ self.direction)
+        phase = seen.value(cosine) if peak is None else seen.along(peak, cosine)
+        return nodes.integral(scattering * phase)
 
 
 def follow_beams(
@@ -128,35 +110,37 @@ def attenuate(
     [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Also the
     mass up to cells' centers [K, z, y, x] of each beam where it `has_mass`.
     """
-    count, (_, moments, colors) = 1, weights.shape
+    field, (_, moments, colors) = medium.extinction.field, weights.shape
+    quarter = moments * colors // (4 * len(field))
     if is_fused_whole(medium.grid, directions):
         from ddrecon.light.fused.receive import MOST_BEAMS
 
-        field = medium.extinction.field
-        eighth = moments * colors // (8 * len(field))
-        count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
-    sums: Sequence[Tensor] = ()
+        count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
+    else:
+        count = max(1, quarter // 8)
+    sums: Tensor | None = None
     masses: list[Tensor] = []
     for some in zip(directions.split(count), weights.split(count), strict=True):
         parts, more = attenuate_few(medium, *some, has_mass)
-        sums = [a + b for a, b in zip(sums, parts, strict=True)] if sums else parts
+        sums = parts if sums is None else sums + parts
         masses += more
-    mean, *others = sums
-    flux = (others[0], others[1], others[2]) if others else None
-    return Moments(mean, flux, others[3] if len(others) > 3 else None), masses
+    assert sums is not None
+    if len(sums) == 1:
+        return Moments(sums[0]), masses
+    # Cut, not indexed: on the way back this is put together once.
+    first, higher = sums.split([4, len(sums) - 4])
+    mean, z, y, x = first.unbind()
+    return Moments(mean, (z, y, x), higher if len(higher) else None), masses
 
 
 def attenuate_few(
     medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool = False
-) -> tuple[tuple[Tensor, ...], list[Tensor]]:
-    """What is received of a few beams, for the mean, for each component of the flux, for all else.
-
-    And masses, as `attenuate` has them.
-    """
+) -> tuple[Tensor, list[Tensor]]:
+    """What is received of a few beams, [moments, C, z, y, x], and their masses."""
     extinction, is_fused = medium.extinction, is_fused_whole(medium.grid, directions)
     field, scale = extinction.field, extinction.scale
 
-    def use(entered: Tensor, steps: Tensor) -> tuple[tuple[Tensor, ...], list[Tensor]]:
+    def use(entered: Tensor, steps: Tensor) -> tuple[Tensor, list[Tensor]]:
         if is_fused:
             from ddrecon.light.fused.receive import receive
 
@@ -164,9 +148,8 @@ def attenuate_few(
             given = entered, steps, weights.expand(-1, -1, colors)
             received = receive(field, scale.flatten().expand(colors), *given)
         else:
-            tau = extinction.mean_transmittance(entered[0], steps[0])
-            sums = tau * weights[0][..., None, None, None]
-            received = *sums[:4], *([sums[4:]] if len(sums) > 4 else [])
+            tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
+            received = torch.einsum("lmc,lczyx->mczyx", weights, tau)
         masses = zip(entered, steps, strict=True) if has_mass else ()
         return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
 

@@ -154,9 +154,7 @@ def _vector(components: Iterable[Tensor]) -> Vector:
     return z, y, x
 
 
-@remember
-def _harmonics_of(direction: Tensor, degree: int) -> Tensor:
-    return harmonics(direction, degree)
+_harmonics_of = remember(harmonics)
 
 
 def beam_moments(radiance: Tensor, direction: Tensor, degree: int) -> Moments:

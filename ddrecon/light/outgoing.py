@@ -48,19 +48,16 @@ def scatter_towards(
     """
     if light.flux is None:
         return scatter_once_more(medium, light).mean.clamp(min=0)
+    more = recompute(_sum_turned, medium, rays, turned) if turned else None
     if is_fused() and not medium.is_cellwise:
         from ddrecon.light.fused.outgoing import scatter_fused
 
-        more = recompute(_sum_turned, medium, rays, turned) if turned else None
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)
-    return recompute(_scatter_towards, medium, light, rays, turned)
 
+    def scatter() -> Tensor:
+        return scatter_once_more(medium, light).positive_along(rays.towards_eye(medium.grid), more)
 
-def _scatter_towards(
-    medium: Medium, light: Moments, rays: Rays, turned: Sequence[TurnedBeam]
-) -> Tensor:
-    more = _sum_turned(medium, rays, turned) if turned else None
-    return scatter_once_more(medium, light).positive_along(rays.towards_eye(medium.grid), more)
+    return recompute(scatter)
 
 
 def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:

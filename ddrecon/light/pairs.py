@@ -27,7 +27,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam, unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import Shear, cross_grid, sum_mass_to_cells
+from ddrecon.light.shear import Shear, cross_grid, sum_masses
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
@@ -93,28 +93,36 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     _, direction = unit_directions(light.direction)
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     is_uniform = extinction.field is medium.scattering.field and not medium.is_cellwise
-    ways = (direction, -direction) if is_uniform else (direction,)
-    (entered, step), *behind = (
-        sum_mass_to_cells(extinction.field, medium.grid, way, extinction.mass_bound) for way in ways
-    )
+    ways = torch.stack([direction, -direction] if is_uniform else [direction])
+    crossing = extinction.field, medium.grid, ways, extinction.mass_bound
+    (entered, *behind), (step, *_) = recompute(sum_masses, *crossing)
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     turned = backward_fraction(medium)
-    if is_uniform:
-        shares = recompute(_pair, medium, entered, behind[0][0], step, turned)
-    else:
-        shares = recompute(_pair_in_cells, medium, entered, step, turned, direction)
-    received, along, against = (irradiance / (4 * math.pi) * share for share in shares)
+
+    def find_shares() -> tuple[Tensor, Tensor, Tensor]:
+        tau = extinction.mean_transmittance(entered, step)
+        if is_uniform:
+            return tau, *_pair(medium, entered, behind[0], step, turned)
+        back = turned * medium.scattering.value
+        forth, against = turn_in_cells(extinction.value, back, medium.grid, direction)
+        return tau, tau * forth, tau * against
+
+    received, along, against = (
+        irradiance / (4 * math.pi) * share for share in recompute(find_shares)
+    )
     return beam, Pair(direction, received, along, against)
 
 
 def _pair(
     medium: Medium, entered: Tensor, behind: Tensor, step: Tensor, turned: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """tau, F and G, averaged over each cell; `entered` and `behind` are the mass on both sides."""
+) -> tuple[Tensor, Tensor]:
+    """F and G, averaged over each cell; `entered` and `behind` are the mass on both sides."""
     extinction = medium.extinction
     depth = extinction.scale * (extinction.field * step)
     before, after = extinction.scale * entered, extinction.scale * behind
-    beta = _turned_part(medium, turned)
+    # beta is 0 where there is no medium
+    back, whole = torch.broadcast_tensors(turned * medium.scattering.scale, extinction.scale)
+    beta = torch.where(whole > 0, back / torch.where(whole > 0, whole, 1), 0)
     rate = (1 - beta * beta).sqrt()
     reflected = beta / (1 + rate)
     # means of exp(-lambda t) and of exp(-lambda (T + u)) over the cell
@@ -123,24 +131,13 @@ def _pair(
     forth = torch.exp(-rate * before) * share
     back = torch.exp(-rate * (total + after)) * share
     again = 1 / (1 - reflected**2 * torch.exp(-2 * rate * total))
-    tau = extinction.mean_transmittance(entered, step)
-    return tau, (forth - reflected**2 * back) * again, reflected * (forth - back) * again
-
-
-def _pair_in_cells(
-    medium: Medium, entered: Tensor, step: Tensor, turned: Tensor, direction: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_pair`, where beta differs from cell to cell (E8.13); b is `turned`."""
-    extinction, back = medium.extinction.value, turned * medium.scattering.value
-    forth, against = turn_in_cells(extinction, back, medium.grid, direction)
-    tau = medium.extinction.mean_transmittance(entered, step)
-    return tau, tau * forth, tau * against
+    return (forth - reflected**2 * back) * again, reflected * (forth - back) * again
 
 
 def turn_in_cells(
     extinction: Tensor, turned: Tensor, grid: Grid, direction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """F and G of E8.11 over what was never scattered, averaged over cells, [C, z, y, x].
+    """F and G over what was never scattered, averaged over cells, [C, z, y, x] (E8.13).
 
     `extinction` and `turned`, b kappa_s, are [C, z, y, x] [1/u]; `direction` [3]: unit, array
     order, the way that F goes.
@@ -181,12 +178,3 @@ def turn_in_cells(
     found = (slicing.lift(shear.to_cells(values)) for values in (along, against))
     forth, back = (grid.cut(field) if isinstance(grid, Slab) else field for field in found)
     return forth, back
-
-
-def _turned_part(medium: Medium, turned: Tensor) -> Tensor:
-    """beta = b kappa_s / kappa_t, [C, 1, 1, 1]; 0 where there is no medium."""
-    above, below = torch.broadcast_tensors(
-        turned * medium.scattering.scale, medium.extinction.scale
-    )
-    is_there = below > 0
-    return torch.where(is_there, above / torch.where(is_there, below, 1), 0)

@@ -56,8 +56,8 @@ class PointBeam:
 
     def scatter(
         self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
-    ) -> tuple[Tensor, Tensor | float]:
-        """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
+    ) -> Tensor:
+        """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`.
 
         Arguments as of `Beam.scatter`. Scattering times p is linear between nodes.
         """
@@ -71,7 +71,7 @@ class PointBeam:
         # ray's distance from it: int ds / (d^2 + s^2) = atan(s / d) / d.
         distance = across.sqrt()
         angle = torch.atan2(distance * nodes.lengths, across + along[1:] * along[:-1])
-        return nodes.integral(scattering * phase, angle / distance), 1.0
+        return nodes.integral(scattering * phase, angle / distance)
 
     def passing(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """How view rays pass the light: from `origin` [R, 3] along unit `direction` [R, 3].
@@ -96,7 +96,7 @@ def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[
 
     # s, sqrt(s) and the direction of travel, as in the module's docstring.
     centers = torch.stack(torch.broadcast_tensors(*grid.centers(extinction.field)), -1)
-    least_square = _least_square(grid)
+    least_square = float((0.75 / math.pi * math.prod(grid.spacing)) ** (2 / 3) / 3)
     square = _bounded_square(centers - position, least_square)
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
@@ -125,11 +125,6 @@ def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[
     return beam, beam_moments(received, direction.movedim(-1, 0), degree)
 
 
-def _least_square(grid: Grid) -> float:
-    """R^2 / 3 [u^2], R being the radius of a sphere of one cell's volume."""
-    return float((0.75 / math.pi * math.prod(grid.spacing)) ** (2 / 3) / 3)
-
-
 def _bounded_square(offset: Tensor, least: float) -> Tensor:
     """The squared length of `offset` [..., 3], or `least` where that is more."""
     return (offset * offset).sum(-1).clamp(min=least)
@@ -141,10 +136,12 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
     `distance` [P]: how far `ends` are from `position`. Returns `[K, P]`.
     """
     pairs = math.ceil(math.hypot(*grid.extent) / (2 * min(grid.spacing)))
-    fraction = _gauss_pairs(pairs).to(field)[:, None]
+    # Gauss's two-point rule meets a grid's planes, where interpolation has a kink, by accident.
+    middle, shift = torch.arange(pairs, dtype=torch.float64) + 0.5, 12**-0.5
+    fraction = (torch.cat([middle - shift, middle + shift]) / pairs).to(field)[:, None]
     inside = _part_inside(grid, position, ends)
     ways = ends - inside[:, None] * (ends - position), ends, inside * distance
-    if is_fused(position):
+    if is_fused(position) and not position.requires_grad:
         from ddrecon.light.fused.point_light import integrate_ways
 
         return integrate_ways(field, grid, *ways, fraction)
@@ -156,15 +153,6 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
 
     chunks = (way.split(max(1, CHUNK_SAMPLES // (2 * pairs))) for way in ways)
     return torch.cat([recompute(integrate, *chunk) for chunk in zip(*chunks, strict=True)], 1)
-
-
-def _gauss_pairs(count: int) -> Tensor:
-    """The nodes of Gauss's two-point rule in `count` equal parts of [0, 1], `[2 count]`.
-
-    They meet the planes of a grid only by accident, where interpolation has a kink.
-    """
-    middle, shift = torch.arange(count, dtype=torch.float64) + 0.5, 12**-0.5
-    return torch.cat([middle - shift, middle + shift]) / count
 
 
 def _part_inside(grid: Grid, position: Tensor, ends: Tensor) -> Tensor:

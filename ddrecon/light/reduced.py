@@ -122,10 +122,17 @@ def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor
     That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact
     phase function p. `towards`: unit, its components broadcast to cells.
     """
+
+    def scatter(travel: Tensor, irradiance: Tensor) -> Tensor:
+        """p E tau of the light that goes along `travel`."""
+        (visible,), _ = attenuate_few(medium, travel[None], irradiance[None, None])
+        z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
+        return visible * medium.seen.value(torch.atleast_3d(z + y + x))
+
     total = torch.zeros_like(medium.extinction.value)
     for sky in _lit_skies(skies):
         for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
-            total = total + recompute(_scatter_direction, medium, travel, irradiance, towards)
+            total = total + recompute(scatter, travel, irradiance)
     return total / (4 * math.pi)
 
 
@@ -137,12 +144,3 @@ def _lit_skies(lights: Sequence[object]) -> list[Sky]:
         for sky in skies
         if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())
     ]
-
-
-def _scatter_direction(
-    medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
-) -> Tensor:
-    """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
-    (visible,), _ = attenuate_few(medium, travel[None], irradiance[None, None])
-    z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-    return visible * medium.seen.value(torch.atleast_3d(z + y + x))

@@ -30,30 +30,22 @@ MARGIN = 2
 """Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
 
-def sum_mass_to_cells(
-    field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float = 0.0
+def sum_masses(
+    field: Tensor, grid: Grid, directions: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """The mass up to where a beam enters each cell's slice, and its path within a slice [u].
+    """The mass up to where beams enter each cell's slice, and their paths within a slice [u].
 
     The mass is the integral of `field` along the beam, from the box on. Slices are those across the
     axis along which the beam crosses most cells.
 
     `field`: [K, z, y, x]; outside the box it falls to zero within half a cell, which keeps the mass
-    of the outer half cells. `direction`: [3], unit, array order, the way light travels. `bound`: 1
-    over the most by which each of two corrections may change a mass, 0 for no limit.
+    of the outer half cells. `directions`: [L, 3], unit, array order, the way light travels.
+    `bound`: 1 over the most by which each of two corrections may change a mass, 0 for no limit.
 
     Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
     between slices, and its mass is carried back to cells to third order: the two corrections.
-    Returns `[K, z, y, x]` and a scalar.
+    Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
-    (entered,), (step,) = recompute(sum_masses, field, grid, direction[None], bound)
-    return entered, step
-
-
-def sum_masses(
-    field: Tensor, grid: Grid, directions: Tensor, bound: Tensor | float
-) -> tuple[Tensor, Tensor]:
-    """The same of beams along `directions` [L, 3]: [L, K, z, y, x] and [L]; to be recomputed."""
     if is_fused_whole(grid, directions):
         from ddrecon.light.fused import shear
 
@@ -77,7 +69,7 @@ def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:
 def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
+    """What `sum_masses` returns, of one beam and one field [1, z, y, x]."""
     whole = whole_of(grid)
     slicing, slope, step = cross_grid(whole, direction)
     count, _, *size = (1 if axis == 0 else whole.shape[axis - 1] for axis in slicing.order)

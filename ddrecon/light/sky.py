@@ -69,12 +69,12 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     radiance = light.scale * light.radiance
     darkest = radiance.detach().amin((1, 2))
     radiance = refine_map(radiance - darkest[:, None, None], rows, 2 * rows)
-    regions = _regions(*radiance.shape[1:], light.directions)
+    label, regions = _regions(*radiance.shape[1:], light.directions)
 
     # Moments: integrals over each region of radiance times 1, x, y, z, `[N, 4, C]`; `geometry`
     # holds the moments of radiance 1.
-    above_darkest = _integrate(radiance, regions)
-    geometry = regions.moments.to(above_darkest)[..., None]
+    above_darkest = _integrate(radiance, label, len(regions))
+    geometry = regions.to(above_darkest)[..., None]
     moments = above_darkest + darkest * geometry
 
     # Suns take all light of their regions and leave them black.
@@ -102,21 +102,13 @@ def count_suns(light: EnvironmentLight) -> tuple[int, int]:
     return sum(isinstance(part, DirectionalLight) for part in parts), regions
 
 
-@dataclass(frozen=True)
-class _Regions:
-    """How a map's pixels fall into N regions.
-
-    `label` [h * w]: the region of each pixel; `moments` [N, 4]: integrals over each region of 1, x,
-    y and z, float64.
-    """
-
-    label: Tensor
-    moments: Tensor
-
-
 @lru_cache(maxsize=4)
-def _regions(height: int, width: int, directions: int) -> _Regions:
-    """The regions of a map of this size around `directions` directions; empty ones are left out."""
+def _regions(height: int, width: int, directions: int) -> tuple[Tensor, Tensor]:
+    """How the pixels of a map of this size fall into N regions around so many `directions`.
+
+    The region of each pixel [h * w]; and integrals over each region of 1, x, y and z, [N, 4],
+    float64. Empty ones are left out.
+    """
     moments = pixel_moments(height, width).reshape(4, -1)
     centers = moments[1:] / np.linalg.norm(moments[1:], axis=0)
     axes = fibonacci_sphere(directions)
@@ -124,7 +116,7 @@ def _regions(height: int, width: int, directions: int) -> _Regions:
     nearest = np.concatenate([(axes @ chunk).argmax(0) for chunk in chunks])
     _, label = np.unique(nearest, return_inverse=True)
     sums = np.stack([np.bincount(label, weights=row) for row in moments], 1)
-    return _Regions(torch.from_numpy(label), torch.from_numpy(sums))
+    return torch.from_numpy(label), torch.from_numpy(sums)
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
@@ -138,18 +130,18 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     return np.stack([radius * np.sin(angle), y, -radius * np.cos(angle)], 1)
 
 
-def _integrate(radiance: Tensor, regions: _Regions) -> Tensor:
+def _integrate(radiance: Tensor, label: Tensor, count: int) -> Tensor:
     """Integrals over every region of the map `radiance` [C, h, w] times 1, x, y, z: `[N, 4, C]`."""
-    values, label = radiance.flatten(1), regions.label.to(radiance.device)
+    values, label = radiance.flatten(1), label.to(radiance.device)
     weights = torch.from_numpy(pixel_moments(*radiance.shape[1:])).to(values).flatten(1)
-    blank = values.new_zeros(values.shape[0], regions.moments.shape[0])
+    blank = values.new_zeros(len(values), count)
     return torch.stack([blank.index_add(1, label, values * weight).T for weight in weights], 1)
 
 
-def _are_suns(irradiance: Tensor, regions: _Regions) -> Tensor:
+def _are_suns(irradiance: Tensor, regions: Tensor) -> Tensor:
     """Which regions are suns, given the irradiance [N] of all colors together."""
     fraction = irradiance / irradiance.sum().clamp(min=torch.finfo(irradiance.dtype).tiny)
-    of_sphere = regions.moments[:, 0].to(irradiance) / (4 * math.pi)
+    of_sphere = regions[:, 0].to(irradiance) / (4 * math.pi)
     rank = fraction.argsort(descending=True, stable=True).argsort(stable=True)
     return (fraction > SUN_FRACTION) & (fraction > SUN_CONTRAST * of_sphere) & (rank < MAX_SUNS)
 

@@ -177,8 +177,8 @@ def integrate_segments(
             peak = at_nodes["peak"] if "peak" in at_nodes else emission.peak.view(-1, 1)
             depth = peak * (passed + to_light)
         # E2.2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
-        weight, phase = beam.scatter(scattering, nodes, seen, depth)
+        weight = beam.scatter(scattering, nodes, seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
-        scattered = scattered + arriving * phase * strength.view(-1, 1)
+        scattered = scattered + arriving * strength.view(-1, 1)
     return scattered, own[-1]

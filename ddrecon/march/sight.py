@@ -61,4 +61,4 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
 @remember
 def _look(grid: Grid, settings: RenderSettings, _: object, *values: Any) -> Sight:
     camera, offsets = Camera(*values), subpixel_offsets(settings.samples_per_pixel)
-    return look_along(grid, Rays.join([cast_rays(camera, offset) for offset in offsets]), settings)
+    return look_along(grid, cast_rays(camera, *offsets), settings)

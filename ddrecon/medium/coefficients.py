@@ -92,7 +92,7 @@ class Coefficient:
 
         That is half an optical depth, in the mean over colors.
         """
-        return _mass_bound(self.scale)
+        return 2 * self.scale.mean()
 
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
@@ -265,11 +265,6 @@ def _scale_sections(
 
 
 _remember_scaled = remember(_scale_sections)
-
-
-@remember
-def _mass_bound(scale: Tensor) -> Tensor:
-    return 2 * scale.mean()
 
 
 @remember_of_phase

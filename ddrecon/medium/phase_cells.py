@@ -9,7 +9,7 @@ each color whose phase function has other numbers besides.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -82,7 +82,7 @@ def count_tables(phase: PhaseFunction) -> int:
 
 def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
     """Polynomials of S at all rungs, and slopes between, [1 or 3, n, 2, steps + 1, 2, K]."""
-    return _peak_tables(_at_rungs(phase, 0), degree)
+    return _tables(_at_rungs(phase, 0), peak_table, degree)
 
 
 def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,22 +103,18 @@ def _end_table(phase: PhaseFunction) -> Tensor:
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
-    """What `turned_phase` is of each cell, [C, z, y, x] at `angle` [z, y, x] (E8.12)."""
+    """How light turned so often scatters by `angle` [z, y, x] in cells, [C, z, y, x] (E8.12)."""
     phase, kind = medium.seen.phase, medium.seen.phase.kind
     assert phase.cells is not None
     backward = STEEP_STEPS
-    tables = _turned_tables(_at_rungs(phase, backward), medium.seen.degree, turns)
+    rungs = _at_rungs(phase, backward)
+    tables = _tables(rungs, turned_table, medium.seen.degree, turns)
     return _look_up(tables.to(phase.cells), _place(kind, phase.cells, backward), angle)[..., 0]
 
 
 def _at_rungs(phase: PhaseFunction, backward: int) -> PhaseFunction:
     """`phase` at the numbers at which tables are kept; of g so many of them are `backward`."""
     return phase.with_cells(_rungs(phase.kind, backward, phase.numbers[0].device))
-
-
-def others_of(phase: PhaseFunction) -> list[Tensor]:
-    """All numbers of `phase` but the last, which may differ from cell to cell."""
-    return list(phase.numbers[:-1])
 
 
 def _look_up(tables: Tensor, place: Tensor, angle: Tensor) -> Tensor:
@@ -154,17 +150,10 @@ def _rungs(kind: PhaseKind, backward: int, device: torch.device) -> Tensor:
 
 
 @remember_of_phase
-def _peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
-    """Polynomials of S at all rungs, and their slopes, [1 or 3, n, 2, steps + 1, 2, K]."""
+def _tables(phase: PhaseFunction, make: Callable[..., Tensor], *arguments: int) -> Tensor:
+    """What tables `make` has at all rungs, and their slopes, [1 or 3, n, 2, steps + 1, 2, K]."""
     # one after the other: weak peaks have short series
-    return _with_slopes([peak_table(phase.with_cells(rung), degree) for rung in phase.numbers[-1]])
-
-
-@remember_of_phase
-def _turned_tables(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
-    """How turned light scatters towards a camera at all rungs, as `_peak_tables`."""
-    rungs = phase.numbers[-1]
-    return _with_slopes([turned_table(phase.with_cells(rung), degree, turns) for rung in rungs])
+    return _with_slopes([make(phase.with_cells(rung), *arguments) for rung in phase.numbers[-1]])
 
 
 def _with_slopes(tables: Sequence[Tensor]) -> Tensor:

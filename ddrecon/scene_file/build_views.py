@@ -14,7 +14,7 @@ from ddrecon.cameras import Camera, cast_rays, image_places, look_at, project
 from ddrecon.errors import FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
-from ddrecon.lenses import is_folded
+from ddrecon.lenses import distort, ray_through
 from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
@@ -27,8 +27,8 @@ READERS: Mapping[str, Callable[[Path], Image]] = {
     "mask": read_mask,
 }
 """What reads the pictures of a view, by their keys."""
-LATTICE = 33
-"""Pixels along each side of an image at which its distortion is checked."""
+CHECKED = 1000
+"""Pixels of an image at which its distortion is checked."""
 COARSER = 8
 MOST_PIXELS = 2**18
 """Images are made about this small before they are looked at closely."""
@@ -139,19 +139,18 @@ def _build_camera(
 
 
 def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
-    """Raises SceneError where the distortion of `camera` folds over within the image."""
+    """Raises SceneError where no light meets a pixel of `camera`: distortion folds over there."""
     if camera.lens is None or camera.distortion is None:
         return
-    # The corners of a coarse lattice of pixels, those of the image among them.
-    rows, columns = (torch.linspace(0, side - 1, LATTICE).long() for side in camera.size)
-    places = image_places(camera).view(*camera.size, 2)[rows][:, columns].flatten(0, 1)
-    folded = is_folded(camera.lens, camera.distortion, places)
-    if bool(folded.any()):
-        y, x = divmod(int(folded.nonzero()[0]), LATTICE)
+    places = image_places(camera)
+    places = places[:: max(1, len(places) // CHECKED)]
+    seen = ray_through(camera.lens, camera.distortion, places)
+    error = (distort(camera.lens, camera.distortion, seen) - places).abs()
+    if not bool((error <= 1e-4 * (1 + places.abs())).all()):
         raise scene_file.refused(
             f"{key}.distortion",
-            f"folds over within the image: no one direction is seen at pixel ({int(columns[x])},"
-            f" {int(rows[y])}); check its coefficients and the focal length, or crop the picture",
+            "folds over within the image: some pixels see no direction; "
+            "check its coefficients and the focal length, or crop the picture",
         )
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError, UsageError, suggestion
-from ddrecon.losses import image_loss
+from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
@@ -304,7 +304,7 @@ def loss_at(
         changed = with_values(exact, {**point, **values})
         images = render_each(changed, [changed.view(view.name) for view in views], memory)
         losses = [
-            image_loss(kind, image, target, view.mask, view.noise)
+            Target.of(target, view.mask, kind, view.noise).loss_of(image)
             for image, target, view in zip(images, targets, views, strict=True)
         ]
         return torch.stack(losses).mean()

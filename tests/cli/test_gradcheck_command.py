@@ -11,7 +11,7 @@ from click.testing import Result
 from torch import Tensor
 
 from ddrecon.diffusion import implicit
-from ddrecon.validate import gradcheck
+from ddrecon.losses import Target
 
 Run = Callable[..., Result]
 SMALL = ["-D", "volume.resolution=[4, 3, 3]"]
@@ -34,11 +34,11 @@ def test_the_program_passes(run: Run) -> None:
 
 def detaching_part(right: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """The image loss with the right value and nine tenths of its derivative."""
-    return lambda loss, image, *others: right(loss, 0.9 * image + 0.1 * image.detach(), *others)
+    return lambda target, image: right(target, 0.9 * image + 0.1 * image.detach())
 
 
 def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gradcheck, "image_loss", detaching_part(gradcheck.image_loss))
+    monkeypatch.setattr(Target, "loss_of", detaching_part(Target.loss_of))
     result = run(*GRADCHECK, *SMALL, *SIMPLE, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (1, "")
     assert result.stdout.splitlines()[-1].startswith("| density | FAIL |")

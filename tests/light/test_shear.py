@@ -13,7 +13,7 @@ from media import box_grid, convergence_order, half_empty, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.shear import sum_masses
 
 DIRECTIONS = [
     (1.0, 0.0, 0.0),
@@ -29,6 +29,11 @@ SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
 def unit(direction: tuple[float, ...]) -> Tensor:
     vector = torch.tensor(direction, dtype=torch.float64)
     return vector / vector.norm()
+
+
+def sum_mass_to_cells(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
+    (entered,), (step,) = sum_masses(field, grid, direction[None], 0.0)
+    return entered, step
 
 
 def by_rays(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -288,6 +288,6 @@ def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> 
 def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path) -> None:
     numbers = NERFSTUDIO | {"k1": -12.0}
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
-    with pytest.raises(SceneError, match=r"folds over within the image.* pixel \(0, 0\)") as caught:
+    with pytest.raises(SceneError, match="folds over within the image") as caught:
         build_scene(scene_file)
     assert len(caught.value.problems) == 1

@@ -1,24 +1,10 @@
 #pragma once
-#include "ddrecon/kernels/third_order.h"
+#include "ddrecon/kernels/numbers.h"
 // Integrals of a field along straight ways, sampled a block of ways at a time.
 
 namespace ddrecon {
 
-// The cell before place `p` on a line of `size` cells, and the part of the way to the next one. As
-// a dual number that changes with the place, but not beyond the outermost centers.
-template <class N> struct Between {
-    int n;
-    N a;
-    template <class F> INLINE Between(const N& p, F most) {
-        const F at = value_of(p), held = at < F(0) ? F(0) : at > most ? most : at;
-        const int whole = (int)held, last = most < F(1) ? 0 : (int)most - 1;
-        n = whole < last ? whole : last;
-        a = along(p, Sloped<F>{held - F(n), F(at > F(0) && at < most)});
-    }
-};
-template <class N, class M> INLINE auto blend(const N& a, const M& low, const M& high) {
-    return low + a * (high - low);
-}
+template <class F> INLINE F blend(F a, F low, F high) { return low + a * (high - low); }
 
 template <class F, int BLOCK> struct Ways {
     int ways, samples, channels, depth, height, width;
@@ -36,16 +22,30 @@ template <class F, int BLOCK> struct Ways {
     INLINE int up_y() const { return height > 1 ? width : 0; }
     INLINE int up_x() const { return width > 1 ? 1 : 0; }
 
-    // The cells around a place.
-    template <class N> struct Corners {
-        Between<N> z, y, x;
+    // The cell before a place on a line, and the part of the way to the next one; not beyond the
+    // outermost centers.
+    struct Between {
+        int n;
+        F a;
+        INLINE Between(F at, F most) {
+            const F held = at < F(0) ? F(0) : at > most ? most : at;
+            const int whole = (int)held, last = most < F(1) ? 0 : (int)most - 1;
+            n = whole < last ? whole : last;
+            a = held - F(n);
+        }
+    };
+    // The cells around sample i of way t.
+    struct Corners {
+        Between z, y, x;
         int at;
-        INLINE Corners(const Ways& all, const N& pz, const N& py, const N& px)
-            : z(pz, F(all.depth - 1)), y(py, F(all.height - 1)), x(px, F(all.width - 1)) {
+        INLINE Corners(const Ways& all, int i, int t)
+            : z(all.place(i, t, 0), F(all.depth - 1)),
+              y(all.place(i, t, 1), F(all.height - 1)),
+              x(all.place(i, t, 2), F(all.width - 1)) {
             at = (z.n * all.height + y.n) * all.width + x.n;
         }
         // The field there.
-        INLINE N look(const Ways& all, const F* field) const {
+        INLINE F look(const Ways& all, const F* field) const {
             auto row = [&](int from) HERE {
                 return blend(x.a, field[at + from], field[at + from + all.up_x()]);
             };
@@ -63,24 +63,13 @@ template <class F, int BLOCK> struct Ways {
             F sum[BLOCK];
             for (int t = 0; t < count; ++t) sum[t] = F(0);
             for (int i = 0; i < samples; ++i)
-                for (int t = 0; t < count; ++t) {
-                    const int way = begin + t;
-                    sum[t] +=
-                        Corners<F>(*this, place(i, way, 0), place(i, way, 1), place(i, way, 2))
-                            .look(*this, field);
-                }
+                for (int t = 0; t < count; ++t)
+                    sum[t] += Corners(*this, i, begin + t).look(*this, field);
             F* __restrict total = totals + (long long)channel * ways + begin;
             for (int t = 0; t < count; ++t) total[t] = sum[t] * lengths[begin + t] / F(samples);
         }
     }
 
-    // A sample near a cell's center, where the slope is the mean of both sides', is looked at so
-    // far to either of them.
-    static INLINE F shift(F p, int size) {
-        const F near = F(kink_width<F>(size));
-        const F held = p < F(0) ? F(0) : p, off = held - F((int)(held + F(0.5)));
-        return p >= -near && (off < F(0) ? -off : off) < near ? F(4) * near : F(0);
-    }
     static INLINE void add(F* to, F value) {
 #if defined(__CUDA_ARCH__)
         atomicAdd(to, value);
@@ -89,22 +78,17 @@ template <class F, int BLOCK> struct Ways {
 #endif
     }
 
-    // The field's cotangent, from those of `totals`; and where ways vary, that of ends and lengths.
-    INLINE void integrate_back(
-        int item, bool varies, const F* totals, F* fields_bar, F* firsts_bar, F* lasts_bar,
-        F* lengths_bar) const {
+    // The field's cotangent, from those of `totals`.
+    INLINE void integrate_back(int item, const F* totals, F* fields_bar) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
-            const F* __restrict field = fields + channel * cells();
             const F* __restrict bar = totals + (long long)channel * ways + begin;
             F part[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
             int corner[BLOCK];
             for (int t = 0; t < count; ++t) part[t] = bar[t] * lengths[begin + t] / F(samples);
             for (int i = 0; i < samples; ++i) {
                 for (int t = 0; t < count; ++t) {
-                    const int way = begin + t;
-                    const Corners<F> own(
-                        *this, place(i, way, 0), place(i, way, 1), place(i, way, 2));
+                    const Corners own(*this, i, begin + t);
                     corner[t] = own.at, az[t] = own.z.a, ay[t] = own.y.a, ax[t] = own.x.a;
                 }
                 for (int t = 0; t < count; ++t) {
@@ -118,29 +102,6 @@ template <class F, int BLOCK> struct Ways {
                     add_layer(0, part[t] - part[t] * az[t]), add_layer(up_z(), part[t] * az[t]);
                 }
             }
-            if (!varies) continue;
-            typedef Dual<F, 3> N;
-            for (int i = 0; i < samples; ++i)
-                for (int t = 0; t < count; ++t) {
-                    const int way = begin + t;
-                    const F z = place(i, way, 0), y = place(i, way, 1), x = place(i, way, 2);
-                    auto look = [&](F side) HERE {
-                        N pz(z + side * shift(z, depth)), py(y + side * shift(y, height));
-                        N px(x + side * shift(x, width));
-                        pz.by[0] = py.by[1] = px.by[2] = F(1);
-                        return Corners<N>(*this, pz, py, px).look(*this, field);
-                    };
-                    N value = look(F(1));
-                    if (shift(z, depth) + shift(y, height) + shift(x, width) > F(0))
-                        value = F(0.5) * (value + look(F(-1)));
-                    UNROLLED
-                    for (int axis = 0; axis < 3; ++axis) {
-                        const F own = part[t] * value.by[axis];
-                        firsts_bar[axis * ways + way] += fraction[i] * own;
-                        lasts_bar[axis * ways + way] += (F(1) - fraction[i]) * own;
-                    }
-                    lengths_bar[way] += bar[t] * value.value / F(samples);
-                }
         }
     }
 };

@@ -39,7 +39,7 @@ def integrate_ways(
 class _Integral(torch.autograd.Function):
     """The integral; `first` and `last` [3, P] are places counted in cells, 0 in the first's center.
 
-    Differentiable by all but `fraction`; in forward mode by the field alone.
+    Differentiable by the field alone.
     """
 
     @staticmethod
@@ -55,19 +55,15 @@ class _Integral(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor | None, ...]:
-        ways = field, first, last, length, _ = ctx.saved_tensors
-        varies = any(ctx.needs_input_grad[1:4])
-        bars = [each.new_zeros(each.shape) if varies else None for each in (first, last, length)]
+        ways = field, *_, length, _ = ctx.saved_tensors
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
         threads = count_shares(thread_count(field), field.nbytes)
         shares = [field.new_zeros(field.shape) for _ in range(threads)]
-        given = _ways(*ways) | {"varies": varies, "totals": total_bar}
-        made = dict(zip(("firsts_bar", "lasts_bar", "lengths_bar"), bars, strict=True))
         own = [{"fields_bar": share} for share in shares]
         items, _ = cut(len(length), BLOCK, length)
         kernel = way_kernel(True, field.element_size() * 8)
-        kernel.launch(items, given, made | own[0], shares=own)
-        return functools.reduce(Tensor.add_, shares), *bars, None
+        kernel.launch(items, _ways(*ways) | {"totals": total_bar}, own[0], shares=own)
+        return functools.reduce(Tensor.add_, shares), None, None, None, None
 
     @staticmethod
     def jvp(ctx: Any, d_field: Tensor | None, *_: None) -> Tensor:
@@ -99,21 +95,16 @@ def _ways(
 
 _WAYS = "ways, samples, channels, depth, height, width, fields, firsts, lasts, lengths, fraction"
 _GIVEN = """
-int ways, samples, channels, depth, height, width, varies;
-F *fields, *firsts, *lasts, *lengths, *fraction, *totals;
-F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar
+int ways, samples, channels, depth, height, width;
+F *fields, *firsts, *lasts, *lengths, *fraction, *totals, *fields_bar
 """
 
 
 @functools.cache
 def way_kernel(is_adjoint: bool, bits: int) -> TextKernel:
-    """The kernel of integrals along ways, `totals`; or its adjoint, from cotangents `totals`.
-
-    Where ways vary, that has cotangents of their ends and lengths as well.
-    """
-    made = "fields_bar firsts_bar lasts_bar lengths_bar" if is_adjoint else "totals"
-    arrays = f"varies, totals, {made.replace(' ', ', ')}" if is_adjoint else made
-    call = f"integrate{'_back' * is_adjoint}(item, {arrays})"
+    """The kernel of integrals along ways, `totals`; or its adjoint, from cotangents `totals`."""
+    made = "fields_bar" if is_adjoint else "totals"
+    call = "integrate_back(item, totals, fields_bar)" if is_adjoint else "integrate(item, totals)"
     text = f"Ways<F, IS_GPU ? 1 : {BLOCK}>{{{_WAYS}}}.{call};"
     name = f"ways{'_adjoint' * is_adjoint}"
     return TextKernel(name, bits, text, _GIVEN, made, "light/fused/point_light.h")

@@ -33,15 +33,13 @@ template <class F, int CHUNK> struct Receiver {
         return begin + CHUNK < cells ? CHUNK : (int)(cells - begin);
     }
     INLINE int weight(int i, int a, int c) const { return (i * moments + a) * colors + c; }
-    // Moment number a in color c: the fifth of `arrays` has all but four.
-    template <class P> INLINE P moment(P const* arrays, int a, int c) const {
-        return a < 4 ? arrays[a] + c * cells : arrays[4] + ((a - 4LL) * colors + c) * cells;
-    }
+    // Where moment number a in color c begins.
+    INLINE long long moment(int a, int c) const { return ((long long)a * colors + c) * cells; }
 
     // Writes to moments `made` what is received of at most BEAMS beams; as dual numbers N, given as
     // `In`, its change.
     template <class N, int BEAMS, class In> INLINE void receive(
-        int item, In field, In scale, In entered, In steps, In weights, F* const* made) const {
+        int item, In field, In scale, In entered, In steps, In weights, F* made) const {
         const long long begin = (long long)item * CHUNK;
         const int count = count_from(begin);
         for (int c = 0; c < colors; ++c) {
@@ -55,24 +53,31 @@ template <class F, int CHUNK> struct Receiver {
                 INDEPENDENT
                 for (int t = 0; t < count; ++t) seen[i][t] = visible(s * e[t], along * f[t]);
             }
+            // Four beams at a time; beyond the last, weights and light are 0.
+            for (int i = lights; i % 4; ++i)
+                for (int t = 0; t < count; ++t) seen[i][t] = N(F(0));
             for (int a = 0; a < moments; ++a) {
-                N sums[CHUNK];
+                N sums[CHUNK], own[4];
                 for (int t = 0; t < count; ++t) sums[t] = N(F(0));
-                for (int i = 0; i < lights; ++i) {
-                    const N own = weights[weight(i, a, c)];
-                    for (int t = 0; t < count; ++t) sums[t] += own * seen[i][t];
+                for (int i = 0; i < lights; i += 4) {
+                    for (int j = 0; j < 4; ++j)
+                        own[j] = i + j < lights ? N(weights[weight(i + j, a, c)]) : N(F(0));
+                    INDEPENDENT
+                    for (int t = 0; t < count; ++t)
+                        sums[t] += own[0] * seen[i][t] + own[1] * seen[i + 1][t] +
+                                   own[2] * seen[i + 2][t] + own[3] * seen[i + 3][t];
                 }
-                F* __restrict out = moment(made, a, c) + begin;
+                F* __restrict out = made + moment(a, c) + begin;
                 for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);
             }
         }
     }
 
     // Adds the field's cotangent, and writes that of what `entered`; where it `varies`, `sums`
-    // [lights, 1 + (1 + moments) colors] of the step, scales and weights. Some of `bars` may be 0.
+    // [lights, 1 + (1 + moments) colors] of the step, scales and weights.
     INLINE void receive_back(
         int item, int first_item, bool varies, const F* field, const F* scale, const F* entered,
-        const F* steps, const F* weights, const F* const* bars, F* field_bar, F* entered_bar,
+        const F* steps, const F* weights, const F* bars, F* field_bar, F* entered_bar,
         double* sums) const {
         const long long begin = ((long long)item + first_item) * CHUNK;
         const int count = count_from(begin);
@@ -90,9 +95,8 @@ template <class F, int CHUNK> struct Receiver {
                 F bar[CHUNK], seen[CHUNK], of_scale[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
-                    if (!bars[a < 4 ? a : 4]) continue;
                     const F own = weights[weight(one, a, c)];
-                    const F* __restrict from = moment(bars, a, c) + begin;
+                    const F* __restrict from = bars + moment(a, c) + begin;
                     for (int t = 0; t < count; ++t) bar[t] += own * from[t];
                 }
                 for (int t = 0; t < count; ++t) {
@@ -109,8 +113,7 @@ template <class F, int CHUNK> struct Receiver {
                 found[0] += total(of_step, count);
                 found[1 + c] = total(of_scale, count);
                 for (int a = 0; a < moments; ++a) {
-                    if (!bars[a < 4 ? a : 4]) continue;
-                    const F* __restrict from = moment(bars, a, c) + begin;
+                    const F* __restrict from = bars + moment(a, c) + begin;
                     for (int t = 0; t < count; ++t) of_scale[t] = from[t] * seen[t];
                     found[1 + (1 + a) * colors + c] = total(of_scale, count);
                 }

@@ -12,24 +12,23 @@ from torch import Tensor
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
-CHUNK = 512
+CHUNK = 256
 """Cells that one item does on a processor; on a GPU it is one."""
-MOST_BEAMS = 16
-"""So many beams at most are received at once."""
+MOST_BEAMS = 48
+"""So many beams at most are received at once: a multiple of four."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 
 
 def receive(
     field: Tensor, scale: Tensor, entered: Tensor, steps: Tensor, weights: Tensor
-) -> tuple[Tensor, ...]:
-    """Moments of L beams together: `weights` [L, moments, C] times tau, averaged over cells.
+) -> Tensor:
+    """Moments [moments, C, z, y, x] of L beams together: `weights` times tau, averaged over cells.
 
     `field` [K, z, y, x] and `scale` [C] of the extinction; `entered` [L, K, z, y, x]: the mass up
-    to where beams enter cells; `steps` [L] [u]: their paths in these. The first is the mean
-    [C, z, y, x], then come three of a flux, and all others [moments - 4, C, z, y, x].
+    to where beams enter cells; `steps` [L] [u]: their paths in these; `weights` [L, moments, C].
     """
-    moments: tuple[Tensor, ...] = _Received.apply(field, scale, entered, steps, weights)
+    moments: Tensor = _Received.apply(field, scale, entered, steps, weights)
     return moments
 
 
@@ -37,23 +36,22 @@ class _Received(torch.autograd.Function):
     """What `receive` returns."""
 
     @staticmethod
-    def forward(*tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(*tensors: Tensor) -> Tensor:
         return _receive("receive", tensors)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.set_materialize_grads(False)
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         keep(ctx, *inputs)
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         # Once: each access may compute them again.
         field, _, entered, _, weights = tensors = ctx.saved_tensors
         _, needs_scale, _, needs_steps, needs_weights = ctx.needs_input_grad
         varies = needs_scale or needs_steps or needs_weights
         lights, moments, colors = weights.shape
-        given = _given(tensors) | {"varies": varies, "bars": _five(bars)}
+        given = _given(tensors) | {"varies": varies, "bars": bar}
         field_bar, entered_bar = field.new_zeros(field.shape), field.new_empty(entered.shape)
         made = {"field_bar": field_bar, "entered_bar": entered_bar}
         items, _ = cut(field[0].numel(), CHUNK, field)
@@ -73,14 +71,14 @@ class _Received(torch.autograd.Function):
         return field_bar, scale_bar.sum(0), entered_bar, steps_bar[:, 0], weights_bar
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, ...]:
-        def change(*tensors: Any) -> tuple[Tensor, ...]:
+    def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
             values, d_values = tensors[:5], tensors[5:]
             pairs = zip(values, d_values, strict=True)
             changes = [torch.zeros_like(one) if d_one is None else d_one for one, d_one in pairs]
             return _receive("tangent", values, changes)
 
-        d_moments: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        d_moments: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_moments
 
 
@@ -96,29 +94,20 @@ def _given(tensors: Sequence[Tensor]) -> dict[str, Any]:
     return given | dict(zip(_SIZES.split(", "), sizes, strict=True))
 
 
-def _receive(
-    kind: str, tensors: Sequence[Tensor], changes: Sequence[Tensor] = ()
-) -> tuple[Tensor, ...]:
+def _receive(kind: str, tensors: Sequence[Tensor], changes: Sequence[Tensor] = ()) -> Tensor:
     """Moments, or of kind "tangent" their changes."""
     given, (field, *_) = _given(tensors), tensors
     given |= {f"d_{name}": change for name, change in zip(_ARRAYS, changes, strict=False)}
-    moments, shape = given["moments"], (given["colors"], *field.shape[1:])
-    made = [field.new_empty(shape) for _ in range(min(moments, 4))]
-    made += [field.new_empty(moments - 4, *shape)] if moments > 4 else []
+    made = field.new_empty(given["moments"], given["colors"], *field.shape[1:])
     items, _ = cut(field[0].numel(), CHUNK, field)
-    receive_kernel(kind, 8 * field.element_size()).launch(items, given, {"made": _five(made)})
-    return tuple(made)
-
-
-def _five(moments: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """`moments` as kernels have them, None for those that are missing."""
-    return [*moments, *[None] * (5 - len(moments))]
+    receive_kernel(kind, 8 * field.element_size()).launch(items, given, {"made": made})
+    return made
 
 
 @functools.cache
 def receive_kernel(kind: str, bits: int) -> TextKernel:
     """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
-    arrays, more, made = ", ".join(_ARRAYS), "F *made[5]", "made"
+    arrays, more, made = ", ".join(_ARRAYS), "F *made", "made"
     call = f"receive<F, {MOST_BEAMS}>(item, {arrays}, made)"
     if kind == "tangent":
         pairs = ", ".join(f"Changing<F>{{{one}, d_{one}}}" for one in _ARRAYS)
@@ -127,7 +116,7 @@ def receive_kernel(kind: str, bits: int) -> TextKernel:
     elif kind == "receive_back":
         own = "bars, field_bar, entered_bar, sums"
         call = f"receive_back(item, first_item, varies, {arrays}, {own})"
-        more = "F *bars[5], *field_bar, *entered_bar; double *sums"
+        more = "F *bars, *field_bar, *entered_bar; double *sums"
         made = "field_bar entered_bar sums"
     text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SIZES}}};\nreceiver.{call};"
     given = "long cells; int first_item, channels, colors, moments, lights, varies;"

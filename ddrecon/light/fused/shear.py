@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.kernels.text import TextKernel
+from ddrecon.light import shear as plain
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
@@ -47,14 +48,9 @@ def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear, ...], Tensor]:
 
     These are the slope by rows and by columns, and the path in a slice [u].
     """
-    speed = directions / directions.new_tensor(grid.spacing)
-    slicings = [Slicing.of(each) for each in speed.tolist()]
-    order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
-    ordered = speed.gather(1, torch.tensor(order, device=speed.device))
-    fastest = ordered[:, 2:].abs()
-    slope = ordered[:, :2] / fastest
-    shears = tuple(Shear(grid, *each) for each in zip(slicings, slope.tolist(), strict=True))
-    return shears, torch.cat([slope, 1 / fastest], 1)
+    crossed = [plain.cross_grid(grid, direction) for direction in directions]
+    shears = tuple(Shear(grid, slicing, slope) for slicing, slope, _ in crossed)
+    return shears, torch.stack([torch.cat([slope, step[None]]) for _, slope, step in crossed])
 
 
 class Shear:
@@ -64,10 +60,10 @@ class Shear:
     cells back.
     """
 
-    def __init__(self, grid: Grid, slicing: Slicing, slope: Sequence[float]):
+    def __init__(self, grid: Grid, slicing: Slicing, slope: Tensor):
         self.is_across_x = slicing.axis == 2
         count, height, width = (grid.shape[a] for a in (slicing.axis, *across(slicing.axis)))
-        more = [math.floor(abs(s) * (count - 1) + 1e-9) + 1 for s in slope]
+        rays = plain.Shear.of(count, (height, width), slope)
         # A row of one slice is followed by the same row of the next, but for slices across z.
         is_slices_first = slicing.axis != 0
         slice_stride, row_stride = (
@@ -78,10 +74,10 @@ class Shear:
             "slices": count,
             "height": height,
             "width": width,
-            "rows": height + more[0],
-            "columns": width + more[1],
-            "first_row": more[0] * (slope[0] > 0),
-            "first_column": more[1] * (slope[1] > 0),
+            "rows": rays.lattice[0],
+            "columns": rays.lattice[1],
+            "first_row": rays.first[0],
+            "first_column": rays.first[1],
             "start": (count - 1) * slice_stride * slicing.is_reversed,
             "slice_stride": -slice_stride if slicing.is_reversed else slice_stride,
             "row_stride": row_stride,

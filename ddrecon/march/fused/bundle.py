@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.beam import Beam, leaving_cosine
+from ddrecon.light.beam import Beam
 from ddrecon.march.emission import Emission
 from ddrecon.march.fused.kernels import Layout
 from ddrecon.medium.phase import PhaseKind
-from ddrecon.medium.phase_cells import at_ends, end_table, others_of, peak_tables
+from ddrecon.medium.phase_cells import at_ends, end_table, peak_tables
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
@@ -83,13 +83,13 @@ def pack_rays(
 def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
     """The beams of `emission` along rays."""
     phase, has_peak = emission.seen.phase, emission.peak is not None
-    numbers = phase.numbers if phase.cells is None else others_of(phase)
+    numbers = phase.numbers if phase.cells is None else phase.numbers[:-1]
     rows = layout.ray_terms if has_peak or phase.cells is not None else 0
     seen = []
     for beam in emission.beams:
         if isinstance(beam, Beam):
-            of_phase = phase.kind, emission.seen.degree, has_peak, layout.form, *numbers
-            seen.append(_see_beam(packed.direction, beam.direction, *of_phase))
+            ways, degree = (packed.direction, beam.direction), emission.seen.degree
+            seen.append(_see_beam(*ways, phase.kind, degree, has_peak, layout.form, *numbers))
         else:
             angles = torch.stack(beam.passing(packed.origin, packed.direction))
             unused = angles.new_zeros(rows, angles.shape[1])
@@ -119,7 +119,7 @@ def _see_beam(
     It is scattered by the phase function `kind` of these `numbers`; or, where that differs from
     cell to cell, of these others.
     """
-    cosine = leaving_cosine(direction, towards)
+    cosine = -(direction @ towards)
     angles = torch.stack([cosine, torch.ones_like(cosine)])
     if form == "LINEAR":
         ends = at_ends(kind(*numbers, cosine.new_zeros(())), cosine)
