@@ -23,6 +23,7 @@ from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of
 
+pytestmark = pytest.mark.usefixtures("shapes_by_python")
 CONFIGS = Path(__file__).parents[1] / "configs"
 # Of one camera and one lamp all is sought that capture.yaml seeks of each.
 CAPTURE = (

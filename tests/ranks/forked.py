@@ -23,6 +23,7 @@ import PIL.Image
 import torch
 import torch._decomp.decompositions_for_jvp
 import torch._dynamo
+from zero_tangents import ask_python
 
 # What commands import is imported once, before there are several processes. So is, above, what
 # pictures and derivatives in forward mode need.
@@ -37,6 +38,7 @@ from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction
 
 PIL.Image.init()
+ask_python(everything=False)
 
 LOADED = set(sys.modules)
 

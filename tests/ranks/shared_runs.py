@@ -115,9 +115,8 @@ def run_jobs(folder: Path, jobs: Mapping[str, Job]) -> Runs:
     """What becomes of `jobs`, one after the other in `folder`, with the scene in it."""
     write_scene(folder)
     script = Path(__file__).with_name("forked.py")
-    known = {
-        name: os.environ[name] for name in ("PATH", "PYTHONPATH", "HOME") if name in os.environ
-    }
+    known = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
+    known["PYTHONPATH"] = os.pathsep.join(sys.path)
     subprocess.run(
         [sys.executable, str(script), json.dumps(list(jobs.values())), str(folder)],
         cwd=folder,

@@ -30,6 +30,7 @@ from media import (
 )
 from torch import Tensor
 from torch.autograd import forward_ad
+from zero_tangents import ask_python
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.operator import AXES, Operator
@@ -297,6 +298,7 @@ def compare(engine: str) -> dict[str, dict[str, float]]:
 
 def main(file: Path) -> None:
     torch.set_num_threads(1)
+    ask_python(everything=False)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

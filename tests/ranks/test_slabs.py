@@ -26,8 +26,7 @@ def errors(tmp_path_factory: pytest.TempPathFactory) -> Errors:
     """Those of all cases, by engine; one process forks all ranks."""
     file = tmp_path_factory.mktemp("slabs") / "errors.json"
     script = Path(__file__).with_name("slab_cases.py")
-    paths = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, str(script), str(file)], env=environment, check=True)
     found: Errors = json.loads(file.read_text())
     return found
