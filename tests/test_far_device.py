@@ -105,22 +105,6 @@ def test_what_fake_tensors_let_pass_is_refused(refused: Callable[[Tensor], Any])
         refused(torch.ones(3, device=FAR))
 
 
-def test_derivatives_there_are_those_of_the_processor() -> None:
-    """Both modes, with tensors that torch makes on its own, and shapes changed in place."""
-    near = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
-    far = near.detach().to(FAR).requires_grad_()
-
-    def function(x: Tensor) -> Tensor:
-        return (x @ torch.outer(x, x) @ x).sqrt() + x[[0, 1]].prod() * x.new_tensor(2.0)
-
-    for one in (near, far):
-        function(one).backward()
-    assert isinstance(far.grad, Far)
-    assert far.grad.tolist() == near.grad.tolist()
-    tangents = [torch.func.jvp(function, (one.detach(),), (one.detach(),)) for one in (near, far)]
-    assert [one.tolist() for one in tangents[0]] == [one.tolist() for one in tangents[1]]
-
-
 def run(name: str, device: torch.device) -> Result:
     """Two iterations."""
     level, overrides = RUNS[name]

@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from media import box_grid
 from slab_cases import CASES_OF
 
-from ddrecon.slabs.slab import HALO, THINNEST, Slab, cut_evenly
+from ddrecon.slabs.slab import THINNEST, cut_evenly
 
 Errors = dict[str, dict[str, dict[str, float]]]
 LIMITS = {"torch": 1e-12, "warp": 1e-11}
@@ -50,21 +49,3 @@ def test_slabs_are_even_and_whole_pairs(ranks: int, more: int) -> None:
     assert cuts[0] == 0 and cuts[-1] == cells and len(sizes) == ranks
     assert all(cut % 2 == 0 for cut in cuts[:-1])
     assert max(sizes) - min(sizes) <= 4
-
-
-@given(st.integers(2, 5), st.integers(0, 20), st.integers(0, 2))
-def test_a_slab_lies_where_its_cells_do(ranks: int, more: int, axis: int) -> None:
-    shape = [3, 4, 5]
-    shape[axis] = ranks * THINNEST + more + 2
-    whole = box_grid((shape[0], shape[1], shape[2]))
-    cuts = cut_evenly(shape[axis], ranks)
-    slabs = [Slab.of(whole, axis, cuts, rank) for rank in range(ranks)]
-    for slab in slabs:
-        assert slab.spacing == pytest.approx(whole.spacing)
-        assert slab.lower[axis] == pytest.approx(
-            whole.lower[axis] + slab.first * whole.spacing[axis]
-        )
-        assert all(halo in (0, HALO) for halo in slab.halo)
-    for below, above in pairwise(slabs):
-        assert below.ends[1] == above.ends[0]
-    assert (slabs[0].ends[0], slabs[-1].ends[1]) == (None, None)
