@@ -236,21 +236,13 @@ def test_a_world_of_another_size_looks_the_same(view: dict):
 def test_a_mirrored_world_looks_mirrored(g: float):
     """Volume, light and camera mirrored in x, the light along no axis."""
     density, grid = half_empty(*SHAPE), Grid(SHAPE, (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
-    image = render(
-        make_scene(
-            density,
-            grid=grid,
-            g=g,
-            travel=(-0.7, -1.7, -1.5),
-            camera=make_camera(eye=(0.2, 0.3, 2.5)),
-            **BOTH,
-        )
-    )
-    camera = make_camera(eye=(-0.2, 0.3, 2.5))
-    mirrored = render(
-        make_scene(density.flip(2), grid=grid, g=g, travel=(0.7, -1.7, -1.5), camera=camera, **BOTH)
-    )
-    torch.testing.assert_close(mirrored.flip(-1), image, rtol=1e-10, atol=0)
+
+    def image(density: Tensor, side: float) -> Tensor:
+        camera, travel = make_camera((0.2 * side, 0.3, 2.5)), (-0.7 * side, -1.7, -1.5)
+        return render(make_scene(density, grid=grid, g=g, travel=travel, camera=camera, **BOTH))
+
+    mirrored = image(density.flip(2), -1).flip(-1)
+    torch.testing.assert_close(mirrored, image(density, 1), rtol=1e-10, atol=0)
 
 
 # --- derivatives of whole images ---
