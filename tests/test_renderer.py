@@ -289,7 +289,7 @@ def build(configuration: dict[str, Any]) -> Scene:
 
 def check(name: str, configuration: dict[str, Any]) -> GradientCheck:
     """Of derivatives of an image, along a random direction and by some entries."""
-    return check_parameters(build(configuration), (name,), 3, 0, lambda names, _: names)[0]
+    return check_parameters(build(configuration), (name,), 2, 0, lambda names, _: names)[0]
 
 
 BY_OTHERS = [
