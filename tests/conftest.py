@@ -6,7 +6,7 @@ The torch engine runs unless a test, or the environment, asks for another.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 from hypothesis import settings
+from zero_tangents import ask_python
 
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import FORMATS
@@ -23,6 +24,7 @@ os.environ.setdefault("DDRECON_ENGINE", "torch")  # compiles nothing
 torch.set_num_threads(1)  # tests run side by side, one a core
 settings.register_profile("patient", deadline=None)  # how loaded the machine is does not matter
 settings.load_profile("patient")
+ask_python(everything=False)
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +37,14 @@ def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
 def same_seed() -> None:
     """No test depends on those before it; the seed decides which views an iteration looks at."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="module")
+def shapes_by_python() -> Iterator[None]:
+    """For devices of their own, of which C++ knows no shapes of sums with numbers."""
+    ask_python(everything=True)
+    yield
+    ask_python(everything=False)
 
 
 BOTH = [suffix for suffix in FORMATS if suffix not in (".vti", ".nc")]

@@ -28,14 +28,13 @@ def missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "find_spec", {}.get)
 
 
-def test_auto_takes_warp_where_it_is_installed(installed: None) -> None:
+@pytest.mark.parametrize(("warp", "expected"), [("installed", "warp"), ("missing", "torch")])
+def test_auto_takes_warp_where_it_is_installed(
+    request: pytest.FixtureRequest, warp: str, expected: str
+) -> None:
+    request.getfixturevalue(warp)
     ddrecon.use_engine("auto")
-    assert current_engine() == "warp"
-
-
-def test_auto_takes_torch_elsewhere(missing: None) -> None:
-    ddrecon.use_engine("auto")
-    assert current_engine() == "torch"
+    assert current_engine() == expected
 
 
 def test_an_unknown_engine_is_refused() -> None:
@@ -80,15 +79,9 @@ def test_an_environment_that_cannot_be_is_named(
 def test_the_engine_runs_all_parts_but_those_that_are_in_torch(installed: None) -> None:
     ddrecon.use_engine("torch")
     assert engine_of_parts() == dict.fromkeys(PARTS, "torch")
-    ddrecon.use_engine("warp")
-    assert engine_of_parts() == dict.fromkeys(PARTS, "warp")
-    assert engine_of_parts(["light"]) == dict.fromkeys(PARTS, "warp") | {"light": "torch"}
-
-
-def test_versions(installed: None) -> None:
-    ddrecon.use_engine("torch")
     assert engine_versions() == {"engine": "torch"}
     ddrecon.use_engine("warp")
+    assert engine_of_parts(["light"]) == dict.fromkeys(PARTS, "warp") | {"light": "torch"}
     assert engine_versions() == {"engine": "warp", "warp-lang": "9.8.7"}
 
 

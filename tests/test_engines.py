@@ -182,14 +182,9 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
     return replace(scene, render=render)
 
 
-@pytest.mark.parametrize("dtype", CLOSE, ids=lambda dtype: str(dtype)[6:])
-def test_engines_agree_on_scenes_drawn_at_random(dtype: torch.dtype) -> None:
-    @settings(
-        max_examples=12,
-        derandomize=True,
-        database=None,
-        phases=[Phase.generate],
-    )
+@pytest.mark.parametrize(("dtype", "count"), [(torch.float32, 2), (torch.float64, 6)])
+def test_engines_agree_on_scenes_drawn_at_random(dtype: torch.dtype, count: int) -> None:
+    @settings(max_examples=count, derandomize=True, database=None, phases=[Phase.generate])
     @given(scene=scenes(dtype), has_moved=some.booleans())
     def check(scene: Scene, has_moved: bool) -> None:
         names = variables_of(scene)

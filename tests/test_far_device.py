@@ -23,6 +23,7 @@ from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of
 
+pytestmark = pytest.mark.usefixtures("shapes_by_python")
 CONFIGS = Path(__file__).parents[1] / "configs"
 # Of one camera and one lamp all is sought that capture.yaml seeks of each.
 CAPTURE = (
@@ -102,22 +103,6 @@ def test_indices_and_masks_go_to_the_device_and_not_back() -> None:
 def test_what_fake_tensors_let_pass_is_refused(refused: Callable[[Tensor], Any]) -> None:
     with pytest.raises((TypeError, RuntimeError)):
         refused(torch.ones(3, device=FAR))
-
-
-def test_derivatives_there_are_those_of_the_processor() -> None:
-    """Both modes, with tensors that torch makes on its own, and shapes changed in place."""
-    near = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
-    far = near.detach().to(FAR).requires_grad_()
-
-    def function(x: Tensor) -> Tensor:
-        return (x @ torch.outer(x, x) @ x).sqrt() + x[[0, 1]].prod() * x.new_tensor(2.0)
-
-    for one in (near, far):
-        function(one).backward()
-    assert isinstance(far.grad, Far)
-    assert far.grad.tolist() == near.grad.tolist()
-    tangents = [torch.func.jvp(function, (one.detach(),), (one.detach(),)) for one in (near, far)]
-    assert [one.tolist() for one in tangents[0]] == [one.tolist() for one in tangents[1]]
 
 
 def run(name: str, device: torch.device) -> Result:

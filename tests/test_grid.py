@@ -16,18 +16,6 @@ RESOLUTION, LOWER, UPPER = (2, 3, 5), (-1.0, 0.0, 2.0), (3.0, 1.5, 4.0)
 GRID = Grid.from_xyz(RESOLUTION, LOWER, UPPER)
 
 
-def test_xyz_becomes_array_order():
-    assert GRID.shape == RESOLUTION[::-1]
-    assert GRID.bounds_xyz == (LOWER, UPPER)
-    assert GRID.cells == torch.zeros(GRID.shape).numel()
-
-
-def test_cells_fill_the_box():
-    for axis in range(3):
-        assert GRID.extent[axis] == UPPER[2 - axis] - LOWER[2 - axis]
-        assert GRID.spacing[axis] * GRID.shape[axis] == pytest.approx(GRID.extent[axis], rel=1e-15)
-
-
 def test_centers_against_explicit_indices():
     z, y, x = torch.broadcast_tensors(*GRID.centers(torch.zeros(1, dtype=torch.float64)))
     for k, j, i in itertools.product(*map(range, GRID.shape)):

@@ -48,17 +48,6 @@ def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
     assert losses[-1] < 0.05 * losses[0]
 
 
-def test_anything_by_name_replaces_what_the_scene_has() -> None:
-    scene = make_scene(random_values(*SHAPE), ambient=(0.2,))
-    brighter = {
-        "lights.0.irradiance": 2 * value_of(scene, "lights.0.irradiance"),
-        "lights.1.radiance": 2 * value_of(scene, "lights.1.radiance"),
-    }
-    torch.testing.assert_close(
-        VolumeRenderer(scene)(values=brighter), 2 * render(scene), rtol=1e-10, atol=1e-14
-    )
-
-
 LIGHTS = ["lights.0.irradiance", "lights.0.direction", "lights.1.radiance"]
 NAMES = ["density", "sigma_a", "sigma_s", "g", *LIGHTS, "views.view.camera"]
 

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import make_camera, make_scene
 
 from ddrecon.cameras import Camera, cast_rays, image_places
 from ddrecon.lenses import distort, ray_through
 from ddrecon.renderer import render
 from ddrecon.settings import RenderSettings
-from ddrecon.variables.values import with_values
 
 LENSES = {
     "opencv": [-0.25, 0.08, -0.01, 0.004, 0.002, -0.003],
@@ -110,33 +109,3 @@ def test_interpolated_pixels_are_those_of_their_own_rays(model: str) -> None:
     between = render(replace(scene, render=RenderSettings(tolerance=0.02)))
     assert not torch.equal(own, between)
     assert (own - between).square().mean().sqrt() < 0.02 * own.square().mean().sqrt()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", LENSES)
-def test_images_differentiate_by_every_number_of_a_lens(model: str) -> None:
-    """With both engines: reverse mode against central differences of the image."""
-    scene = make_scene(random_values(3, 4, 3), camera=replace(lens_camera(model), size=(6, 5)))
-    name = scene.views[0].name
-    values = {
-        f"views.{name}.focal": torch.tensor(1.4, dtype=torch.float64),
-        f"views.{name}.principal_point": torch.tensor([0.48, 0.51], dtype=torch.float64),
-        f"views.{name}.distortion": lens_of(model),
-    }
-    weights = torch.linspace(-1, 1, 30, dtype=torch.float64).view(1, 1, 6, 5)
-
-    def loss(moved: dict[str, torch.Tensor]) -> torch.Tensor:
-        return (weights * render(with_values(scene, moved))).sum()
-
-    leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
-    gradients = torch.autograd.grad(loss(leaves), list(leaves.values()))
-    step = 1e-6
-    for (key, value), gradient in zip(values.items(), gradients, strict=True):
-        for index in range(value.numel()):
-            moved = torch.zeros_like(value).view(-1)
-            moved[index] = step
-            moved = moved.view(value.shape)
-            rise = loss(values | {key: value + moved}) - loss(values | {key: value - moved})
-            difference = float(rise) / (2 * step)
-            found = float(gradient.view(-1)[index])
-            assert abs(found - difference) <= 1e-5 * float(gradient.abs().max()), (key, index)

@@ -80,7 +80,11 @@ def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
         assert float(image_loss("photon", target + error, target, None, noise)) == pytest.approx(1)
 
 
-def test_psnr_of_displayed_values_has_white_for_its_peak() -> None:
+def test_psnr_has_white_for_its_peak() -> None:
+    """Of values, and of those that are displayed."""
+    assert psnr(torch.ones(3, 8, 8) + 0.01, torch.ones(3, 8, 8), None) == pytest.approx(
+        40, abs=1e-3
+    )
     target = torch.full((3, 8, 8), 0.2)
     shown = float(srgb.encode(np.array(0.2))) + 0.01
     brighter = torch.full((3, 8, 8), float(srgb.decode(np.array(shown))))
@@ -124,11 +128,6 @@ def test_what_counts_is_averaged() -> None:
     assert float(image_loss("l2", image, target, mask)) == pytest.approx(
         float(((image - target)[:, kept] ** 2).mean()), rel=1e-6
     )
-
-
-def test_psnr_of_a_known_error() -> None:
-    target = torch.ones(3, 8, 8)
-    assert psnr(target + 0.01, target, None) == pytest.approx(40, abs=1e-3)
 
 
 @pytest.mark.parametrize("cells", [8, 16, 32])

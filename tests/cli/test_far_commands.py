@@ -13,9 +13,9 @@ from ddrecon.cli.session import Session
 from ddrecon.uncertainty import posterior
 
 Run = Callable[..., Result]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("shapes_by_python")]
 
 
-@pytest.mark.slow
 def test_commands_end_well_there(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Session, "start", lambda _: FAR)
     for name in ("MOST", "ROUNDS", "INNER"):

@@ -14,6 +14,7 @@ SCENE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0", "--iteration
 RANK = ["-q", "--tolerance", "0.9", "--noise", "0.05", "--next-view"]
 
 
+@pytest.mark.slow
 def test_cameras_and_lights_are_ranked(
     folder: Path, succeed: Run, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

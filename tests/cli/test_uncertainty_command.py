@@ -65,6 +65,7 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
     assert not any(Path("sure").iterdir())
 
 
+@pytest.mark.slow
 def test_one_that_stops_goes_on_to_the_same_bits(
     finished: Path, run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,8 +6,6 @@ import re
 from itertools import groupby
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 TAG = re.compile(r"\bE(\d+)\.(\d+)(?:-E?\1\.(\d+))?\b")
 THEORY = (ROOT / "docs" / "theory.md").read_text()
@@ -32,18 +30,6 @@ CITED = {
     for suffix in ("*.py", "*.h")
     for path in sorted((ROOT / "ddrecon").rglob(suffix))
 }
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("by E2.3.", {(2, 3)}),
-        ("E2.4-E2.6 and E10.1", {(2, 4), (2, 5), (2, 6), (10, 1)}),
-        ("1E5.2, PE4.1, 0xE1, E4", set()),
-    ],
-)
-def test_tags_are_found(text: str, found: set[Tag]) -> None:
-    assert tags(text) == found
 
 
 def test_tags_count_up_in_the_section_where_they_stand() -> None:

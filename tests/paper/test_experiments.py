@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper").glob("*.yaml"))}
 RECONSTRUCTIONS = [name for name in CONFIGS if name != "fig08"]
 """Fig. 8 is of derivatives, which tests/test_tangents.py checks."""
-ITERATIONS = 20
+ITERATIONS = 12
 COARSE = [
     f"optimize.iterations={ITERATIONS}",
     "optimize.refine_at=[0.98, 0.99]",

@@ -24,6 +24,7 @@ import PIL.Image
 import torch
 import torch._decomp.decompositions_for_jvp
 import torch._dynamo
+from zero_tangents import ask_python
 
 # What commands import is imported once, before there are several processes. So is, above, what
 # pictures and derivatives in forward mode need.
@@ -34,6 +35,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 for name in ("cli.session", "run.render_folder", "scene_file.doubts", "uncertainty.drive"):
     import_module(f"ddrecon.{name}")
 PIL.Image.init()
+ask_python(everything=False)
 
 LOADED = set(sys.modules)
 

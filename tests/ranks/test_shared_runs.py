@@ -1,14 +1,89 @@
-"""A run shared by several processes is the run of one, and loses nothing where one is killed."""
+"""A run shared by several processes is the run of one, and loses nothing where one is killed.
+
+So are runs in slabs, and samples of a run that several share.
+"""
 
 from __future__ import annotations
 
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
-from shared_runs import RENDER, TESTS, VIEWS, Runs, job, run_jobs
 
 from ddrecon.run.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.slow
+Job = dict[str, Any]
+"""As `forked.py` takes them."""
+SCENE = """\
+volume:
+  bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}
+  resolution: [8, 6, 5]
+  density: 0.5
+  sigma_a: 0.5
+  sigma_s: [6, 5, 4]
+  g: 0.3
+lights:
+  - {type: directional, direction: [-1, -2, -1], irradiance: 3}
+diffusion: {transport_rounds: 0}
+optimize:
+  views_per_iteration: 2
+  loss: l2
+  parameters:
+    density: {init: 0.4, tv: 1e-3}
+    sigma_s: {field: true}
+    g: {}
+    lights.0.irradiance: {}
+    views.a.camera: {}
+    views.c.camera: {}
+    views.*.exposure: {}
+    views.*.offset: {}
+views:
+"""
+VIEWS = {"a": (0, 0, 2.5), "b": (2.5, 0, 0), "c": (0, 0.5, -2)}
+TESTS = {"d": (2, 1, 1), "e": (-2, -1, 1)}
+
+
+def write_scene(folder: Path) -> None:
+    """A scene of five training views of two sizes, and two test views."""
+    text = SCENE
+    for number, (name, origin) in enumerate((VIEWS | TESTS).items()):
+        width, height = (8, 6) if number % 2 else (10, 8)
+        y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+        blob = np.maximum(0.4 + 0.03 * number - x**2 - (y - 0.05 * number) ** 2, 0.1)
+        np.save(folder / f"{name}.npy", blob[..., None] * [1.0, 0.8, 0.6])
+        camera = f"origin: {list(origin)}, target: [0, 0, 0], resolution: [{width}, {height}]"
+        split = "test" if name in TESTS else "train"
+        text += f"  - {{name: {name}, image: {name}.npy, split: {split},\n"
+        text += f"     camera: {{type: perspective, fov: 30, {camera}}}}}\n"
+    (folder / "scene.yaml").write_text(text)
+
+
+def job(ranks: int, output: str, *options: str, **others: Any) -> Job:
+    command = ["optimize", "scene.yaml", "-o", output, "--dtype", "float64", "--engine", "torch"]
+    return {"ranks": ranks, "arguments": [*command, "--iterations", "4", *options]} | others
+
+
+RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
+FIELDS = "density", "sigma_s"
+WARM = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch"
+TALL = *WARM, "-D", "diffusion.warm_start=false"
+ROUNDS = "-D", "diffusion.transport_rounds=1", "-D", "diffusion.degree=1"
+CELLS = "--share", "cells"
+
+
+def sure(ranks: int, output: str, *options: str) -> Job:
+    command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
+    roughly = ["--noise", "0.05", "--tolerance", "0.9", "--keep-samples"]
+    return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
+
+
 JOBS = {
     "one": job(1, "one"),
     "four": job(4, "four", seeds=True),
@@ -20,17 +95,88 @@ JOBS = {
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+    "sure": sure(1, "sure", "--samples", "3"),
+    "sure begun": sure(1, "doubts", "--samples", "2"),
+    "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
+    "whole": job(1, "whole", *TALL, *ROUNDS),
+    "warm": job(1, "warm", *WARM),
+    "warm cells": job(2, "warm cells", *WARM, *CELLS),
+    "cells killed": job(3, "torn", *TALL, *ROUNDS, *CELLS, failing=[2, 4, "killed"]),
+    "cells resumed": job(2, "torn", *TALL, *ROUNDS, *CELLS, "--resume", "--preview-every", "4"),
+    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.model=flux_limited"),
+    "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
+    "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
 }
+
+
+class Runs:
+    """The `folder` in which `JOBS` were run, and what became of them."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.names = folder, list(JOBS)
+        codes = json.loads((folder / "codes.json").read_text())
+        self.codes = dict(zip(JOBS, codes, strict=True))
+
+    def text(self, name: str, rank: int, end: str) -> str:
+        return (self.folder / f"{self.names.index(name)}.{rank}.{end}").read_text()
+
+    def log(self, output: str) -> np.ndarray:
+        """The log in the folder `output`, without the times.
+
+        And without the steps of solves: one that was cut off has begun nearer to its end.
+        """
+        with (self.folder / output / "loss.csv").open() as stream:
+            rows = [
+                row | {"seconds": "0", "forward_iterations": "0"} for row in csv.DictReader(stream)
+            ]
+        return np.array([[float(cell or 0) for cell in row.values()] for row in rows])
+
+    def found(self, output: str) -> dict[str, np.ndarray]:
+        """All that a run found."""
+        path = self.folder / output
+        numbers = json.loads((path / "parameters.json").read_text())
+        fields = {name: np.load(path / f"volumes/{name}.npz")[name] for name in FIELDS}
+        views = {
+            name: np.ravel(value["matrix"] if isinstance(value, dict) else value)
+            for name, value in numbers.items()
+        }
+        return fields | views
+
+    def compare(self, output: str, alone: str) -> None:
+        """Asserts that a run found what another did, to rounding, all the way."""
+        np.testing.assert_allclose(self.log(output), self.log(alone), rtol=1e-7)
+        expected, found = self.found(alone), self.found(output)
+        assert expected.keys() == found.keys()
+        assert {"views.c.exposure", "views.d.camera"} <= found.keys()
+        for name, value in expected.items():
+            np.testing.assert_allclose(found[name], value, rtol=1e-6, atol=1e-8, err_msg=name)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
-    return run_jobs(tmp_path_factory.mktemp("ranks"), JOBS)
+    """What becomes of `JOBS`, one after the other in a folder with the scene in it."""
+    folder = tmp_path_factory.mktemp("ranks")
+    write_scene(folder)
+    script = Path(__file__).with_name("forked.py")
+    known = {name: os.environ[name] for name in ("PATH", "HOME") if name in os.environ}
+    known["PYTHONPATH"] = os.pathsep.join(sys.path)
+    subprocess.run(
+        [sys.executable, str(script), json.dumps(list(JOBS.values())), str(folder)],
+        cwd=folder,
+        # The last as commands set it, before they import torch.
+        env=known | {"OMP_NUM_THREADS": "1", "TORCH_CPP_LOG_LEVEL": "FATAL"},
+        check=True,
+    )
+    return Runs(folder)
 
 
-@pytest.mark.parametrize("output", ["four", "broken"])
-def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
-    runs.compare(output, "one")
+ALIKE = [("four", "one"), ("broken", "one"), ("torn", "whole"), ("warm cells", "warm")]
+
+
+@pytest.mark.parametrize(("output", "alone"), ALIKE)
+def test_ranks_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
+    """Also in slabs, and where solves begin at the last solutions, carried to finer cells."""
+    runs.compare(output, alone)
 
 
 def test_the_first_rank_alone_prints(runs: Runs) -> None:
@@ -75,3 +221,38 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
 
 def test_one_rank_imports_and_starts_nothing(runs: Runs) -> None:
     assert runs.text("one", 0, "out").splitlines()[-2:] == ["[]", "False"]
+
+
+def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
+    assert runs.codes["tall"] == [0] and runs.codes["tall cells"] == [0, 0]
+    arrays = sorted(path.name for path in (runs.folder / "tall").glob("*.npy"))
+    assert len(arrays) == 2 * len(VIEWS | TESTS)
+    for name in arrays:
+        one, other = (np.load(runs.folder / output / name) for output in ("tall", "tall cells"))
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5 * abs(one).max())
+
+
+def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
+    assert runs.codes["cells refused"][0] == 2
+    lines = runs.text("cells refused", 0, "err").splitlines()
+    assert len(lines) == 1 and lines[0].startswith("--share cells: diffusion.model: flux_limited")
+    assert not (runs.folder / "none").exists()
+
+
+def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
+    names = sorted(path.name for path in (runs.folder / "torn" / "previews").iterdir())
+    assert "c.png" in names and "c.000004.png" in names
+    assert (runs.folder / "torn" / "report.html").is_file()
+
+
+def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:
+    """They go on where one has begun; the first of them alone writes."""
+    assert runs.codes["sure begun"] == [0]
+    assert runs.codes["sure of three"] == [0, 0, 0]
+    assert runs.text("sure of three", 0, "out") and not runs.text("sure of three", 1, "out")
+    one, other = (sorted((runs.folder / output).rglob("*.npz")) for output in ("sure", "doubts"))
+    assert [path.name for path in one] == [path.name for path in other]
+    assert "0002" in {path.parent.name for path in one}
+    for known, found in zip(one, other, strict=True):
+        for key, value in np.load(known).items():
+            np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-7)

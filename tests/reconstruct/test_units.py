@@ -20,6 +20,7 @@ from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty.samples import Uncertainty
 
+pytestmark = pytest.mark.slow
 EYES = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
 GAINS = {"one": 1.2, "two": 1 / 1.2}
 CAMERAS = {
@@ -66,7 +67,7 @@ def scene_of(kind: str) -> Scene:
     ]
     settings = OptimizeSettings(
         SOUGHT[kind],
-        iterations=8,
+        iterations=5,
         noise=NoiseSettings(read=0.05),
         refine_at=(),
         views_per_iteration=0,

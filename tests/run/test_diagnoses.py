@@ -117,6 +117,7 @@ SIDE = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("begin", "scene"), [(lambda scene: None, ()), (start_empty, SIDE)], ids=["near", "far"]
 )

@@ -120,7 +120,7 @@ def test_the_number_of_threads_changes_nothing_much(path: Path) -> None:
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
     scene = load_scene(
         path,
-        overrides=["optimize.iterations=4", "optimize.views_per_iteration=0"],
+        overrides=["optimize.iterations=2", "optimize.views_per_iteration=0"],
         dtype=torch.float64,
     )
     one, other = (

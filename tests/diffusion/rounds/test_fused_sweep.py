@@ -136,7 +136,6 @@ CASES = {
     "gray": Case(colors=1, moments=1, is_lit=False),
     "gray-begun": Case(colors=1, known=4, spacing=CUBES),
     "fields": Case(varies=True, moments=1),
-    "gray-fields": Case(varies=True, colors=1, moments=1, is_lit=False, spacing=CUBES),
     "50": Case(degree=5, moments=36, spacing=CUBES),
     "wide": Case((3, 4, 35), CUBES),
     "wider": Case((3, 4, 70), THIN, degree=5, colors=1),
