@@ -77,7 +77,7 @@ template <class F, int BLOCK> struct Ways {
     // A sample near a cell's center, where the slope is the mean of both sides', is looked at so
     // far to either of them.
     static INLINE F shift(F p, int size) {
-        const F near = F(kink_width<F>(size));
+        const F near = KINK<F> * F(size);
         const F held = p < F(0) ? F(0) : p, off = held - F((int)(held + F(0.5)));
         return p >= -near && (off < F(0) ? -off : off) < near ? F(4) * near : F(0);
     }
