@@ -59,6 +59,10 @@ template <> struct Format<double> {
     static constexpr double log2_low = 1.90821492927058770002e-10;
 };
 
+// How near to a cell's center a place counts as on it, in units of a line's length
+// (`numerics/third_order.py`).
+template <class F> constexpr F KINK = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
+
 template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
 template <> inline constexpr double FACTORIAL<0> = 1.0;
 // Coefficients of exp(x), of psi(-x), of its slope psi'(-x), and of log((1 + s) / (1 - s)) / (2 s)

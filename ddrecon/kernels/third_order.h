@@ -5,11 +5,6 @@
 
 namespace ddrecon {
 
-// Within so many cells a place counts as on a cell's center, by its number of digits.
-template <class F> INLINE double kink_width(int size) {
-    return 16.0 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23) * size;
-}
-
 // A place among points on a line, the part a of the way from point n to the next: q = n + a.
 template <class F> struct Place {
     int n;
@@ -31,7 +26,7 @@ template <class N> struct Taps {
     INLINE Taps(const Place<F>& place, int size, bool is_end = false, int way = 0) {
         const int nearest = (int)(place.q + 0.5);
         const double off = place.q - nearest;
-        const bool is_kink = (off < 0 ? -off : off) < kink_width<F>(size);
+        const bool is_kink = (off < 0 ? -off : off) < KINK<F> * size;
         N a = N(place.a), weight = N(F(0));
         if constexpr (IS_DUAL<N>) a.by[way] = F(1);
         linear[0] = linear[3] = N(F(0));

@@ -18,7 +18,7 @@ from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import recompute, recompute_for
+from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
@@ -154,7 +154,7 @@ def attenuate_few(
         return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
 
     crossing = field, medium.grid, directions, extinction.mass_bound
-    if not is_fused:
-        return recompute(lambda: use(*sum_masses(*crossing)))
-    # Of lights, which are few, kernels keep what their adjoint needs.
-    return use(*sum_masses(*crossing)) if has_mass else recompute_for(use, sum_masses, *crossing)
+    if is_fused and has_mass:
+        # Of lights, which are few, kernels keep what their adjoint needs.
+        return use(*sum_masses(*crossing))
+    return recompute(lambda: use(*sum_masses(*crossing)))

@@ -156,25 +156,6 @@ def recompute(function: Callable[..., T], *arguments: object) -> T:
         return function(*arguments)
 
 
-def recompute_for(
-    use: Callable[..., T], function: Callable[..., tuple[Tensor, ...]], *arguments: object
-) -> T:
-    """`use(*function(*arguments))`: what `use` saves of its arguments is computed again as well.
-
-    It does not run again itself, and keeps whatever else it saves.
-    """
-    if not torch.is_grad_enabled():
-        return use(*function(*arguments))
-    if is_forward():
-        return recompute(lambda: use(*function(*arguments)))
-    again = _Recomputation(lambda: function(*arguments))
-    with saved_tensors_hooks(again.pack, again.unpack):
-        results = function(*arguments)
-    again.places = {(one.data_ptr(), one.shape): again.pack(one) for one in results}
-    with saved_tensors_hooks(again.pack_result, again.unpack_result):
-        return use(*results)
-
-
 class _Recomputation:
     """Numbers in place of the tensors that `function` saves for its backward pass.
 
@@ -184,7 +165,6 @@ class _Recomputation:
     def __init__(self, function: Callable[[], Any]):
         self.function = function
         self.count = 0
-        self.places: dict[tuple[int, torch.Size], int] = {}
         self.saved: dict[int, Tensor] = {}
 
     def pack(self, _: Tensor) -> int:
@@ -198,19 +178,11 @@ class _Recomputation:
             self._run()
         return self.saved.pop(number)
 
-    def pack_result(self, tensor: Tensor) -> Tensor | int:
-        return self.places.get((tensor.data_ptr(), tensor.shape), tensor)
-
-    def unpack_result(self, packed: Tensor | int) -> Tensor:
-        return packed if isinstance(packed, Tensor) else self.unpack(packed)
-
     def _run(self) -> None:
         saved: list[Tensor] = []
         with (
             torch.enable_grad(),
             saved_tensors_hooks(lambda tensor: saved.append(tensor.detach()), saved.__getitem__),
         ):
-            found = self.function()
-        if self.places:
-            saved += [one.detach() for one in found]
+            self.function()
         self.saved = dict(enumerate(saved))

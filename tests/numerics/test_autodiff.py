@@ -9,7 +9,7 @@ import torch
 from media import random_values
 from torch import Tensor
 
-from ddrecon.numerics.autodiff import recompute, recompute_for
+from ddrecon.numerics.autodiff import recompute
 
 
 def curved(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,22 +50,3 @@ def test_nothing_between_arguments_and_result_stays() -> None:
     assert [reference() for reference in seen] == [None]
     result.sum().backward()
     assert len(seen) == 2 and [reference() for reference in seen] == [None, None]
-
-
-def test_what_is_used_is_computed_again_and_its_use_is_not() -> None:
-    calls: list[str] = []
-
-    def find(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        calls.append("find")
-        return curved(x, y)
-
-    def use(one: Tensor, other: Tensor) -> Tensor:
-        calls.append("use")
-        return (one.square() * other.exp() * one).sum()
-
-    x, y = (value.requires_grad_() for value in random_values(2, 3, 4))
-    expected = torch.autograd.grad(use(*curved(x, y)), (x, y))
-    calls.clear()
-    found = torch.autograd.grad(recompute_for(use, find, x, y), (x, y))
-    torch.testing.assert_close(found, expected)
-    assert calls.count("use") == 1 and calls.count("find") > 1

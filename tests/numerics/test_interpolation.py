@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from media import convergence_order, random_values
+from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -136,15 +136,6 @@ def test_sums_of_squares_are_exact_in_smooth_channels_alone():
     found = sample_volume((x * x - y * y + 2 * z * z)[None], places, ThirdOrder(0, 1))[0, 0]
     a, b, c = places[0].unbind(-1)
     torch.testing.assert_close(found, a * a - b * b + 2 * c * c, rtol=0, atol=1e-14)
-
-
-def test_smooth_channels_converge_at_third_order():
-    points, counts, errors = 0.5 * (2 * random_values(1, 400, 2) - 1), [12, 24, 48], []
-    for count in counts:
-        y, x = torch.meshgrid(centers(count), centers(count), indexing="ij")
-        found = sample_slices(torch.sin(3 * x + y)[None, None], points, ThirdOrder(0, 1))[0, 0]
-        errors.append(float((found - torch.sin(3 * points[0, :, 0] + points[0, :, 1])).norm()))
-    assert convergence_order([1 / count for count in counts], errors) > 2.7
 
 
 def test_subdivided_squares_are_exact_in_smooth_channels():

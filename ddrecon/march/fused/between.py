@@ -16,8 +16,6 @@ from ddrecon.numerics.autodiff import differentiate_once, keep
 
 LENGTH = 256
 """Pixels that an item of a launch does on a processor."""
-FEW = 1 << 14
-"""So many numbers of pixels are not worth a second thread."""
 _PIXELS = """
 F *values; int channels, rows, columns, length, total, pixels; F *places; long *hit;
 """
@@ -54,7 +52,7 @@ class _Interpolate(torch.autograd.Function):
         out = values.new_zeros(len(values), count)
         items, given = _pixels(values, places, hit, count)
         kernel = pixel_kernel("interpolate", torch.finfo(values.dtype).bits)
-        kernel.launch(items, given, {"out": out}, _threads(places, len(values)))
+        kernel.launch(items, given, {"out": out})
         return out
 
     @staticmethod
@@ -66,7 +64,7 @@ class _Interpolate(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, out_bar: Tensor) -> tuple[Tensor | None, ...]:
         values, places, hit = ctx.saved_tensors
-        bits, threads = torch.finfo(values.dtype).bits, _threads(places, len(values))
+        bits, threads = torch.finfo(values.dtype).bits, thread_count(places)
         threads = count_shares(threads, values.nbytes)
         shares = [values.new_zeros(values.shape) for _ in range(threads)]
         items, given = _pixels(values, places, hit, ctx.count)
@@ -81,10 +79,6 @@ class _Interpolate(torch.autograd.Function):
         along = torch.where(moves, interpolate(d_values, places), 0)
         d_out = values.new_zeros(len(values), ctx.count)
         return d_out.index_copy(1, hit, along)
-
-
-def _threads(pixels: Tensor, channels: int = 1) -> int:
-    return 1 if pixels.numel() * channels < FEW else thread_count(pixels)
 
 
 def _pixels(values: Tensor, places: Tensor, hit: Tensor, count: int) -> tuple[int, dict[str, Any]]:

@@ -113,13 +113,11 @@ template <class F, bool IS_SLICED, class N> struct Spot {
 template <class F> struct Kink {
     typedef Packets<F> P;
     typedef typename P::V V;
-    // How near is on it, in units of a line's length; and how far from it a side is looked at.
-    static constexpr F WIDTH =
-        F(16) * (sizeof(F) == 8 ? F(2.220446049250313e-16) : F(1.1920929e-7));
-    static constexpr F SIDE = F(4) * WIDTH;
+    // How far from it a side is looked at, in units of a line's length.
+    static constexpr F SIDE = 4 * KINK<F>;
     static INLINE typename P::M is_at(V y, int size) {
         const V inside = P::least(P::most(y, P::all(F(-2))), P::all(F(size + 1)));
-        return P::size(y - P::real(P::whole(inside + F(0.5)))) < P::all(WIDTH * F(size));
+        return P::size(y - P::real(P::whole(inside + F(0.5)))) < P::all(KINK<F> * F(size));
     }
     // Its derivative by y is along `direction`.
     template <class N> static INLINE Place<F, N> place(V y, int size, F side, int direction) {

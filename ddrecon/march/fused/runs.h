@@ -59,15 +59,6 @@ template <> struct Permute<float> {
     typedef Packets<float>::V V;
     typedef Packets<float>::I I;
     static INLINE V pick(V row, I at) { return __builtin_ia32_permvarsf512(row, at); }
-    // The same, and 0 at places from LANES on.
-    static INLINE V pick_any(V row, I at) { return __builtin_ia32_vpermi2varps512(row, at, V{}); }
-    static INLINE I pick_any(I from, I at, I other) {
-        return __builtin_ia32_vpermi2vard512(from, at, other);
-    }
-    // Those `lanes` of x that are named by bits, in front of `others`.
-    static INLINE I gather_lanes(I x, unsigned lanes, I others) {
-        return __builtin_ia32_compresssi512_mask(x, others, (unsigned short)lanes);
-    }
 };
 #else
 template <class F> constexpr bool HAS_PERMUTATION = false;
@@ -119,9 +110,6 @@ template <class F> struct Window {
 //         row j    .  .  #  #  .  .  .      # += a bar L
 //         row p    .  .  .  .  .  .  .
 //               first column
-//
-// Where lanes lie in the order of their columns, and a few to each, columns pick them instead: the
-// first of those that lie right of each column, the second, and so on. That is 1.2 times as fast.
 
 #if defined(__CUDA_ARCH__)
 template <class F> INLINE void spread_place(
@@ -141,43 +129,27 @@ template <class F> INLINE void spread_place(
         }
 }
 #else
-// What the lanes of a run count for columns `first` to `first` + LANES - 1 of cells.
+// What the lanes of a run count for LANES columns of cells, from its first on.
 template <class F> struct Shares {
     typedef Packets<F> P;
-    typedef Permute<F> Lanes;
     typedef typename P::V V;
-    typedef typename P::I I;
-    static constexpr int MOST_ALIKE = 8;
     Run run;
     Lines lines;
-    int first, alike = 0;
     long long rows[4];
-    V ya, y_excess, xa, x_excess, at_low, at_high;
-    // If up to so many lanes lie `alike` right of the same column: for each column the lanes whose
-    // first to fourth it is. Else each lane's weights of columns, and those of a (1 - a) / 2 second
-    // differences.
-    I lanes_of[MOST_ALIKE][4];
+    V ya, y_excess;
+    // Each lane's weights of columns, and those of a (1 - a) / 2 second differences.
     V linear[LANES], cubic[LANES];
 
     Shares(
         const Run& run, const Place<F, V>& y, const Place<F, V>& x, const Lines& lines,
         bool is_cubic)
-        : run(run),
-          lines(lines),
-          first(run.first),
-          ya(y.a),
-          y_excess(y.excess),
-          xa(x.a),
-          x_excess(x.excess) {
+        : run(run), lines(lines), ya(y.a), y_excess(y.excess) {
         for (int r = 0; r < 4; ++r)
             rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
-        if constexpr (HAS_PERMUTATION<F>)
-            if (lines.columns >= LANES) pick_lanes(x);
-        if (alike) return;
         // 1 in column k of a run: entries LANES - 1 - k on.
         F ones[2 * LANES - 1] = {};
         ones[LANES - 1] = F(1);
-        auto column = [&](int k) -> V { return P::read(ones + LANES - 1 - (k - first)); };
+        auto column = [&](int k) -> V { return P::read(ones + LANES - 1 - (k - run.first)); };
         const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
         for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
@@ -190,69 +162,20 @@ template <class F> struct Shares {
                                         w0 * at[0] + w1 * at[3]);
         }
     }
-    void pick_lanes(const Place<F, V>& x) {
-        const I numbers = P::numbers(), none = I{} + LANES;
-        const int count = __builtin_popcount(run.lanes), begin = P::lane_of(x.cells[1], run.lane);
-        // The run's lanes first, the columns right of which they lie, and those after new ones.
-        const I lanes = Lanes::gather_lanes(numbers, run.lanes, none);
-        const I column = Lanes::pick_any(x.cells[1], lanes, none), is_lane = numbers < count;
-        const I before = Lanes::pick_any(column, (numbers - 1) & (LANES - 1), none);
-        const I step = P::pick(is_lane & (numbers > 0), column - before, I{});
-        if (!__builtin_reduce_and((step == 0) | (step == 1))) return;
-        const unsigned starts = P::bits_of((step == 1) | (numbers == 0));
-        const I start = Lanes::gather_lanes(numbers, starts, I{} + count);
-        const I next = Lanes::pick_any(start, numbers + 1, I{} + count);
-        const int most = __builtin_reduce_max(next - start);
-        if (most > MOST_ALIKE) return;
-        // The first column is that left of the first lane's, or where LANES end with the row.
-        const int last = lines.columns - LANES;
-        first = begin - 1 < last ? (begin > 0 ? begin - 1 : 0) : last;
-        const int shift = begin - 1 - first, end = begin + __builtin_popcount(starts) + 1;
-        run.low = begin > 0 ? begin - 1 : 0;
-        run.high = end < lines.columns ? end : lines.columns - 1;
-        for (int k = 0; k < most; ++k) {
-            const I which = P::pick(start + k < next, start + k, none);
-            const I lane = Lanes::pick_any(lanes, which, none), at = numbers - shift;
-            for (int c = 0; c < 4; ++c)
-                lanes_of[k][c] = Lanes::pick_any(lane, (at - c) & (2 * LANES - 1), none);
-        }
-        // Beyond the ends of the row the columns at its ends count once more.
-        at_low = __builtin_convertvector(-(x.cells[0] == x.cells[1]), V);
-        at_high = __builtin_convertvector(-(x.cells[3] == x.cells[2]), V);
-        alike = most;
-    }
     // To a row of cells what linear values there have as bars, and corrections along the row.
     template <bool IS_CUBIC> void add_row(F* row, V bar, V bend_bar = V{}) const {
         V sum = P::all(F(0));
-        if (!alike)
-            for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
-                const int l = __builtin_ctz(rest);
-                sum += ((const F*)&bar)[l] * linear[l];
-                if (IS_CUBIC) sum += ((const F*)&bend_bar)[l] * cubic[l];
-            }
-        if constexpr (HAS_PERMUTATION<F>) {
-            V by_j = bar * xa, by_i = bar - by_j, by_m = V{}, by_p = V{};
-            if (IS_CUBIC) {
-                const V bend = x_excess * bend_bar;
-                by_p = bend * xa;
-                by_m = bend - by_p;
-                by_j += (by_m - F(2) * by_p) + at_high * by_p;
-                by_i += (by_p - F(2) * by_m) + at_low * by_m;
-            }
-            for (int k = 0; k < alike; ++k) {
-                sum +=
-                    Lanes::pick_any(by_i, lanes_of[k][1]) + Lanes::pick_any(by_j, lanes_of[k][2]);
-                if (IS_CUBIC)
-                    sum += Lanes::pick_any(by_m, lanes_of[k][0]) +
-                           Lanes::pick_any(by_p, lanes_of[k][3]);
-            }
+        for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            sum += ((const F*)&bar)[l] * linear[l];
+            if (IS_CUBIC) sum += ((const F*)&bend_bar)[l] * cubic[l];
         }
         if (lines.column == 1 && lines.columns >= LANES) {
-            P::write(row + first, P::read(row + first) + sum);
+            P::write(row + run.first, P::read(row + run.first) + sum);
         } else {
             const F* values = (const F*)&sum;
             for (int j = run.low; j <= run.high; ++j)
-                row[(long long)j * lines.column] += values[j - first];
+                row[(long long)j * lines.column] += values[j - run.first];
         }
     }
     void add(F* field, V bar) const {

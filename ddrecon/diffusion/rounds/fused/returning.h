@@ -192,7 +192,8 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             return_stretch<IS_ALONG, decltype(of)::matter>(steps, back, from, to);
         });
     }
-    template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void return_stretch(
+    template <bool IS_ALONG, Matter MATTER, int POINTS>
+    __attribute__((noinline)) void return_stretch(
         const Steps<POINTS>& given, const Back<POINTS>& given_back, int from, int to) const {
         const Steps<POINTS> steps = given;
         const Back<POINTS> back = given_back;

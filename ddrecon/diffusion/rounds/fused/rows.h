@@ -284,7 +284,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             follow_stretch<IS_ALONG, decltype(of)::matter>(steps, light, from, to);
         });
     }
-    template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void follow_stretch(
+    template <bool IS_ALONG, Matter MATTER, int POINTS>
+    __attribute__((noinline)) void follow_stretch(
         const Steps<POINTS>& given, const Line<N>& light, int from, int to) const {
         const Steps<POINTS> steps = given;
         const N scale = this->scale, strength = this->strength, inflow = this->inflow;

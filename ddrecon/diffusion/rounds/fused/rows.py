@@ -14,11 +14,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.spare import count_shares
-from ddrecon.kernels.text import TextKernel, declarations, names_of
+from ddrecon.kernels.text import TextKernel, declarations
 
 _ROOM = "diffusion/rounds/fused"
 MARGIN = 16
@@ -151,39 +152,24 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
     They begin where vectors do; empty ones are from 0 to 0. `densest` [z, y]: the largest value of
     the first field that steps to these cells meet.
     """
-    _, depth, height, width = fields[0].shape
-    rows, like = depth * height, fields[0]
-    occupied = like.new_empty(rows, 2, dtype=torch.int32)
-    ranges = like.new_empty(rows, 4, dtype=torch.int32)
-    tops, densest, larger = like.new_empty(rows), like.new_empty(rows), list[Tensor]()
-    sizes = {"depth": depth, "height": height, "width": width}
-    found, reached = {"occupied": occupied, "tops": tops}, {"ranges": ranges, "densest": densest}
-    surround_row, reach_row = _surround_kernels(torch.finfo(like.dtype).bits)
+    (depth, height, width), larger = fields[0].shape[1:], []
     for field in fields:
-        flat = field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch)
-        given = {"field": field.detach(), "channels": len(field), "is_first": not larger}
-        inner = flat[MARGIN + (height + 3) * pitch :]
-        surround_row.launch(rows, given | sizes | {"pitch": pitch}, found | {"inner": inner})
-        larger.append(flat)
-    reach_row.launch(rows, found | sizes | {"margin": MARGIN}, reached)
-    return larger, ranges, densest
-
-
-@functools.cache
-def _surround_kernels(bits: int) -> tuple[TextKernel, TextKernel]:
-    size, path = "int depth, height, width,", f"{_ROOM}/surround.h"
-    of_row = (
-        f"F *field; int channels; {size} pitch; bool is_first; F *inner; int *occupied; F *tops"
-    )
-    around = f"int *occupied; F *tops; {size} margin; int *ranges; F *densest"
-    one, other = (
-        TextKernel(name, bits, f"{name}(item, {names_of(given)});", given, made, path)
-        for name, given, made in (
-            ("surround_row", of_row, "inner occupied tops"),
-            ("reach_row", around, "ranges densest"),
-        )
-    )
-    return one, other
+        larger.append(field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch))
+        inner = larger[-1][MARGIN:].view(len(field), depth + 2, height + 2, pitch)
+        inner[:, 1:-1, 1:-1, :width] = field
+    is_met = functools.reduce(torch.logical_or, ((field != 0).any(0) for field in fields))
+    # How many cells there are from each end of a row to the last one that is not empty.
+    count = torch.arange(1, width + 1, dtype=torch.int32)
+    reach = torch.stack([(is_met * each).amax(-1) for each in (count.flip(0), count)]).float()
+    ranges = []
+    # Light at the ends of a step is a cell away at most, along each axis.
+    for cells in (1, 2):
+        before, end = max_pool2d(reach, 2 * cells + 1, 1, cells)
+        begin = (width - before - cells).clamp(min=0) // MARGIN * MARGIN
+        end = torch.where(end > 0, ((end + cells) / MARGIN).ceil() * MARGIN, 0)
+        ranges += [begin * (end > 0), end.clamp(max=width)]
+    densest = max_pool2d(fields[0].amax((0, 3)).clamp(min=0)[None], 3, 1, 1)
+    return larger, torch.stack(ranges, -1).int(), densest
 
 
 @functools.cache
