@@ -105,7 +105,8 @@ def build_scene(
     problems.raise_any()
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    diffusion = choose_rounds(tree, _phase_of(media))
+    densities = [medium.density for medium in media.values()]
+    diffusion = choose_rounds(tree, _phase_of(media), densities)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -114,7 +115,7 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, render = choose_rounds(tree, volume.phase, volume), tree.render
+    diffusion, render = choose_rounds(tree, volume.phase, densities, volume), tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
@@ -225,7 +226,10 @@ def _varied(
 
 
 def choose_rounds(
-    tree: SceneTree, phase: PhaseFunction, volume: Volume | None = None
+    tree: SceneTree,
+    phase: PhaseFunction,
+    densities: Sequence[Tensor],
+    volume: Volume | None = None,
 ) -> DiffusionSettings:
     """The diffusion settings of `tree`, with rounds and degree as `phase` deserves if left out.
 
@@ -245,7 +249,8 @@ def choose_rounds(
     elif is_thick:
         left = 0.0
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    is_flat = volume is not None and not is_thick and _is_flat(volume)
+    is_known = not any(name.endswith("density") for name in optimized)
+    is_flat = is_known and not is_thick and any(map(_is_flat, densities))
     if is_flat or float(phase.backward_tail(3, 1).max()) > BACKWARD:
         rounds, degree = rounds + (left > MORE_ROUNDS[1]), 5
     return replace(
@@ -255,9 +260,8 @@ def choose_rounds(
     )
 
 
-def _is_flat(volume: Volume) -> bool:
-    """Whether the medium of `volume` goes up to a face of the box."""
-    density = volume.density
+def _is_flat(density: Tensor) -> bool:
+    """Whether a medium of this `density` goes up to a face of the box."""
     faces = (density.select(axis, end).mean() for axis in range(3) for end in (0, -1))
     return float(max(faces)) > FLAT * float(density.mean())
 
