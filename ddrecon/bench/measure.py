@@ -322,19 +322,17 @@ def measure(
 ) -> dict[str, list[Shot]]:
     """The shots by name of all `contestants` that can be solved.
 
-    Each runs once in every turn, so that what else runs slows all alike. One is run once before,
-    uncounted: the first work of a process takes longer.
+    Each runs once in every turn, so that what else runs slows all alike. The first turn is not
+    counted: kernels are compiled in it.
     """
     shots: dict[str, list[Shot]] = {name: [] for name in contestants}
-    with suppress(SolveError):
-        next(iter(contestants.values()))()
     for turn, name in progress(
-        [(turn, name) for turn in range(turns) for name in contestants], "bench"
+        [(turn, name) for turn in range(turns + 1) for name in contestants], "bench"
     ):
         if turn == len(shots[name]):
             with suppress(SolveError):
                 shots[name].append(contestants[name]())
-    return {name: each for name, each in shots.items() if each}
+    return {name: each[1:] for name, each in shots.items() if each}
 
 
 def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced | None) -> Row:
