@@ -105,8 +105,8 @@ def build_scene(
     problems.raise_any()
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    densities = [medium.density for medium in media.values()]
-    diffusion = choose_rounds(tree, _phase_of(media), densities)
+    is_flat = _is_flat(media.values())
+    diffusion = choose_rounds(tree, _phase_of(media), is_flat)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -115,7 +115,7 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, render = choose_rounds(tree, volume.phase, densities, volume), tree.render
+    diffusion, render = choose_rounds(tree, volume.phase, is_flat, volume), tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
@@ -226,14 +226,12 @@ def _varied(
 
 
 def choose_rounds(
-    tree: SceneTree,
-    phase: PhaseFunction,
-    densities: Sequence[Tensor],
-    volume: Volume | None = None,
+    tree: SceneTree, phase: PhaseFunction, is_flat: bool, volume: Volume | None = None
 ) -> DiffusionSettings:
     """The diffusion settings of `tree`, with rounds and degree as `phase` deserves if left out.
 
     A phase function that is optimized may become any: it starts as one of strong peaks does.
+    `is_flat`: whether the medium goes up to a face of the box, if its density is not optimized.
     `volume`: None where it is not known yet; fewer rounds and moments may do in it.
     """
     settings = tree.diffusion
@@ -249,8 +247,7 @@ def choose_rounds(
     elif is_thick:
         left = 0.0
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    is_known = not any(name.endswith("density") for name in optimized)
-    is_flat = is_known and not is_thick and any(map(_is_flat, densities))
+    is_flat &= not is_thick and not any(name.endswith("density") for name in optimized)
     if is_flat or float(phase.backward_tail(3, 1).max()) > BACKWARD:
         rounds, degree = rounds + (left > MORE_ROUNDS[1]), 5
     return replace(
@@ -260,10 +257,15 @@ def choose_rounds(
     )
 
 
-def _is_flat(density: Tensor) -> bool:
-    """Whether a medium of this `density` goes up to a face of the box."""
-    faces = (density.select(axis, end).mean() for axis in range(3) for end in (0, -1))
-    return float(max(faces)) > FLAT * float(density.mean())
+def _is_flat(media: Iterable[Volume]) -> bool:
+    """Whether `media`, all together, go up to a face of the box."""
+    faces, whole = np.zeros(6), 0.0
+    for one in media:
+        size, density = float((one.sigma_a + one.sigma_s).mean()), one.density
+        ends = (density.select(axis, end) for axis in range(3) for end in (0, -1))
+        faces += [size * float(face.mean()) for face in ends]
+        whole += size * float(density.mean())
+    return bool(faces.max() > FLAT * whole)
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
