@@ -261,7 +261,7 @@ def _is_flat(media: Iterable[Volume]) -> bool:
     """Whether `media`, all together, go up to a face of the box."""
     faces, whole = np.zeros(6), 0.0
     for one in media:
-        size, density = float((one.sigma_a + one.sigma_s).mean()), one.density
+        size, density = float(one.sigma_a.mean() + one.sigma_s.mean()), one.density
         ends = (density.select(axis, end) for axis in range(3) for end in (0, -1))
         faces += [size * float(face.mean()) for face in ends]
         whole += size * float(density.mean())
