@@ -17,7 +17,7 @@ from hypothesis import settings
 from zero_tangents import ask_python
 
 from ddrecon.cli.commands import main
-from ddrecon.io.volumes.table import FORMATS
+from ddrecon.io.volumes.table import WRITTEN
 
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ.setdefault("DDRECON_ENGINE", "torch")  # compiles nothing
@@ -47,7 +47,7 @@ def shapes_by_python() -> Iterator[None]:
     ask_python(everything=False)
 
 
-BOTH = [suffix for suffix in FORMATS if suffix not in (".vti", ".nc")]
+BOTH = [suffix for suffix in WRITTEN if suffix != ".vti"]
 """Formats that are written and read."""
 
 

@@ -58,9 +58,9 @@ def export(
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
     _require_volumes(sources)
     from ddrecon.io.files.folders import require_free_files
-    from ddrecon.io.volumes.table import FORMATS, raise_z, read_together, write_fields
+    from ddrecon.io.volumes.table import WRITTEN, raise_z, read_together, write_fields
 
-    kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
+    kind, known = output.suffix.lower(), (".xml", ".json", *WRITTEN)
     if kind not in known:
         raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
     from ddrecon.reference.export import export_scene
@@ -68,10 +68,10 @@ def export(
     from ddrecon.uncertainty.folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
-    is_of_scene = kind not in FORMATS or any(map(_is_scene, sources))
+    is_of_scene = kind not in WRITTEN or any(map(_is_scene, sources))
     if is_of_scene and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
-    if kind not in FORMATS and up == "z":
+    if kind not in WRITTEN and up == "z":
         raise click.UsageError("--up z turns volumes only")
     constants: Fields = {}
     if not is_of_scene:
@@ -85,7 +85,7 @@ def export(
             written = export_transforms(scene, scene_file, output, may_exist=overwrite)
         else:
             fields, constants, bounds = _fields_of(scene)
-    if kind in FORMATS:
+    if kind in WRITTEN:
         written = [output]
         require_free_files(written, may_exist=overwrite)
         write_fields(output, *(raise_z(fields, bounds) if up == "z" else (fields, bounds)))

@@ -78,17 +78,22 @@ def compare_to_folder(
                 ours = view_image(light_field, scene, view.camera).cpu()
             seconds["ours"] = perf_counter() - start
             theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
-            image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
-            measured |= {
-                "error": traced.error(image),
-                "distance": traced.distance(image),
-                "psnr": psnr(ours, theirs, None),
-                "brightness": float(image.mean()) / mean if mean > 0 else None,
-            }
+            measured |= _measure(traced, ours, theirs)
             written = _write(folder / view.name, ours, theirs)
         report["views"][view.name] = measured
         report["files"][view.name] = [path.name for path in written]
     return report
+
+
+def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
+    """How far `ours` [3, h, w] is from what was traced; `theirs` is the same image as a tensor."""
+    image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
+    return {
+        "error": traced.error(image),
+        "distance": traced.distance(image),
+        "psnr": psnr(ours, theirs, None),
+        "brightness": float(image.mean()) / mean if mean > 0 else None,
+    }
 
 
 def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:

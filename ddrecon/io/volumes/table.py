@@ -29,24 +29,17 @@ from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 class VolumeFormat:
     """How one kind of volume file is read and written.
 
-    Without `names`, a file holds one field and does not name it.
+    Without `names`, a file holds one field and does not name it; without `write` it is only read.
     """
 
-    write: Callable[[Path, Fields, np.ndarray], None]
+    write: Callable[[Path, Fields, np.ndarray], None] | None
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
 
 
 def refuse_reading(path: Path, *_: str) -> NoReturn:
     """Raises FormatError, which says what is read instead."""
-    raise FormatError(
-        path, ".vti is written, not read: save the volume as .npz or .nc (docs/formats.md)"
-    )
-
-
-def refuse_writing(path: Path, *_: object) -> NoReturn:
-    """Raises FormatError, which says what is written instead."""
-    raise FormatError(path, ".nc is read, not written: name a .npz, .vdb or .vti")
+    raise FormatError(path, ".vti is written, not read: save it as .npz (docs/formats.md)")
 
 
 FORMATS: dict[str, VolumeFormat] = {
@@ -54,9 +47,10 @@ FORMATS: dict[str, VolumeFormat] = {
     ".vol": VolumeFormat(write_vol, read_vol),
     ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
     ".vti": VolumeFormat(write_vti, refuse_reading, refuse_reading),
-    ".nc": VolumeFormat(refuse_writing, read_netcdf, netcdf_names),
+    ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
 }
+WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
 
 
 def field_names(path: Path) -> list[str]:
@@ -96,7 +90,10 @@ def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
     Raises FormatError where the format holds but one field, or is not written.
     """
-    _format_of(path).write(path, fields, np.asarray(bounds, np.float64))
+    write = _format_of(path).write
+    if write is None:
+        raise FormatError(path, f"{path.suffix} is read, not written: take {', '.join(WRITTEN)}")
+    write(path, fields, np.asarray(bounds, np.float64))
 
 
 def _format_of(path: Path) -> VolumeFormat:

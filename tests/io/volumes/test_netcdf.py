@@ -116,7 +116,7 @@ def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
 
 def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
     path = tmp_path / "f.nc"
-    with pytest.raises(FormatError, match=r"read, not written: name a \.npz"):
+    with pytest.raises(FormatError, match=r"read, not written: take \.npz"):
         write_field(path, "density", VALUES, BOUNDS)
     assert (
         refusal(written(path, VALUES, "z y x", **plain()))

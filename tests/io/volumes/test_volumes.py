@@ -95,7 +95,7 @@ def test_cells_lie_where_vtk_has_them(tmp_path: Path) -> None:
 
 def test_reading_one_says_what_is_read(tmp_path: Path) -> None:
     (tmp_path / "f.vti").write_text('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaa">]><x/>')
-    assert "written, not read: save the volume as .npz" in refusal(tmp_path / "f.vti")
+    assert "written, not read: save it as .npz" in refusal(tmp_path / "f.vti")
 
 
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
