@@ -4,7 +4,12 @@ Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
 
     phi(d) = (1 - exp(-d)) / d,    psi(d) = phi + phi' = (1 - phi) / d.
 
-Where d is small psi is its series: its closed form is a difference of nearly equal numbers there.
+Of what is emitted on such a step, (e + r (s - 1/2)) at the part s of it, e phi + r d eta leave it,
+and of the mean along it e psi - r eta are its own, with
+
+    eta(d) = (psi - phi / 2) / d.
+
+Where d is small eta is its series: its closed form is a difference of nearly equal numbers there.
 """
 
 from __future__ import annotations
@@ -16,9 +21,9 @@ from torch import Tensor
 
 from ddrecon.numerics.autodiff import is_varied
 
-SERIES_BELOW = 1e-2
-"""Below this depth psi is its series."""
-TERMS = 6
+SERIES_BELOW = 0.1
+"""Below this depth eta is its series."""
+TERMS = 9
 """Of the series: the next one, and its slope, are below rounding."""
 
 
@@ -30,7 +35,8 @@ def decay_mean(depth: Tensor) -> Tensor:
     if not is_varied(depth):
         return phi
     # The second term is 0 and has the slope: so one array is kept, where autograd would keep ten.
-    return phi + (_psi(at, phi) - phi) * (depth - at)
+    psi = 0.5 * phi + at * _eta(at, phi)
+    return phi + (psi - phi) * (depth - at)
 
 
 def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
@@ -43,23 +49,20 @@ def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Te
     return (weight * decay * decay_mean(scale * (end - begin).abs())).sum(0)
 
 
-def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """What reaches the near end of a step from all along it, and what is lost of what enters it.
-
-    The first is the mean over s in [0, 1] of (near + (far - near) s) exp(-depth s), which is far
-    phi + (near - far) psi; the second, the part of what enters at the far end, is 1 - exp(-depth).
-    `depth` [N, C, ...] >= 0; `near` and `far` have its shape, or one of them has one channel.
-    """
+def decay_terms(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """phi, psi and eta of `depth`, >= 0, of any shape."""
     phi = decay_mean(depth)
-    psi = _psi(depth, phi)
-    return far * phi + (near - far) * psi, -torch.expm1(-depth)
+    eta = _eta(depth, phi)
+    return phi, 0.5 * phi + depth * eta, eta
 
 
-def _psi(depth: Tensor, phi: Tensor) -> Tensor:
-    """psi, given `phi`; or as the sum over k of (-`depth`)^k / (k + 2)!."""
-    *others, last = (depth.new_tensor(1 / math.factorial(k + 2)) for k in range(TERMS))
+def _eta(depth: Tensor, phi: Tensor) -> Tensor:
+    """eta, given `phi`; or as the sum over k of (-`depth`)^k (k + 1) / (2 (k + 3)!)."""
+    *others, last = (
+        depth.new_tensor((k + 1) / (2 * math.factorial(k + 3))) for k in range(TERMS)
+    )
     series = last.expand_as(depth)
     for factor in reversed(others):
         series = torch.addcmul(factor, depth, series, value=-1)
     thick = depth.clamp(min=SERIES_BELOW)
-    return torch.where(depth < SERIES_BELOW, series, (1 - phi) / thick)
+    return torch.where(depth < SERIES_BELOW, series, ((1 - phi) / thick - 0.5 * phi) / thick)

@@ -1,14 +1,14 @@
-"""Radiance along one direction through the whole grid, by short characteristics (E2.9).
+"""Radiance along one direction through the whole grid, by finite volumes (E2.9).
 
-w . grad I + kappa_t I = kappa_s q is integrated from slice to slice. The slices lie
-across the axis along which the direction crosses most cells, and are visited in the order that
-light takes. A ray reaches each cell's center from the slice before, where it crossed between
-centers; depth and scattering depth of the step are those of the mean of its ends, and what scatters
-into the ray is linear in depth between them. Radiance is never negative where that is not, and a
-white furnace is exact.
+w . grad I + kappa_t I = E is integrated from slice to slice. The slices lie across the axis along
+which the direction crosses most cells, and are visited in the order that light takes. A ray goes
+through one cell of each slice, with that cell's extinction, and what is emitted along it is linear:
+the cell's mean, and a slope. What leaves a cell goes on to up to four of the next slice. Of each
+cell the mean of I along its ray is kept: so what is emitted and does not leave is found again, to
+rounding, and a white furnace is exact.
 
-All steps are computed at once, but for the recurrence I_k = passed_k I_{k-1} + source_k. In a slab
-of the grid, light comes from one neighbor and leaves for the other.
+All but the recurrence I_out = passed I_in + source is computed at once. In a slab of the grid,
+light comes from one neighbor and leaves for the other.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.decay import decayed_line
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.slabs.slab import Slab, whole_of
 
@@ -73,120 +73,76 @@ class Course:
         along = speed[self.order.index(1 + axis)]
         return (along > 0) - (along < 0)
 
-    def before(self, values: Tensor, is_repeated: bool) -> Tensor:
-        """`values` where rays were one slice earlier.
-
-        Beyond the faces of the box they are those at the face where they `is_repeated`, else zero.
-        """
-        for dim, drift in ((COLUMNS, self.drift[1]), (ROWS, self.drift[0]), (SLICES, self.forward)):
-            values = _interpolate_upstream(values, dim, drift, is_repeated)
-        return values
-
 
 def radiance_along(
     medium: Medium,
-    scatters: Tensor,
+    emitted: Tensor,
+    rise: Tensor,
     inflow: Tensor | None,
     direction: Direction,
     entering: Tensor | None = None,
-) -> Tensor:
-    """I [C, z, y, x] at cell centers along `direction`, of what `scatters` into it (E2.9).
+) -> tuple[Tensor, Tensor]:
+    """I along `direction` (E2.9): its mean in each cell, and what leaves it [C, z, y, x].
 
-    `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
-    `medium` adds (1 - f) kappa_s a unit length; `inflow` [C, 1, 1, 1]: the radiance that enters the
-    box, None for none. In a slab it is I in its own cells; `entering` is the layer of I before
-    these, less the `inflow`, as the neighbor has it.
+    `direction`: the unit vector of travel (array order); `emitted` [C, z, y, x]: E, a unit length;
+    `rise`: its slope along the ray, a unit length;
+    `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, of which what leaves is
+    counted from. In a slab both are those of its own cells; `entering` is what leaves the layer
+    before these, as the neighbor has it.
     """
     grid = medium.grid
     course = Course.of(whole_of(grid), direction)
-    passed, source = step_along(medium, scatters, inflow, course)
-    if not isinstance(grid, Slab):
-        gained = course.lift(follow(passed, source, course))
-        return gained if inflow is None else gained + inflow
-    dim, way = course.order.index(1 + grid.axis), course.way_along(grid.axis)
-    passed, source = (part.narrow(dim, grid.halo[0], grid.size) for part in (passed, source))
-    if way and entering is not None:
-        # One layer more, of which nothing passes and to which is added what is there.
-        layer = course.lay(entering)
-        more = torch.zeros_like(layer[:, : passed.shape[1]]), layer
-        passed, source = (
-            torch.cat([first, own][::way], dim)
-            for first, own in zip(more, (passed, source), strict=True)
-        )
-    found = follow(passed, source, course).narrow(dim, int(way > 0), grid.size)
-    return course.lift(found) if inflow is None else course.lift(found) + inflow
-
-
-def step_along(
-    medium: Medium, scatters: Tensor, inflow: Tensor | None, course: Course
-) -> tuple[Tensor, Tensor]:
-    """The part of I that a step to each cell lets pass, and what it adds, laid out for `course`.
-
-    As `radiance_along` has them. With an `inflow`, I is what there is more than that.
-    """
-    scatters = course.lay(scatters)
-    # over the step to each cell: the depth int kappa_t ds, and int (1 - f) kappa_s ds
-    mass = _step_integral(medium.extinction, course)
-    scattering_mass = (
-        mass
-        if medium.remaining.field is medium.extinction.field
-        else _step_integral(medium.remaining, course)
-    )
-    depth = mass * _scale(medium.extinction)
-    # what scatters along the step and reaches its end, and the part of I that is lost on it
-    line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
-    source = line * (scattering_mass * _scale(medium.remaining))
+    depth = course.lay(medium.extinction.value * course.step)
+    e, r = course.lay(emitted * course.step), course.lay(rise * course.step**2)
+    phi, psi, eta = decay_terms(depth)
+    passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
     if inflow is not None:
         # Light from outside is there without a medium. The rest, I - inflow, is zero where rays
-        # enter and loses inflow * lost on every step: a white furnace stays exact.
-        source = source - inflow.view(1, -1, 1, 1) * lost
-    return 1 - lost, source
+        # enter and loses inflow * lost on every way: a white furnace stays exact.
+        outside = inflow.view(1, -1, 1, 1)
+        source = source - outside * -torch.expm1(-depth)
+        own = own - outside * (1 - phi)
+    passed, source, own, phi = torch.broadcast_tensors(passed, source, own, phi)
+    way = 0
+    if isinstance(grid, Slab):
+        dim, way = course.order.index(1 + grid.axis), course.way_along(grid.axis)
+        passed, source, own, phi = (
+            part.narrow(dim, grid.halo[0], grid.size) for part in (passed, source, own, phi)
+        )
+        if way and entering is not None:
+            # One layer more, of which nothing passes and to which is added what is there.
+            layer = course.lay(entering)
+            more = torch.zeros_like(layer), layer
+            passed, source = (
+                torch.cat([first, part][::way], dim)
+                for first, part in zip(more, (passed, source), strict=True)
+            )
+    arriving, leaving = follow(passed, source, course)
+    if way and entering is not None:
+        arriving, leaving = (
+            part.narrow(dim, int(way > 0), grid.size) for part in (arriving, leaving)
+        )
+    found = course.lift(torch.addcmul(own, arriving, phi))
+    return found if inflow is None else found + inflow, course.lift(leaving)
 
 
-def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-    """I_k = `passed`_k (I_{k-1} where rays were then) + `source`_k, slice after slice.
+def follow(passed: Tensor, source: Tensor, course: Course) -> tuple[Tensor, Tensor]:
+    """I_in, where rays enter a slice, and I_out = `passed` I_in + `source`, slice after slice.
 
     `[slices, C, rows, columns]`; I is zero before the first slice and beyond the faces of the box.
-    `passed` may have one channel where `source` has C.
     """
     rows, columns = course.drift
     # A row and a column of zeros where light comes from.
     zeros = int(columns > 0), int(columns < 0), int(rows > 0), int(rows < 0)
-    radiance, arriving = [], torch.zeros_like(source[0])
+    entered, left, arriving = [], [], torch.zeros_like(source[0])
     for share, more in list(zip(passed.unbind(), source.unbind(), strict=True))[:: course.forward]:
-        radiance.append(torch.addcmul(more, share, arriving))
-        arriving = pad(radiance[-1], zeros)
+        entered.append(arriving)
+        left.append(torch.addcmul(more, share, arriving))
+        arriving = pad(left[-1], zeros)
         for dim, drift in ((1, rows), (2, columns)):
             if drift:
                 low, high = (arriving.narrow(dim, i, more.shape[dim]) for i in (0, 1))
                 here, behind = (high, low) if drift > 0 else (low, high)
                 arriving = torch.lerp(here, behind, abs(drift))
-    return torch.stack(radiance[:: course.forward])
-
-
-def _step_integral(coefficient: Coefficient, course: Course) -> Tensor:
-    """The integral of the coefficient's field over the step to each cell, as a trapezoid.
-
-    There is no medium beyond the box.
-    """
-    field = course.lay(coefficient.field)
-    return (field + course.before(field, is_repeated=False)) * (0.5 * course.step)
-
-
-def _scale(coefficient: Coefficient) -> Tensor:
-    return coefficient.scale.view(1, -1, 1, 1)
-
-
-def _interpolate_upstream(values: Tensor, dim: int, drift: float, is_repeated: bool) -> Tensor:
-    """`values` at the place `drift` cells, at most one, before each along `dim`.
-
-    They are linear between cells; beyond the last one as in `Course.before`.
-    """
-    if drift == 0:
-        return values
-    edge = values.narrow(dim, 0 if drift > 0 else values.shape[dim] - 1, 1)
-    edge = edge if is_repeated else torch.zeros_like(edge)
-    longer = torch.cat([edge, values] if drift > 0 else [values, edge], dim)
-    lower, upper = (longer.narrow(dim, start, values.shape[dim]) for start in (0, 1))
-    behind, here = (lower, upper) if drift > 0 else (upper, lower)
-    return behind if abs(drift) == 1 else torch.lerp(here, behind, abs(drift))
+    arriving, leaving = (torch.stack(each[:: course.forward]) for each in (entered, left))
+    return arriving, leaving

@@ -36,7 +36,9 @@ Of two moments 26 give no better images than 18; 14, along axes and corners of a
 """
 
 
-def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) -> Tensor:
+def sweep(
+    medium: Medium, source: Tensor, slope: Tensor, inflow: Tensor | None, degree: int
+) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `inflow`: light from
@@ -60,12 +62,12 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
         def follow() -> Tensor:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            return radiance_along(medium, scatters, inflow, directions[number], entering)
+            rise = torch.tensordot(slope.new_tensor(directions[number]), slope, 1)
+            return radiance_along(medium, scatters, rise, inflow, directions[number], entering)
 
-        radiance = recompute(follow)
+        radiance, leaving = recompute(follow)
         moments.addr_(weights[number] * row, radiance.flatten())
-        leaving = radiance.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
-        return leaving if inflow is None else leaving - inflow
+        return leaving.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
 
     rest = _pass_on(ways, nothing, add)
     found = moments.view(count, colors, *shape)
@@ -117,7 +119,7 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    if is_fused() and has_kernels("transport rounds", *where):
+    if False and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
@@ -126,8 +128,37 @@ def sweep_change(
             factors = torch.zeros_like(factors[..., :1, :1, :1])
         return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    swept = Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
+    emitted = scatters * medium.remaining_scattering
+    slope = recompute(emission_slope, medium, scatters[0])
+    swept = Moments.of_harmonics(sweep(medium, emitted, slope, inflow, degree))
     return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
+
+
+def emission_slope(medium: Medium, scatters: Tensor) -> Tensor:
+    """kappa_s grad q of the isotropic part q = `scatters` of what scatters, [3, C, z, y, x].
+
+    Of the differences to both neighbors along an axis each counts by the neighbor's share of the
+    depth of both: at the edge of a medium only that within it does.
+    """
+    slopes = []
+    for axis, spacing in zip((-3, -2, -1), medium.grid.spacing, strict=True):
+        n = scatters.shape[axis]
+        depth = medium.extinction.value * spacing
+        size = depth.narrow(axis, 0, n - 1), depth.narrow(axis, 1, n - 1)
+        total = size[0] + size[1] + THIN
+        rise = scatters.diff(dim=axis) / spacing
+        zero = torch.zeros_like((rise * total).narrow(axis, 0, 1)) if n > 1 else torch.zeros_like(scatters + depth)
+        up, down = size[1] / total, size[0] / total
+        if n == 1:
+            slopes.append(zero)
+            continue
+        shares = torch.cat([up, zero], axis) + torch.cat([zero, down], axis)
+        found = torch.cat([up * rise, zero], axis) + torch.cat([zero, down * rise], axis)
+        slopes.append(found * shares / (shares**2 + EDGE))
+    return torch.stack(slopes) * medium.remaining_scattering
+
+
+THIN, EDGE = 1e-3, 2.5e-3
 
 
 @functools.cache

@@ -29,6 +29,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
+OPT = {'half': 0.7, 'smooth': True}
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
 
@@ -82,7 +83,7 @@ def _round(
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(medium, light, problem.source, inflow, degree)
+    change = sweep_change(_averaged(medium), light, problem.source, inflow, degree)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:
@@ -98,6 +99,26 @@ def _round(
     return _blend(medium, light, new, change.higher, factor, degree)
 
 
+def _averaged(medium: Medium) -> Medium:
+    if not OPT['smooth']:
+        return medium
+    done = {}
+
+    def average(one):
+        f = one.field
+        if id(f) not in done:
+            g = f
+            for ax in (-1, -2, -3):
+                n = g.shape[ax]
+                lo = torch.cat([g.narrow(ax, 0, 1), g.narrow(ax, 0, n - 1)], ax)
+                hi = torch.cat([g.narrow(ax, 1, n - 1), g.narrow(ax, n - 1, 1)], ax)
+                g = 0.75 * g + 0.125 * (lo + hi)
+            done[id(f)] = g
+        return replace(one, field=done[id(f)])
+
+    return replace(medium, extinction=average(medium.extinction), remaining=average(medium.remaining))
+
+
 def _blend(
     medium: Medium, light: Moments, new: Moments, swept: Tensor, factor: Tensor, degree: int
 ) -> Moments:
@@ -105,13 +126,12 @@ def _blend(
 
     That is what is `new`, and theta times what was `swept` of higher degree.
     """
-    if is_fused() and not medium.is_cellwise:
+    if False:
         from ddrecon.diffusion.rounds.fused.gain import blend_fused
 
         length = _share_length(medium, degree)
         return blend_fused(medium, light, new, swept, factor, length)
-    share = recompute(_transport_share, medium, degree)
-    new = replace(new, higher=share * swept)
+    new = replace(new, higher=swept)
     change = new.plus(light.scaled(-1.0, -1.0, -1.0))
     return light.plus(change.scaled(factor, factor, factor))
 
@@ -150,18 +170,18 @@ def _gain(
     much the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
     L1 - 3 F(L0), None for zero.
     """
-    if is_fused() and not medium.is_cellwise:
+    if False:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
         return gain_fused(medium, change, off, cosine, _share_length(medium, degree))
     share = recompute(_transport_share, medium, degree)
-    flux = change.flux if off is None else add_vectors(change.flux, off.flux)
-    gain = Moments(change.mean, flux).scaled(share, share)
+    gain = Moments(change.mean, change.flux).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
-    source = source if off is None else source - share * off.mean
+    source = source if off is None else source - off.mean
     if change.flux is None:
         return gain, source, None
-    z, y, x = (share * cosine * along for along in change.flux)
+    z, y, x = (cosine * along for along in gain.flux)
+    if off is not None: gain = Moments(gain.mean, add_vectors(gain.flux, off.flux))
     return gain, source, (z, y, x)
 
 
@@ -190,9 +210,11 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
     # 1e-6, theta is 1 already
-    half_depth = (0.5 * _share_length(medium, degree) * medium.extinction.value).clamp(min=1e-3)
+    length = _mean_step(whole_of(medium.grid), degree)
+    half_depth = (0.5 * length * medium.extinction.value).clamp(min=1e-3)
     rho = half_depth / torch.tanh(half_depth) - 1
-    return 1 / (1 + rho**2)
+    tr = medium.transport_extinction / medium.extinction.value.clamp(min=1e-20)
+    return 1 / (1 + OPT['half'] * rho * tr)
 
 
 def _share_length(medium: Medium, degree: int) -> Tensor:
