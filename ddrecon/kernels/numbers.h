@@ -65,16 +65,19 @@ template <class F> constexpr F KINK = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23
 
 template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
 template <> inline constexpr double FACTORIAL<0> = 1.0;
-// Coefficients of exp(x), of psi(-x), of its slope psi'(-x), and of log((1 + s) / (1 - s)) / (2 s)
-// in s^2.
+// Coefficients of exp(x), of psi(-x), of eta(-x), of its slope eta'(-x), and of
+// log((1 + s) / (1 - s)) / (2 s) in s^2.
 template <int K> struct OfExp {
     static constexpr double value = 1.0 / FACTORIAL<K>;
 };
 template <int K> struct OfPsi {
     static constexpr double value = 1.0 / FACTORIAL<K + 2>;
 };
-template <int K> struct OfPsiSlope {
-    static constexpr double value = -(K + 1) / FACTORIAL<K + 3>;
+template <int K> struct OfEta {
+    static constexpr double value = (K + 1) / (2 * FACTORIAL<K + 3>);
+};
+template <int K> struct OfEtaSlope {
+    static constexpr double value = -(K + 1) * (K + 2) / (2 * FACTORIAL<K + 4>);
 };
 template <int K> struct OfLog {
     static constexpr double value = 1.0 / (2 * K + 1);
@@ -119,12 +122,16 @@ template <class F> INLINE F root(F x) {
 #endif
 }
 
-// psi(d) = (1 - phi) / d with phi = (1 - exp(-d)) / d, for d from 0 to 1/2; and its derivative.
+// psi, eta (`numerics/decay.py`) and its derivative, for depths from 0 to 1/2; that of psi is -2
+// eta.
 template <class F> INLINE F psi_series(F depth) {
     return series<OfPsi, F, Format<F>::terms>(-depth);
 }
-template <class F> INLINE F psi_slope_series(F depth) {
-    return series<OfPsiSlope, F, Format<F>::terms>(-depth);
+template <class F> INLINE F eta_series(F depth) {
+    return series<OfEta, F, Format<F>::terms>(-depth);
+}
+template <class F> INLINE F eta_slope_series(F depth) {
+    return series<OfEtaSlope, F, Format<F>::terms>(-depth);
 }
 
 // phi and psi (`numerics/decay.py`) of a depth of at least 0.

@@ -37,7 +37,7 @@ Of two moments 26 give no better images than 18; 14, along axes and corners of a
 
 
 def sweep(
-    medium: Medium, source: Tensor, slope: Tensor, inflow: Tensor | None, degree: int
+    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, degree: int
 ) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
@@ -62,7 +62,8 @@ def sweep(
         def follow() -> Tensor:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            rise = torch.tensordot(slope.new_tensor(directions[number]), slope, 1)
+            rise = torch.tensordot(gradient.new_tensor(directions[number]), gradient, 1)
+            rise = rise * medium.remaining_scattering
             return radiance_along(medium, scatters, rise, inflow, directions[number], entering)
 
         radiance, leaving = recompute(follow)
@@ -118,44 +119,42 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
+    gradient = recompute(gradient_within, medium, light.mean + source.mean)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    if False and has_kernels("transport rounds", *where):
+    if is_fused() and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
             # the kernels' factors are the same everywhere: what scatters is summed before
             source = light.weighted(factors).plus(source)
             factors = torch.zeros_like(factors[..., :1, :1, :1])
-        return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
+        return sweep_fused(medium, light, factors, source, gradient, inflow, DIRECTIONS[degree])
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
     emitted = scatters * medium.remaining_scattering
-    slope = recompute(emission_slope, medium, scatters[0])
-    swept = Moments.of_harmonics(sweep(medium, emitted, slope, inflow, degree))
+    swept = Moments.of_harmonics(sweep(medium, emitted, gradient, inflow, degree))
     return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
 
 
-def emission_slope(medium: Medium, scatters: Tensor) -> Tensor:
-    """kappa_s grad q of the isotropic part q = `scatters` of what scatters, [3, C, z, y, x].
+def gradient_within(medium: Medium, q: Tensor) -> Tensor:
+    """The gradient of `q` [C, z, y, x] as cells of `medium` have it, [3, C, z, y, x] (E2.9).
 
     Of the differences to both neighbors along an axis each counts by the neighbor's share of the
-    depth of both: at the edge of a medium only that within it does.
+    depth of both cells: at the edge of a medium only the one within it does.
     """
-    slopes = []
+    found = []
     for axis, spacing in zip((-3, -2, -1), medium.grid.spacing, strict=True):
-        n = scatters.shape[axis]
-        depth = medium.extinction.value * spacing
-        size = depth.narrow(axis, 0, n - 1), depth.narrow(axis, 1, n - 1)
-        total = size[0] + size[1] + THIN
-        rise = scatters.diff(dim=axis) / spacing
-        zero = torch.zeros_like((rise * total).narrow(axis, 0, 1)) if n > 1 else torch.zeros_like(scatters + depth)
-        up, down = size[1] / total, size[0] / total
-        if n == 1:
-            slopes.append(zero)
-            continue
-        shares = torch.cat([up, zero], axis) + torch.cat([zero, down], axis)
-        found = torch.cat([up * rise, zero], axis) + torch.cat([zero, down * rise], axis)
-        slopes.append(found * shares / (shares**2 + EDGE))
-    return torch.stack(slopes) * medium.remaining_scattering
+        count, depth = q.shape[axis], spacing * medium.extinction.value
+        low, high = depth.narrow(axis, 0, count - 1), depth.narrow(axis, 1, count - 1)
+        inverse = 1 / (low + high + THIN)
+        # shares of the neighbors above and below, none beyond the box
+        none = torch.zeros_like(depth.narrow(axis, 0, 1))
+        above, below = torch.cat([high * inverse, none], axis), torch.cat([none, low * inverse], axis)
+        both = above + below
+        factor = both / ((both**2 + EDGE) * spacing)
+        rise = torch.nn.functional.pad(q.diff(dim=axis), [1 if a == -axis - 1 else 0 for a in range(3) for _ in range(2)])
+        up, down = rise.narrow(axis, 1, count), rise.narrow(axis, 0, count)
+        found.append(factor * (above * up + below * down))
+    return torch.stack(found)
 
 
 THIN, EDGE = 1e-3, 2.5e-3

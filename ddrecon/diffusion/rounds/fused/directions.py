@@ -25,7 +25,7 @@ from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 POINTS = 4
-"""Cells at most where a step begins."""
+"""Cells at most that light comes from."""
 MOST_OF_FEW, MOST, FEW = 9, 16, 4
 """Directions at most in a chunk: of FEW moments, and of many.
 
@@ -41,16 +41,16 @@ Fewer fit into a cache, but more is saved before them.
 def piece_numbers(shape: tuple[int, int, int], colors: int, moments: int) -> int:
     """Numbers, at most, that a piece of directions has of its own.
 
-    Those of moments and of two fields' cotangents, and lines of its lanes.
+    Those of moments, of gradients' and of two fields' cotangents, and lines of its lanes.
     """
     depth, height, width = shape
     lines = 2 * MOST * (SLABS[1] + 1) * height * width
-    return colors * (depth * height * width * (moments + 2) + 2 * lines)
+    return colors * (depth * height * width * (moments + 5) + 2 * lines)
 
 
 @dataclass(frozen=True)
 class Step:
-    """The step to a cell along a direction: from a mean of up to four cells, of given `weights`.
+    """The `length` [u] of a way through a cell, to which light comes from up to four, of `weights`.
 
     Each of `points` tells how many cells it lies before the cell along z, y and x, none or one, of
     light with the `signs`. Where `is_along` the first lies in the same row: a recurrence in x.
@@ -58,7 +58,7 @@ class Step:
 
     direction: Direction
     weight: float
-    half: float
+    length: float
     signs: tuple[int, ...]
     points: tuple[tuple[int, ...], ...]
     weights: tuple[float, ...]
@@ -66,14 +66,14 @@ class Step:
 
     @staticmethod
     def of(grid: Grid, direction: Direction, weight: float) -> Step:
-        """The step of a `direction` of the quadrature through `grid`, half of it [u] (E2.9)."""
+        """The step of a `direction` of the quadrature through `grid` (E2.9)."""
         course = Course.of(grid, direction)
         axis = course.order[0] - 1
         moved = [0.0, 0.0, 0.0]
         moved[axis] = float(course.forward)
         for drift, dim in zip(course.drift, course.order[2:], strict=True):
             moved[dim - 1] = drift
-        # The cells around where light was, first that on the row itself where it goes along x.
+        # The cells that light comes from, first that on the row itself where it goes along x.
         found: dict[tuple[int, ...], float] = {}
         for point in product(*((1,) if i == axis else (0, 1) for i in range(3))):
             part = math.prod(abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
@@ -82,7 +82,7 @@ class Step:
         signs = tuple((m > 0) - (m < 0) for m in moved)
         is_along = axis == 2 and (0, 0, 1) in found
         points, weights = tuple(found), tuple(found.values())
-        return Step(direction, weight, 0.5 * course.step, signs, points, weights, is_along)
+        return Step(direction, weight, course.step, signs, points, weights, is_along)
 
     def course(self) -> list[int]:
         """The struct `Course` of kernels."""
@@ -90,8 +90,9 @@ class Step:
         return [self.signs[2], self.is_along, len(self.points), *chain(*points)]
 
     def parts(self) -> list[float]:
-        """The struct `Parts`: half the step and the weights."""
-        return [self.half, *self.weights, *[0.0] * (POINTS - len(self.points))]
+        """The struct `Parts` of kernels."""
+        along = [self.length * component for component in self.direction]
+        return [self.length, *along, *self.weights, *[0.0] * (POINTS - len(self.points))]
 
 
 Unit = list[Step]

@@ -4,14 +4,14 @@
 
 namespace ddrecon {
 
-// A direction: its way along x, and the cells where its steps begin, of which the first may be
-// `along` the row. Each point tells how many cells it lies before the step's end, none or one.
+// A direction: its way along x, and the cells from which light comes to a cell, of which the first
+// may be `along` the row. Each point tells how many cells it lies before that cell, none or one.
 struct Course {
     int x_way, is_along, count, points[4][3];
 };
-// Half of its step [u], and what each point counts in the mean.
+// Its step [u], that along z, y, x, and what each point counts in the mean.
 template <class F> struct Parts {
-    F half, part[4];
+    F step, along[3], part[4];
 };
 
 // Directions that go through the rows together: the way in y, which of all directions they are,
@@ -24,15 +24,15 @@ struct Group {
 // lie behind them. A launch does some colors `together`, a chunk of the directions of each piece,
 // and one `half` of the slices; what is found `adds` to what others have.
 template <class F> struct Sweep {
-    const F *factors, *beam_factors, *scales, *extinction, *scattering, *densest;
+    const F *factors, *beam_factors, *scales, *extinction, *scattering, *gradient, *densest;
     const F *light_parts[5], *source_parts[5], *bars[5];
-    const F *d_factors, *d_scales, *d_light_parts[5], *d_source_parts[5];
+    const F *d_factors, *d_scales, *d_gradient, *d_light_parts[5], *d_source_parts[5];
     const F *parts, *matrices;
     const int *groups, *courses, *pairs, *order, *ranges, *chunks;
     int depth, height, width, pitch, margin, colors, most, slab, slabs, directions;
     int extinction_channels, scattering_channels, scratch_rows, pieces, chunk_count;
     int together, color_from, chunk, half, adds;
-    F *found, *saved, *lines, *scratch, *returning, *e_bar, *sc_bar;
+    F *found, *saved, *lines, *scratch, *returning, *e_bar, *sc_bar, *gradient_bar;
     double* sums;
 };
 

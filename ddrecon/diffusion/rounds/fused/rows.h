@@ -3,16 +3,17 @@
 // Rows of cells along which radiance is followed (E2.9, E2.10).
 //
 // A lane goes through the slices across z in the way that its light takes, s counting them, and in
-// each through the rows, t counting them in the way of a group of directions. A step begins at a
-// mean of up to four cells, which lie in this slice or the one before, in this row or the one
-// before: wherever a direction goes, they were done already. Of a row and a direction there are two
-// lines of numbers: NEAR, what scatters along it, and LIGHT, I less the light from outside; of
-// tangents their changes as well. Lines of the last slice are kept, each in the place of one that
-// no step needs any more. I before each slab of slices is saved: for the adjoint, light goes
-// through a slab once more, and lines of all its slices are kept.
+// each through the rows, t counting them in the way of a group of directions. Light comes to a cell
+// from up to four, which lie in this slice or the one before, in this row or the one before:
+// wherever a direction goes, they were done already. Of a row and a direction there are two lines
+// of numbers: OWN, what scatters along it, which becomes the mean of I in each cell, and LIGHT, I
+// where it leaves cells, both less the light from outside; of tangents their changes as well. Lines
+// of the last slice are kept, each in the place of one that no cell needs any more. I before each
+// slab of slices is saved: for the adjoint, light goes through a slab once more, and lines of all
+// its slices are kept, OWN as what scatters.
 //
-// Behind each row there are at least two cells that hold what is beyond its ends. Where a step
-// meets no medium, light is only moved: that is decided for stretches of a row.
+// Behind each row there are at least two cells that hold what is beyond its ends. Where there is no
+// medium, light is only moved: that is decided for stretches of a row.
 
 namespace ddrecon {
 
@@ -21,42 +22,37 @@ namespace ddrecon {
 template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Rows {
     static constexpr bool IS_CHANGED = sizeof(N) > sizeof(F);
     static constexpr int COUNT = Order<DEGREE>::COUNT, LINES = IS_CHANGED ? 4 : 2;
-    enum { NEAR, LIGHT };
+    enum { OWN, LIGHT };
 
-    // A row of cells where a step's end lies: its slice and its turn, where it is among cells and
-    // in fields that have a layer around them, and where steps to it meet a medium.
+    // A row of cells: its slice and its turn, where it is among cells, which of them have matter,
+    // and the depth of a unit length in the densest.
     struct Here {
         int s, t, from, to;
-        long long at, row;
+        long long at;
         F deepest;
-        const int* range;
     };
-    // Lines where steps to a row may begin, of the group's first direction: in this slice or the
-    // one before, in this row or the one before. Beyond the faces of the box are neither medium nor
-    // I; q is repeated there.
-    struct Beginnings {
-        Line<N> near[4], light[4];
+    // Lines where light comes from to a row, of the group's first direction: in this slice or the
+    // one before, in this row or the one before. Beyond the faces of the box there is no I.
+    struct Before {
+        Line<N> light[4];
         bool is_inside[4];
-        long long back[4];
     };
-    // What steps to a row along a direction begin with, and what they meet at their ends.
-    template <int POINTS> struct Steps {
-        Line<N> near, e, sc, near_from[POINTS], light_from[POINTS], e_from[POINTS], sc_from[POINTS];
-        F half, part[POINTS];
-        INLINE N mass(int c) const { return half * (e[c] + gather<POINTS>(e_from, part, c)); }
-        INLINE N scattering_mass(int c) const {
-            if constexpr (SHARES_FIELD)
-                return mass(c);
-            else
-                return half * (sc[c] + gather<POINTS>(sc_from, part, c));
+    // Cells of a row and a direction: what scatters along it, of all directions how much more at
+    // the next cell along z, y and x, fields, and what comes from the cells before.
+    template <int POINTS> struct Ways {
+        Line<N> own, gradient[3], e, sc, from[POINTS];
+        F step, along[3], part[POINTS];
+        INLINE N rise(int c) const {
+            return along[0] * gradient[0][c] + along[1] * gradient[1][c] +
+                   along[2] * gradient[2][c];
         }
     };
 
     const Sweep<F>& of;
     const Job& job;
-    const long long plane, cells, all, sheet, padded, stride;
+    const long long plane, cells, all, stride;
     F *const scratch, *const empty, *const lines;
-    const Line<N> e_cells, sc_cells;
+    const Line<N> e_cells, sc_cells, gradients;
     N scale, strength, inflow;
     int slice_from = 0;
     const Group* group = nullptr;
@@ -68,8 +64,6 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
           plane((long long)of.height * of.width),
           cells(of.depth * plane),
           all(of.colors * cells),
-          sheet((of.height + 2LL) * of.pitch),
-          padded((of.depth + 2) * sheet),
           stride((long long)LINES * of.most * of.pitch),
           scratch(of.scratch + (long long)job.lane * of.scratch_rows * of.pitch),
           empty(scratch + of.margin),
@@ -80,13 +74,14 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
               of.margin),
           e_cells(field(of.extinction, of.extinction_channels)),
           sc_cells(field(of.scattering, of.scattering_channels)),
+          gradients(line_at<N>(of.gradient + job.color * cells, of.d_gradient - of.gradient)),
           scale(number(0)),
           strength(number(1)),
           inflow(number(2)) {}
 
     INLINE Line<N> field(const F* of_all, int channels) const {
-        const long long own = channels > 1 ? job.color * padded : 0;
-        return line_at<N>(of_all + of.margin + sheet + of.pitch + own, channels * padded);
+        const long long own = channels > 1 ? job.color * cells : 0;
+        return line_at<N>(of_all + own, channels * cells);
     }
     INLINE N number(int which) const {
         const int at = which * of.colors + job.color;
@@ -126,26 +121,17 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     }
     INLINE Here place(int s, int t) const {
         const int k = job.way > 0 ? s : of.depth - 1 - s;
-        const int r = group->y_way > 0 ? t : of.height - 1 - t;
-        const int* range = of.ranges + 4 * (k * of.height + r);
+        const int r = group->y_way > 0 ? t : of.height - 1 - t, row = k * of.height + r;
+        const int* range = of.ranges + 2 * row;
         return {
-            s,
-            t,
-            range[0],
-            range[1],
-            k * plane + (long long)r * of.width,
-            k * sheet + (long long)r * of.pitch,
-            value_of(scale) * of.densest[k * of.height + r],
-            range};
+            s, t, range[0], range[1], row * (long long)of.width, value_of(scale) * of.densest[row]};
     }
-    INLINE Beginnings find_beginnings(const Here& here) const {
-        Beginnings found;
+    INLINE Before find_before(const Here& here) const {
+        Before found;
         for (int i = 0; i < 4; ++i) {
             const int s = here.s - i / 2, t = here.t - i % 2;
             found.is_inside[i] = s >= 0 && t >= 0;
-            found.near[i] = line(s < 0 ? 0 : s, t < 0 ? 0 : t, NEAR, group->before);
             if (found.is_inside[i]) found.light[i] = line(s, t, LIGHT, group->before);
-            found.back[i] = i / 2 * job.way * sheet + i % 2 * group->y_way * of.pitch;
         }
         return found;
     }
@@ -153,25 +139,27 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         return ((const Course*)of.courses)[group->begin + j];
     }
     template <int POINTS>
-    INLINE Steps<POINTS> find_steps(const Here& here, const Beginnings& begin, int j) const {
-        Steps<POINTS> found;
+    INLINE Ways<POINTS> find_ways(const Here& here, const Before& before, int j) const {
+        Ways<POINTS> found;
         const Course& own = course(j);
         const Parts<F>& parts = ((const Parts<F>*)of.parts)[group->begin + j];
-        const long long own_line = (long long)LINES * j * of.pitch;
-        found.half = parts.half;
-        found.near = line(here.s, here.t, NEAR, group->before + j);
-        found.e = e_cells + here.row;
-        found.sc = sc_cells + here.row;
+        found.step = parts.step;
+        found.own = line(here.s, here.t, OWN, group->before + j);
+        found.e = e_cells + here.at;
+        found.sc = sc_cells + here.at;
+        UNROLLED
+        for (int a = 0; a < 3; ++a) {
+            found.along[a] = parts.along[a];
+            found.gradient[a] = gradients + (a * all + here.at);
+        }
         UNROLLED
         for (int i = 0; i < POINTS; ++i) {
             const int *point = own.points[i], place = 2 * point[0] + point[1];
-            const int shift = point[2] * own.x_way;
+            const long long shift = point[2] * own.x_way;
             found.part[i] = parts.part[i];
-            found.near_from[i] = begin.near[place] + (own_line - shift);
-            found.light_from[i] = begin.is_inside[place] ? begin.light[place] + (own_line - shift)
-                                                         : nothing() + -shift;
-            found.e_from[i] = found.e + (-begin.back[place] - shift);
-            found.sc_from[i] = found.sc + (-begin.back[place] - shift);
+            found.from[i] = before.is_inside[place]
+                                ? before.light[place] + ((long long)LINES * j * of.pitch - shift)
+                                : nothing() + -shift;
         }
         return found;
     }
@@ -192,9 +180,9 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             sums.by[i][0] = of.factors[own];
             sums.by[i][1] = of.beam_factors ? of.beam_factors[own] : F(1);
         }
-        const Line<N> near = line(here.s, here.t, NEAR, group->before);
+        const Line<N> own = line(here.s, here.t, OWN, group->before);
         const long long apart = (long long)LINES * of.pitch;
-        to_directions<DEGREE>(matrices[0], sums, pairs_at(near.at, apart), ahead, from, to);
+        to_directions<DEGREE>(matrices[0], sums, pairs_at(own.at, apart), ahead, from, to);
         if constexpr (IS_CHANGED) {
             Sums<F, COUNT, 3> changes;
             for (int i = 0; i < COUNT; ++i) {
@@ -206,7 +194,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                     changes.by[i][n] = by[n];
                 }
             }
-            const Pairs<F> pairs = pairs_at(near.change, apart);
+            const Pairs<F> pairs = pairs_at(own.change, apart);
             to_directions<DEGREE>(matrices[0], changes, pairs, ahead, from, to);
         }
     }
@@ -219,8 +207,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                 enter_group(g);
                 for (int t = 0; t < of.height; ++t) {
                     const Here here = place(s, t);
-                    find_scattering(
-                        here, KEEPS ? 0 : here.range[2], KEEPS ? of.width : here.range[3]);
+                    find_scattering(here, KEEPS ? 0 : here.from, KEEPS ? of.width : here.to);
                     follow_row(here);
                     if constexpr (!KEEPS) add_moments(here, of.adds || g > job.group_from);
                 }
@@ -228,26 +215,21 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     }
     INLINE void follow_row(const Here& here) const {
         const int width = of.width;
-        const Beginnings begin = find_beginnings(here);
+        const Before before = find_before(here);
         for (int j = 0; j < group->members; ++j) {
             const Course& own = course(j);
-            const Line<N> near = line(here.s, here.t, NEAR, group->before + j);
             const Line<N> light = line(here.s, here.t, LIGHT, group->before + j);
             light.put(-1, N(F(0)));
             light.put(width, N(F(0)));
-            if (own.x_way > 0)
-                near.put(-1, near[0]);
-            else
-                near.put(width, near[width - 1]);
             if (KEEPS && here.s < slice_from) {
                 const F* row = saved_row(here.s + 1, here.t, group->begin + j);
                 for (int c = 0; c < width; ++c) light.at[c] = row[c];
                 continue;
             }
             if (own.count == 1)
-                follow_direction<1>(here, begin, light, j);
+                follow_direction<1>(here, before, light, j);
             else
-                follow_direction<4>(here, begin, light, j);
+                follow_direction<4>(here, before, light, j);
             if (!KEEPS && of.saved && here.s + 1 < of.depth && slab_of(here.s + 1) == here.s + 1) {
                 F* row = saved_row(here.s + 1, here.t, group->begin + j);
                 for (int c = 0; c < width; ++c) row[c] = light.at[c];
@@ -255,19 +237,20 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         }
     }
     template <int POINTS> INLINE void follow_direction(
-        const Here& here, const Beginnings& begin, const Line<N>& light, int j) const {
-        Steps<POINTS> steps = find_steps<POINTS>(here, begin, j);
+        const Here& here, const Before& before, const Line<N>& light, int j) const {
+        Ways<POINTS> ways = find_ways<POINTS>(here, before, j);
         const Course& own = course(j);
         if (!own.is_along) {
-            follow_steps<false>(here, steps, light);
+            follow_ways<false>(here, ways, light);
             return;
         }
         // What comes along the row itself is carried on cell by cell.
         UNROLLED
         for (int i = 0; i < POINTS; ++i)
-            if (!own.points[i][0] && !own.points[i][1]) steps.light_from[i] = nothing();
-        follow_steps<true>(here, steps, light);
+            if (!own.points[i][0] && !own.points[i][1]) ways.from[i] = nothing();
+        follow_ways<true>(here, ways, light);
         const Line<N> carried = line_at<N>(scratch_row(0), of.pitch);
+        const Line<N> within = line_at<N>(scratch_row(2), of.pitch);
         const int way = own.x_way, width = of.width;
         carry_on(light.at, carried.at, way, width);
         if constexpr (IS_CHANGED) {
@@ -276,43 +259,52 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                 light.change[c] += carried.change[c] * light.at[c - way];
             carry_on(light.change, carried.at, way, width);
         }
+        if constexpr (KEEPS) return;
+        INDEPENDENT
+        for (int c = 0; c < width; ++c) ways.own.put(c, ways.own[c] + within[c] * light[c - way]);
     }
-    template <bool IS_ALONG, int POINTS> INLINE void follow_steps(
-        const Here& here, const Steps<POINTS>& steps, const Line<N>& light) const {
-        const bool is_thin = steps.half * here.deepest < F(0.25);
+    template <bool IS_ALONG, int POINTS> INLINE void follow_ways(
+        const Here& here, const Ways<POINTS>& ways, const Line<N>& light) const {
+        const bool is_thin = ways.step * here.deepest < F(0.5);
         in_stretches(here.from, here.to, of.width, is_thin, [&](auto of, int from, int to) HERE {
-            follow_stretch<IS_ALONG, decltype(of)::matter>(steps, light, from, to);
+            follow_stretch<IS_ALONG, decltype(of)::matter>(ways, light, from, to);
         });
     }
     template <bool IS_ALONG, Matter MATTER, int POINTS>
     __attribute__((noinline)) void follow_stretch(
-        const Steps<POINTS>& given, const Line<N>& light, int from, int to) const {
-        const Steps<POINTS> steps = given;
-        const N scale = this->scale, strength = this->strength, inflow = this->inflow;
+        const Ways<POINTS>& given, const Line<N>& light, int from, int to) const {
+        const Ways<POINTS> ways = given;
+        const N scale = this->scale * ways.step, inflow = this->inflow;
+        const N strength = this->strength * ways.step;
         const Line<N> carried = line_at<N>(scratch_row(0), of.pitch);
+        const Line<N> within = line_at<N>(scratch_row(2), of.pitch);
         INDEPENDENT
         for (int c = from; c < to; ++c) {
-            const N arriving = gather<POINTS>(steps.light_from, steps.part, c);
+            const N arriving = gather<POINTS>(ways.from, ways.part, c);
             if constexpr (MATTER == EMPTY) {
                 light.put(c, arriving);
-                if constexpr (IS_ALONG) carried.put(c, N(steps.part[0]));
+                if constexpr (!KEEPS) ways.own.put(c, arriving);
+                if constexpr (IS_ALONG) carried.put(c, N(ways.part[0]));
+                if constexpr (IS_ALONG && !KEEPS) within.put(c, N(ways.part[0]));
             } else {
-                const N far = gather<POINTS>(steps.near_from, steps.part, c), near = steps.near[c];
-                const N mass = steps.mass(c), depth = scale * mass;
-                const N scattering_depth = steps.scattering_mass(c) * strength;
+                const N depth = scale * ways.e[c], scatters = strength * ways.sc[c];
+                const Emitted<N> emitted = {scatters * ways.own[c], scatters * ways.rise(c)};
                 const Passage<N> by = pass_through<MATTER>(value_of(depth), depth);
-                light.put(c, light_after(arriving, far, near, scattering_depth, inflow, by));
-                if constexpr (IS_ALONG) carried.put(c, steps.part[0] * by.passed);
+                light.put(c, light_after(arriving, emitted, inflow, by));
+                if constexpr (IS_ALONG) carried.put(c, ways.part[0] * by.passed);
+                if constexpr (KEEPS) continue;
+                ways.own.put(c, light_within(arriving, emitted, inflow, by));
+                if constexpr (IS_ALONG) within.put(c, ways.part[0] * by.phi);
             }
         }
     }
     // What is found: moments of light, of which the known ones are taken away; or their changes.
     INLINE void add_moments(const Here& here, bool is_adding) const {
-        const Line<N> light = line(here.s, here.t, LIGHT, group->before);
+        const Line<N> within = line(here.s, here.t, OWN, group->before);
         F* const begin = found_row(here);
         const F* taken[COUNT];
-        F *found[COUNT], first = change_of(inflow), *lines = light.at;
-        if constexpr (IS_CHANGED) lines = light.change;
+        F *found[COUNT], first = change_of(inflow), *lines = within.at;
+        if constexpr (IS_CHANGED) lines = within.change;
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i];
             const bool is_known = k < 4 && !job.piece;

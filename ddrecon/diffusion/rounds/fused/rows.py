@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
 from ddrecon.diffusion.rounds.fused.swept import Swept
@@ -55,9 +54,10 @@ class Rows:
         self.slabs = -(-low // self.slab) + -(-high // self.slab)
         fields = swept.fields
         if changes is not None:
-            # Each with its change behind it: steps meet a medium where that changes, too.
+            # Each with its change behind it: there is a medium where that changes, too.
             fields = [torch.cat(pair) for pair in zip(fields, changes.fields, strict=True)]
-        self.fields, self.ranges, self.densest = surround(fields, self.pitch)
+        self.fields = [field.contiguous() for field in fields]
+        self.ranges, self.densest = find_ranges(self.fields)
         self.channels = [len(field) for field in swept.fields]
 
     def follow(self, is_saved: bool = False) -> tuple[Tensor, Tensor | None]:
@@ -75,8 +75,8 @@ class Rows:
 
     def transpose(
         self, saved: Tensor, bars: Sequence[Tensor | None], varies_numbers: bool
-    ) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light.
+    ) -> tuple[Tensor, Tensor, Tensor, list[Tensor]]:
+        """Cotangents of `scales` [3, C], moments, gradient and fields, of those `bars` of light.
 
         `saved`: by `follow`.
         """
@@ -85,10 +85,12 @@ class Rows:
         counts = [self.colors if each > 1 else self.together for each in self.channels]
         fields = [self.like.new_zeros(self.pieces, each, *shape) for each in counts]
         sums = self.like.new_zeros(self.colors, 2 * self.pieces, 3, dtype=torch.float64)
+        gradient = self.like.new_zeros(self.pieces, 3, *self.like.shape)
         made = {
             "saved": saved, "sums": sums, "e_bar": fields[0], "sc_bar": fields[-1],
+            "gradient_bar": gradient,
             "lines": self.like.new_empty(self._line_count(2, (self.slab + 1) * self.height)),
-            "returning": self.like.new_zeros(self._line_count(2 + len(fields), self.height + 2)),
+            "returning": self.like.new_zeros(self._line_count(1, self.height + 2)),
         }  # fmt: skip
         flag = f", {str(varies_numbers).lower()}"
         found = self._run("return_rows<", flag, {"bars": bars}, made)
@@ -96,7 +98,8 @@ class Rows:
             (bar[0] if len(bar) == 1 else bar.sum(0)).sum_to_size(each, *shape)
             for bar, each in zip(fields, self.channels, strict=True)
         ]
-        return sums.sum(1).T.to(found.dtype), found, of_fields
+        gradient = gradient[0] if self.pieces == 1 else gradient.sum(0)
+        return sums.sum(1).T.to(found.dtype), found, gradient, of_fields
 
     def _line_count(self, kinds: int, places: int) -> int:
         return self.lanes * (kinds * self.tables["most"] * self.pitch * places + MARGIN)
@@ -117,7 +120,7 @@ class Rows:
             "beam_factors": swept.beam_factors, "scales": swept.scales,
             "extinction": self.fields[0], "extinction_channels": self.channels[0],
             "scattering": self.fields[-1], "scattering_channels": self.channels[-1],
-            "ranges": self.ranges, "densest": self.densest,
+            "gradient": swept.gradient, "ranges": self.ranges, "densest": self.densest,
             "depth": self.depth, "height": self.height, "width": self.width,
             "pitch": self.pitch, "margin": MARGIN, "colors": self.colors,
             "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
@@ -128,6 +131,7 @@ class Rows:
             given |= {
                 "d_light_parts": changes.light, "d_source_parts": changes.source,
                 "d_factors": changes.factors, "d_scales": changes.scales,
+                "d_gradient": changes.gradient,
             }  # fmt: skip
         degree, shares_field = round(self.count**0.5) - 1, str(swept.scattering is None).lower()
         whole = f"{function}{degree}, {shares_field}{flags}>"
@@ -144,32 +148,21 @@ class Rows:
         return sums.sum(0) if len(sums) > 1 else sums[0]
 
 
-def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor, Tensor]:
-    """`fields` [K, z, y, x] with empty cells around them; `ranges` and `densest` of their rows.
+def find_ranges(fields: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """From and to where rows of `fields` [K, z, y, x] have a medium, [z, y, 2], and `densest`.
 
-    They are flat: MARGIN zeros and [K, z + 2, y + 2, pitch]. `ranges` [z, y, 4]: from and to where
-    steps to the cells of a row meet a medium, and where those meet one that begin at these cells.
     They begin where vectors do; empty ones are from 0 to 0. `densest` [z, y]: the largest value of
-    the first field that steps to these cells meet.
+    the first field.
     """
-    (depth, height, width), larger = fields[0].shape[1:], []
-    for field in fields:
-        larger.append(field.new_zeros(MARGIN + len(field) * (depth + 2) * (height + 2) * pitch))
-        inner = larger[-1][MARGIN:].view(len(field), depth + 2, height + 2, pitch)
-        inner[:, 1:-1, 1:-1, :width] = field
+    width = fields[0].shape[-1]
     is_met = functools.reduce(torch.logical_or, ((field != 0).any(0) for field in fields))
     # How many cells there are from each end of a row to the last one that is not empty.
     count = torch.arange(1, width + 1, dtype=torch.int32)
-    reach = torch.stack([(is_met * each).amax(-1) for each in (count.flip(0), count)]).float()
-    ranges = []
-    # Light at the ends of a step is a cell away at most, along each axis.
-    for cells in (1, 2):
-        before, end = max_pool2d(reach, 2 * cells + 1, 1, cells)
-        begin = (width - before - cells).clamp(min=0) // MARGIN * MARGIN
-        end = torch.where(end > 0, ((end + cells) / MARGIN).ceil() * MARGIN, 0)
-        ranges += [begin * (end > 0), end.clamp(max=width)]
-    densest = max_pool2d(fields[0].amax((0, 3)).clamp(min=0)[None], 3, 1, 1)
-    return larger, torch.stack(ranges, -1).int(), densest
+    before, end = ((is_met * each).amax(-1) for each in (count.flip(0), count))
+    begin = (width - before) // MARGIN * MARGIN * (end > 0)
+    end = ((end + MARGIN - 1) // MARGIN * MARGIN).clamp(max=width)
+    densest = fields[0].amax((0, 3)).clamp(min=0)
+    return torch.stack([begin, end], -1).int(), densest
 
 
 @functools.cache

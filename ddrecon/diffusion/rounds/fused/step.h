@@ -1,18 +1,17 @@
 #pragma once
 #include "ddrecon/diffusion/rounds/fused/given.h"
 #include "ddrecon/kernels/dual.h"
-// A step of light along a direction from cell to cell (E2.9), for rows of cells and for single
-// ones.
+// The way of light along a direction through one cell (E2.9).
 
 namespace ddrecon {
 
-// What a step meets: no matter; steps of less than half an optical depth alone, in which what
-// passes needs no exponential; any.
+// What a way leads through: no matter; cells of less than half an optical depth alone, in which
+// what passes needs no exponential; any.
 enum Matter { EMPTY, THIN, ANY };
 template <Matter MATTER> struct Of {
     static constexpr Matter matter = MATTER;
 };
-// All steps to `width` cells of a row, which meet matter `from` one `to` another: `pass` does those
+// All `width` cells of a row, of which those `from` one `to` another have matter: `pass` does those
 // of a stretch.
 template <class Pass>
 INLINE void in_stretches(int from, int to, int width, bool is_thin, Pass pass) {
@@ -24,52 +23,46 @@ INLINE void in_stretches(int from, int to, int width, bool is_thin, Pass pass) {
     pass(Of<EMPTY>(), to, width);
 }
 
-// What a depth does to light, with slopes where it is a dual number: of a linear source on the way
-// `phi - psi` counts at the beginning and `psi` at the end; what passes, and what is lost.
+// phi, psi and eta of `numerics/decay.py`, d eta as `rising`, what passes, and what is lost, with
+// slopes where the depth is a dual number.
 template <class N> struct Passage {
-    N phi, psi, passed, lost;
+    N phi, psi, eta, rising, passed, lost;
 };
 template <Matter MATTER, class F, class N> INLINE Passage<N> pass_through(F d, const N& depth) {
     const F kept = MATTER == ANY ? decay(d) : F(0);
     const bool is_thin = MATTER != ANY || d < F(0.5);
     const F thin = is_thin ? d : F(0), inverse = F(1) / (is_thin ? F(0.5) : d);
-    const F near = psi_series(thin), near_slope = psi_slope_series(thin);
+    const F near = psi_series(thin);
+    const F near_eta = eta_series(thin);
+    const F near_slope = eta_slope_series(thin);
     const F phi = is_thin ? F(1) - d * near : (F(1) - kept) * inverse;
     const F psi = is_thin ? near : (F(1) - phi) * inverse;
-    const F psi_slope = is_thin ? near_slope : (phi - F(2) * psi) * inverse;
+    const F eta = is_thin ? near_eta : (psi - F(0.5) * phi) * inverse;
+    const F eta_slope = is_thin ? near_slope : (F(0.5) * (phi - psi) - F(3) * eta) * inverse;
     const F lost = d * phi, passed = MATTER == ANY ? kept : F(1) - lost;
-    return {
-        along(depth, Sloped<F>{phi, psi - phi}), along(depth, Sloped<F>{psi, psi_slope}),
-        along(depth, Sloped<F>{passed, -passed}), along(depth, Sloped<F>{lost, passed})};
+    return {along(depth, Sloped<F>{phi, psi - phi}),
+            along(depth, Sloped<F>{psi, F(-2) * eta}),
+            along(depth, Sloped<F>{eta, eta_slope}),
+            along(depth, Sloped<F>{d * eta, eta + d * eta_slope}),
+            along(depth, Sloped<F>{passed, -passed}),
+            along(depth, Sloped<F>{lost, passed})};
 }
 
-// The mean along a step of what scatters at its beginning, `far`, and at its end.
-template <class N, class D> INLINE D scattered(const N& far, const N& near, const Passage<D>& by) {
-    return far * by.phi + (near - far) * by.psi;
-}
-// I at the end of a step, less the light from outside, `inflow`, which is there without a medium.
-template <class N, class D> INLINE D light_after(
-    const N& arriving, const N& far, const N& near, const N& scattering_depth, const N& inflow,
-    const Passage<D>& by) {
-    return arriving * by.passed + (scattering_depth * scattered(far, near, by) - inflow * by.lost);
-}
-
-// E2.9 transposed: cotangents of a step's numbers, of that of I; `inflow` but for what I gets of
-// it.
-template <class F> struct StepBars {
-    F arriving, far, near, mass, scattering_mass, scale, strength, inflow;
+// What the cell emits along the way: all of it, and by how much more at its end than at its
+// beginning.
+template <class N> struct Emitted {
+    N whole, rise;
 };
-template <Matter MATTER, class F> INLINE StepBars<F> return_step(
-    F bar, F arriving, F far, F near, F mass, F scattering_mass, F scale, F strength, F inflow) {
-    const F q = scattering_mass * strength, depth = scale * mass;
-    const Passage<Dual<F>> by = pass_through<MATTER>(depth, Dual<F>(depth, F(1)));
-    const F depth_bar = bar * light_after(arriving, far, near, q, inflow, by).by[0];
-    const F q_bar = bar * scattered(far, near, by).value, line_bar = bar * q;
-    const F psi = by.psi.value;
-    return {bar * by.passed.value,   line_bar * (by.phi.value - psi),
-            line_bar * psi,          depth_bar * scale,
-            q_bar * strength,        depth_bar * mass,
-            q_bar * scattering_mass, -bar * by.lost.value};
+// I where light leaves the cell, less the light from outside, `inflow`, which is there without a
+// medium; and its mean along the way, less the same.
+template <class N, class E, class D> INLINE D
+light_after(const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Passage<D>& by) {
+    return arriving * by.passed +
+           (by_cell.whole * by.phi + by_cell.rise * by.rising - inflow * by.lost);
+}
+template <class N, class E, class D> INLINE D
+light_within(const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Passage<D>& by) {
+    return (arriving + inflow) * by.phi + (by_cell.whole * by.psi - by_cell.rise * by.eta - inflow);
 }
 
 } // namespace ddrecon

@@ -28,12 +28,14 @@ def sweep_fused(
     light: Moments,
     factors: Tensor,
     source: Moments,
+    gradient: Tensor,
     inflow: Tensor | None,
     directions: int,
 ) -> Moments:
     """The moments of the radiance that `light`, by `factors`, and `source` scatter (E2.8).
 
-    The first two less those of `light`. `directions`: how many the quadrature has.
+    The first two less those of `light`. `gradient`: of what scatters alike everywhere, as of
+    `gradient_within`; `directions`: how many the quadrature has.
     """
     colors, beam_factors = len(light.mean), None
     if is_forward():  # where a beam and its factors may both change
@@ -51,6 +53,7 @@ def sweep_fused(
         directions,
         _scales(medium.extinction.scale, medium.remaining.scale, inflow, colors),
         *fields,
+        gradient.expand(3, colors, *light.mean.shape[1:]),
         _spread_factors(factors, colors),
         beam_factors,
         *parts_of(light, colors),
@@ -99,10 +102,12 @@ class _Sweep(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
+        _, _, _, needs_scales, _, _, _, needs_factors, *needs_more = ctx.needs_input_grad
         needs_beam_factors, *needs_parts = needs_more
         parts = bars[:-1]
-        scales_bar, moments_bar, fields = Rows(swept).transpose(ctx.saved, parts, needs_scales)
+        scales_bar, moments_bar, gradient_bar, fields = Rows(swept).transpose(
+            ctx.saved, parts, needs_scales
+        )
         extinction_bar, *scattering_bar = fields
         return (
             None,
@@ -111,6 +116,7 @@ class _Sweep(torch.autograd.Function):
             scales_bar if needs_scales else None,
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
+            gradient_bar,
             swept.factor_bar(moments_bar) if needs_factors else None,
             swept.beam_factor_bar(moments_bar) if needs_beam_factors else None,
             *swept.light_bars(moments_bar, parts, needs_parts[:PARTS]),

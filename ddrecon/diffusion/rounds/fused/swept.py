@@ -60,7 +60,7 @@ class Swept:
     `scales` [3, C]: of extinction, of scattering, and inflow; `extinction` and `scattering`: fields
     [1 or C, z, y, x], None where the second is the first. What scatters has the moments
     `factors` [K, C] times those of `light`, and those of `source`: where there are `beam_factors`
-    [K, C], these times its first part.
+    [K, C], these times its first part. `gradient` [3, C, z, y, x] is that of their mean.
     """
 
     grid: Grid
@@ -68,6 +68,7 @@ class Swept:
     scales: Tensor
     extinction: Tensor
     scattering: Tensor | None
+    gradient: Tensor
     factors: Tensor
     beam_factors: Tensor | None
     light: Parts
@@ -76,9 +77,9 @@ class Swept:
     @staticmethod
     def of(grid: Grid, directions: int, *tensors: Any) -> Swept:
         """From tensors as autograd must be given them: one by one."""
-        scales, extinction, scattering, factors, beams, *parts = tensors
+        scales, extinction, scattering, gradient, factors, beams, *parts = tensors
         light, source = tuple(parts[:PARTS]), tuple(parts[PARTS:])
-        coefficients = scales, extinction, scattering
+        coefficients = scales, extinction, scattering, gradient
         return Swept(grid, directions, *coefficients, factors, beams, light, source)
 
     @property
@@ -89,7 +90,7 @@ class Swept:
 
     def changes(self, *changes: Tensor | None) -> Swept:
         """What is added to all tensors, as `Swept.of` takes them; None for nothing."""
-        tensors = self.scales, self.extinction, self.scattering, self.factors
+        tensors = self.scales, self.extinction, self.scattering, self.gradient, self.factors
         whole = [
             tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
             for tensor, change in zip(tensors, changes, strict=False)
