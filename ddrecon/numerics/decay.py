@@ -58,9 +58,7 @@ def decay_terms(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _eta(depth: Tensor, phi: Tensor) -> Tensor:
     """eta, given `phi`; or as the sum over k of (-`depth`)^k (k + 1) / (2 (k + 3)!)."""
-    *others, last = (
-        depth.new_tensor((k + 1) / (2 * math.factorial(k + 3))) for k in range(TERMS)
-    )
+    *others, last = (depth.new_tensor((k + 1) / (2 * math.factorial(k + 3))) for k in range(TERMS))
     series = last.expand_as(depth)
     for factor in reversed(others):
         series = torch.addcmul(factor, depth, series, value=-1)

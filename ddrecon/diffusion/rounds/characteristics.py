@@ -59,6 +59,12 @@ class Course:
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
         return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), 1 / fastest)
 
+    @property
+    def moved(self) -> list[float]:
+        """By how many cells along z, y and x light moves from one slice to the next."""
+        moved = {SLICES: float(self.forward), ROWS: self.drift[0], COLUMNS: self.drift[1]}
+        return [moved[self.order.index(1 + axis)] for axis in range(3)]
+
     def lay(self, field: Tensor) -> Tensor:
         """`field` [C, z, y, x] as [slices, C, rows, columns]."""
         return field.permute(self.order).contiguous()
@@ -69,31 +75,34 @@ class Course:
 
     def way_along(self, axis: int) -> int:
         """1 where light goes up along the grid's `axis`, -1 where down, 0 where neither."""
-        speed = {SLICES: self.forward, ROWS: self.drift[0], COLUMNS: self.drift[1]}
-        along = speed[self.order.index(1 + axis)]
+        along = self.moved[axis]
         return (along > 0) - (along < 0)
 
 
 def radiance_along(
     medium: Medium,
-    emitted: Tensor,
-    rise: Tensor,
+    scatters: Tensor,
+    gradient: Tensor,
     inflow: Tensor | None,
     direction: Direction,
     entering: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """I along `direction` (E2.9): its mean in each cell, and what leaves it [C, z, y, x].
 
-    `direction`: the unit vector of travel (array order); `emitted` [C, z, y, x]: E, a unit length;
-    `rise`: its slope along the ray, a unit length;
-    `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, of which what leaves is
-    counted from. In a slab both are those of its own cells; `entering` is what leaves the layer
-    before these, as the neighbor has it.
+    `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
+    `medium` adds (1 - f) kappa_s a unit length; `gradient` [3, C, z, y, x]: by how much q rises
+    from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
+    which what leaves cells is counted. In a slab both are those of its own cells; `entering` is
+    what leaves the layer before these, as the neighbor has it.
     """
     grid = medium.grid
     course = Course.of(whole_of(grid), direction)
-    depth = course.lay(medium.extinction.value * course.step)
-    e, r = course.lay(emitted * course.step), course.lay(rise * course.step**2)
+    depth, strength = (
+        course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
+    )
+    # what the cell emits along the ray, and by how much more at its end than at its beginning
+    rise = torch.tensordot(gradient.new_tensor(course.moved), gradient, 1)
+    e, r = strength * course.lay(scatters), strength * course.lay(rise)
     phi, psi, eta = decay_terms(depth)
     passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
     if inflow is not None:

@@ -17,6 +17,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.operator import AXES
 from ddrecon.diffusion.rounds.characteristics import Course, Direction, radiance_along
 from ddrecon.engine import has_kernels
 from ddrecon.light.moments import Moments
@@ -41,7 +42,8 @@ def sweep(
 ) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
-    `source` [K, C, z, y, x]: moments of what scatters, to some degree; `inflow`: light from
+    `source` [K, C, z, y, x]: moments of what scatters, to some degree; `gradient` [3, C, z, y, x]:
+    of the first, as of `cell_gradient`; `inflow`: light from
     outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
@@ -62,9 +64,7 @@ def sweep(
         def follow() -> Tensor:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            rise = torch.tensordot(gradient.new_tensor(directions[number]), gradient, 1)
-            rise = rise * medium.remaining_scattering
-            return radiance_along(medium, scatters, rise, inflow, directions[number], entering)
+            return radiance_along(medium, scatters, gradient, inflow, directions[number], entering)
 
         radiance, leaving = recompute(follow)
         moments.addr_(weights[number] * row, radiance.flatten())
@@ -119,7 +119,7 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = recompute(gradient_within, medium, light.mean + source.mean)
+    gradient = cell_gradient(light.mean + source.mean)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
     if is_fused() and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
@@ -130,34 +130,21 @@ def sweep_change(
             factors = torch.zeros_like(factors[..., :1, :1, :1])
         return sweep_fused(medium, light, factors, source, gradient, inflow, DIRECTIONS[degree])
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    emitted = scatters * medium.remaining_scattering
-    swept = Moments.of_harmonics(sweep(medium, emitted, gradient, inflow, degree))
+    swept = Moments.of_harmonics(sweep(medium, scatters, gradient, inflow, degree))
     return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
 
 
-def gradient_within(medium: Medium, q: Tensor) -> Tensor:
-    """The gradient of `q` [C, z, y, x] as cells of `medium` have it, [3, C, z, y, x] (E2.9).
+def cell_gradient(q: Tensor) -> Tensor:
+    """By how much `q` [C, z, y, x] rises from cell to cell, [3, C, z, y, x] (E2.9).
 
-    Of the differences to both neighbors along an axis each counts by the neighbor's share of the
-    depth of both cells: at the edge of a medium only the one within it does.
+    Half the difference of both neighbors; at the faces of the box, that to the one.
     """
-    found = []
-    for axis, spacing in zip((-3, -2, -1), medium.grid.spacing, strict=True):
-        count, depth = q.shape[axis], spacing * medium.extinction.value
-        low, high = depth.narrow(axis, 0, count - 1), depth.narrow(axis, 1, count - 1)
-        inverse = 1 / (low + high + THIN)
-        # shares of the neighbors above and below, none beyond the box
-        none = torch.zeros_like(depth.narrow(axis, 0, 1))
-        above, below = torch.cat([high * inverse, none], axis), torch.cat([none, low * inverse], axis)
-        both = above + below
-        factor = both / ((both**2 + EDGE) * spacing)
-        rise = torch.nn.functional.pad(q.diff(dim=axis), [1 if a == -axis - 1 else 0 for a in range(3) for _ in range(2)])
-        up, down = rise.narrow(axis, 1, count), rise.narrow(axis, 0, count)
-        found.append(factor * (above * up + below * down))
-    return torch.stack(found)
-
-
-THIN, EDGE = 1e-3, 2.5e-3
+    return torch.stack(
+        [
+            torch.gradient(q, dim=axis)[0] if q.shape[axis] > 1 else torch.zeros_like(q)
+            for axis in AXES
+        ]
+    )
 
 
 @functools.cache

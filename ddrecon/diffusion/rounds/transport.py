@@ -24,14 +24,17 @@ from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
+from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
-OPT = {'half': 0.7, 'smooth': True}
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
+DAMPING = 0.7
+"""Sigma of E7.2: with less, waves from cell to cell grow where cells are thick."""
 
 
 def run_rounds(
@@ -48,13 +51,31 @@ def run_rounds(
     """
     if rounds == 0:
         return light
-    grid = problem.medium.grid
+    medium, grid = average_cells(problem.medium), problem.medium.grid
     light = _renewed(light, grid)
-    for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
-        cosine = _flux_factor(problem.medium, round_index == rounds)
-        made = _round(problem, light, solve, degree, round_index, cosine, factor)
+    for round_index, factor in enumerate(_blending(medium, rounds), 1):
+        cosine = _flux_factor(medium, round_index == rounds)
+        made = _round(problem, medium, light, solve, degree, round_index, cosine, factor)
         light = _renewed(made, grid)
     return light
+
+
+def average_cells(medium: Medium) -> Medium:
+    """`medium` with cells' means of fields that are linear between their centers, for sweeps."""
+    means = {
+        id(one.field): recompute(_cell_means, one.field)
+        for one in (medium.extinction, medium.remaining)
+    }
+    extinction, remaining = (
+        replace(one, field=means[id(one.field)]) for one in (medium.extinction, medium.remaining)
+    )
+    return replace(medium, extinction=extinction, remaining=remaining)
+
+
+def _cell_means(field: Tensor) -> Tensor:
+    for axis in AXES:
+        field = field + second_difference(field, axis) / 8
+    return field
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -67,6 +88,7 @@ def _renewed(light: Moments, grid: Grid) -> Moments:
 
 def _round(
     problem: DiffusionProblem,
+    medium: Medium,
     light: Moments,
     solve: SolverWithMemory,
     degree: int,
@@ -76,14 +98,13 @@ def _round(
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `cosine`: as of `_flux_factor`.
+    `medium` is the problem's as sweeps have it; `cosine`: as of `_flux_factor`.
     """
-    operator, right = problem.system
-    medium, outside = problem.medium, problem.outside
+    (operator, right), outside = problem.system, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(_averaged(medium), light, problem.source, inflow, degree)
+    change = sweep_change(medium, light, problem.source, inflow, degree)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:
@@ -93,47 +114,11 @@ def _round(
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux))
-    if change.higher is None or factor is None:
+    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
+    if factor is None:
         return new
-    return _blend(medium, light, new, change.higher, factor, degree)
-
-
-def _averaged(medium: Medium) -> Medium:
-    if not OPT['smooth']:
-        return medium
-    done = {}
-
-    def average(one):
-        f = one.field
-        if id(f) not in done:
-            g = f
-            for ax in (-1, -2, -3):
-                n = g.shape[ax]
-                lo = torch.cat([g.narrow(ax, 0, 1), g.narrow(ax, 0, n - 1)], ax)
-                hi = torch.cat([g.narrow(ax, 1, n - 1), g.narrow(ax, n - 1, 1)], ax)
-                g = 0.75 * g + 0.125 * (lo + hi)
-            done[id(f)] = g
-        return replace(one, field=done[id(f)])
-
-    return replace(medium, extinction=average(medium.extinction), remaining=average(medium.remaining))
-
-
-def _blend(
-    medium: Medium, light: Moments, new: Moments, swept: Tensor, factor: Tensor, degree: int
-) -> Moments:
-    """Light by `factor` as far from what was as to what a round makes of it (E7.1).
-
-    That is what is `new`, and theta times what was `swept` of higher degree.
-    """
-    if False:
-        from ddrecon.diffusion.rounds.fused.gain import blend_fused
-
-        length = _share_length(medium, degree)
-        return blend_fused(medium, light, new, swept, factor, length)
-    new = replace(new, higher=swept)
-    change = new.plus(light.scaled(-1.0, -1.0, -1.0))
-    return light.plus(change.scaled(factor, factor, factor))
+    difference = new.plus(light.scaled(-1.0, -1.0, -1.0))
+    return light.plus(difference.scaled(factor, factor, factor))
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
@@ -152,9 +137,10 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
     nu are Chebyshev's nodes of the interval between - and + p_2: by at most about so much a round
     multiplies what is left in the moments that diffusion lacks. As that interval is even, what
-    shrinks without blending shrinks with it. None where light's direction does not matter.
+    shrinks without blending shrinks with it. None where that is nothing: of one round, and where
+    light is known by two moments.
     """
-    if medium.degree < 2:
+    if medium.degree < 2 or rounds == 1:
         return [None] * rounds
     bound = SPECTRUM * remaining_moments(medium)[2]
     nodes = [math.cos(math.pi * (2 * k + 1) / (2 * rounds)) for k in range(rounds)]
@@ -164,25 +150,24 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 def _gain(
     medium: Medium, change: Moments, off: Moments | None, degree: int, cosine: Tensor
 ) -> tuple[Moments, Tensor, Vector | None]:
-    """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E2.10, and what they add to S.
+    """theta (L0' - L0) and theta (L1' - L1) + L1 - 3 F(L0) of E2.10, and what they add to S.
 
-    That is kappa_s theta (L0' - L0) - theta (S - A L0). And c = theta `cosine` (L1' - L1), by how
-    much the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
-    L1 - 3 F(L0), None for zero.
+    That is kappa_s theta (L0' - L0) - (S - A L0). And c = theta `cosine` (L1' - L1), by how much
+    the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and L1 -
+    3 F(L0), None for zero.
     """
-    if False:
+    length = _mean_step(whole_of(medium.grid), degree)
+    if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        return gain_fused(medium, change, off, cosine, _share_length(medium, degree))
-    share = recompute(_transport_share, medium, degree)
+        return gain_fused(medium, change, off, cosine, DAMPING, length)
+    share = recompute(_transport_share, medium, length)
     gain = Moments(change.mean, change.flux).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
-    source = source if off is None else source - off.mean
-    if change.flux is None:
-        return gain, source, None
-    z, y, x = (cosine * along for along in gain.flux)
-    if off is not None: gain = Moments(gain.mean, add_vectors(gain.flux, off.flux))
-    return gain, source, (z, y, x)
+    turned = None if gain.flux is None else Moments(source, gain.flux).scaled(1.0, cosine).flux
+    if off is None:
+        return gain, source, turned
+    return Moments(gain.mean, add_vectors(gain.flux, off.flux)), source - off.mean, turned
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
@@ -201,25 +186,18 @@ def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     return imbalance
 
 
-def _transport_share(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E7.2).
+def _transport_share(medium: Medium, length: float) -> Tensor:
+    """theta = 1 / (1 + sigma rho kappa_tr / kappa_t), the share of a change that counts (E7.2).
 
-    The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
-    too much if its source is linear over steps of optical depth d, that of `_share_length`.
-    Returns `[C, z, y, x]` in (0, 1].
+    rho is by how much too much sweeps of waves from cell to cell diffuse, of steps of a mean
+    `length` [u]. Returns `[C, z, y, x]` in (0, 1].
     """
-    # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
-    # 1e-6, theta is 1 already
-    length = _mean_step(whole_of(medium.grid), degree)
-    half_depth = (0.5 * length * medium.extinction.value).clamp(min=1e-3)
-    rho = half_depth / torch.tanh(half_depth) - 1
-    tr = medium.transport_extinction / medium.extinction.value.clamp(min=1e-20)
-    return 1 / (1 + OPT['half'] * rho * tr)
-
-
-def _share_length(medium: Medium, degree: int) -> Tensor:
-    """exp(-p_1) (mean step) [u], by whose optical depth theta is (E7.3), [C or 1, 1, 1, 1]."""
-    return _mean_step(whole_of(medium.grid), degree) * torch.exp(-remaining_moments(medium)[1])
+    depth = length * medium.extinction.value
+    # rho = d (psi / phi - 1/2) = d^2 eta / phi
+    phi, _, eta = decay_terms(depth)
+    p_1 = remaining_moments(medium)[1] if medium.seen.degree else 0.0
+    transport_depth = depth - length * p_1 * medium.remaining_scattering
+    return 1 / (1 + DAMPING * depth * eta / phi * transport_depth)
 
 
 @functools.cache

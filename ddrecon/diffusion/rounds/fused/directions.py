@@ -52,14 +52,15 @@ def piece_numbers(shape: tuple[int, int, int], colors: int, moments: int) -> int
 class Step:
     """The `length` [u] of a way through a cell, to which light comes from up to four, of `weights`.
 
-    Each of `points` tells how many cells it lies before the cell along z, y and x, none or one, of
-    light with the `signs`. Where `is_along` the first lies in the same row: a recurrence in x.
+    Light has `moved` by so many cells along z, y and x. Each of `points` tells how many cells it
+    lies before the cell along these, none or one. Where `is_along` the first lies in the same row:
+    a recurrence in x.
     """
 
     direction: Direction
     weight: float
     length: float
-    signs: tuple[int, ...]
+    moved: tuple[float, ...]
     points: tuple[tuple[int, ...], ...]
     weights: tuple[float, ...]
     is_along: bool
@@ -68,31 +69,26 @@ class Step:
     def of(grid: Grid, direction: Direction, weight: float) -> Step:
         """The step of a `direction` of the quadrature through `grid` (E2.9)."""
         course = Course.of(grid, direction)
-        axis = course.order[0] - 1
-        moved = [0.0, 0.0, 0.0]
-        moved[axis] = float(course.forward)
-        for drift, dim in zip(course.drift, course.order[2:], strict=True):
-            moved[dim - 1] = drift
+        axis, moved = course.order[0] - 1, course.moved
         # The cells that light comes from, first that on the row itself where it goes along x.
         found: dict[tuple[int, ...], float] = {}
         for point in product(*((1,) if i == axis else (0, 1) for i in range(3))):
             part = math.prod(abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
             if part > 0:
                 found[point] = part
-        signs = tuple((m > 0) - (m < 0) for m in moved)
         is_along = axis == 2 and (0, 0, 1) in found
         points, weights = tuple(found), tuple(found.values())
-        return Step(direction, weight, course.step, signs, points, weights, is_along)
+        return Step(direction, weight, course.step, tuple(moved), points, weights, is_along)
 
     def course(self) -> list[int]:
         """The struct `Course` of kernels."""
         points = self.points + self.points[:1] * (POINTS - len(self.points))
-        return [self.signs[2], self.is_along, len(self.points), *chain(*points)]
+        x_way = (self.moved[2] > 0) - (self.moved[2] < 0)
+        return [x_way, self.is_along, len(self.points), *chain(*points)]
 
     def parts(self) -> list[float]:
         """The struct `Parts` of kernels."""
-        along = [self.length * component for component in self.direction]
-        return [self.length, *along, *self.weights, *[0.0] * (POINTS - len(self.points))]
+        return [self.length, *self.moved, *self.weights, *[0.0] * (POINTS - len(self.points))]
 
 
 Unit = list[Step]
@@ -114,7 +110,7 @@ def _chunks(steps: list[Step], is_paired: bool, count: int) -> list[list[Unit]]:
 
 
 def _goes_down_y(step: Step) -> bool:
-    return step.signs[1] < 0
+    return step.moved[1] < 0
 
 
 @functools.cache
@@ -135,7 +131,7 @@ def make_tables(
     groups, pairs, ranges = list[list[int]](), list[list[int]](), list[list[int]]()
     matrices, largest = list[Tensor](), 0
     for is_up in (True, False):
-        way = [step for step in steps if (step.signs > (0, 0, 0)) == is_up]
+        way = [step for step in steps if (step.moved > (0, 0, 0)) == is_up]
         number = math.ceil(len(way) / most / pieces) * pieces
         for chunk in _chunks(way, moments > 1, number):
             first, begin = len(groups), len(done)

@@ -9,9 +9,9 @@ namespace ddrecon {
 struct Course {
     int x_way, is_along, count, points[4][3];
 };
-// Its step [u], that along z, y, x, and what each point counts in the mean.
+// Its step [u], cells moved along z, y, x, and what each point counts in the mean.
 template <class F> struct Parts {
-    F step, along[3], part[4];
+    F step, moved[3], part[4];
 };
 
 // Directions that go through the rows together: the way in y, which of all directions they are,

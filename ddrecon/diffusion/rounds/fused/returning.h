@@ -169,7 +169,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             back.bar[c] = whole_bar * scatters;
             UNROLLED
             for (int a = 0; a < 3; ++a)
-                gradient_bar[a * all + c] += rise_bar * scatters * ways.along[a];
+                gradient_bar[a * all + c] += rise_bar * scatters * ways.moved[a];
             const F mass_bar = depth_bar * scale, scattered = scatters_bar * strength;
             e_bar[c] += mass_bar + (SHARES_FIELD ? scattered : F(0));
             if constexpr (!SHARES_FIELD) sc_bar[c] += scattered;

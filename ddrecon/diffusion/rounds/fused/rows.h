@@ -37,14 +37,14 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         Line<N> light[4];
         bool is_inside[4];
     };
-    // Cells of a row and a direction: what scatters along it, of all directions how much more at
-    // the next cell along z, y and x, fields, and what comes from the cells before.
+    // Cells of a row and a direction: what scatters along it, by how much q rises from cell to
+    // cell along z, y and x, fields, and what comes from the cells before.
     template <int POINTS> struct Ways {
         Line<N> own, gradient[3], e, sc, from[POINTS];
-        F step, along[3], part[POINTS];
+        F step, moved[3], part[POINTS];
         INLINE N rise(int c) const {
-            return along[0] * gradient[0][c] + along[1] * gradient[1][c] +
-                   along[2] * gradient[2][c];
+            return moved[0] * gradient[0][c] + moved[1] * gradient[1][c] +
+                   moved[2] * gradient[2][c];
         }
     };
 
@@ -149,7 +149,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         found.sc = sc_cells + here.at;
         UNROLLED
         for (int a = 0; a < 3; ++a) {
-            found.along[a] = parts.along[a];
+            found.moved[a] = parts.moved[a];
             found.gradient[a] = gradients + (a * all + here.at);
         }
         UNROLLED
