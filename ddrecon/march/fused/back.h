@@ -264,7 +264,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             }
             Spot<F, false, V> spot = node;
             spot.y = node.y.behind(node.z.cells[i] * lines.rows);
-            spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, linear_bar);
+            Runs<F> runs;
+            runs.find(spot.y, spot.x, lines);
+            spread_to_cells(spot, runs, 0, value_bar, linear_bar);
         }
     }
 

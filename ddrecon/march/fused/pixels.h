@@ -28,7 +28,7 @@ template <class F> struct Pixels {
         Packet packet;
         packet.y = Place<F, V>::at(P::load(places, n, 2, total - 1), rows);
         packet.x = Place<F, V>::at(P::load(places + 1, n, 2, total - 1), columns);
-        packet.runs = Runs<F>(packet.y, packet.x, lines());
+        packet.runs.find(packet.y, packet.x, lines());
         return packet;
     }
     INLINE V value_at(const Packet& packet, const F* v) const {

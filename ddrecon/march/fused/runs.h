@@ -11,8 +11,7 @@ constexpr int MOST_RUNS = 5;
 
 #if defined(__CUDA_ARCH__)
 template <class F> struct Runs {
-    INLINE Runs() {}
-    template <class N> INLINE Runs(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
+    template <class N> INLINE void find(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
 };
 #else
 // `lanes` (bits) that are a run, the first of which is `lane`; they need columns `low` to `high`,
@@ -26,8 +25,7 @@ struct Run {
 template <class F> struct Runs {
     int count;
     Run run[LANES];
-    Runs() {}
-    Runs(
+    INLINE void find(
         const Place<F, typename Packets<F>::V>& y, const Place<F, typename Packets<F>::V>& x,
         const Lines& lines) {
         typedef Packets<F> P;
