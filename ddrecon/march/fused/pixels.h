@@ -98,7 +98,7 @@ template <class F> struct Pixels {
                 for (int r = 0; r < packet.runs.count; ++r) {
                     const Shares<F> shares(packet.runs.run[r], packet.y, packet.x, lines(), true);
                     for (int k = 0; k < count; ++k)
-                        shares.add_cubic(field + k * size, bars[k], -bars[k]);
+                        shares.template add<true>(field + k * size, bars[k], -bars[k]);
                 }
 #endif
             }

@@ -1,5 +1,4 @@
 #pragma once
-#include "ddrecon/march/fused/optics.h"
 #include "ddrecon/march/fused/runs.h"
 // A packet of rays: what stands where in a node's values (`kernels.py`), where its nodes lie, what
 // they emit, and the integral of that.
