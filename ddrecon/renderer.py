@@ -250,7 +250,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     elif scene.render.background:
         behind = _background(scene.lights, sight.rays)
     radiance, clear = march(_emission(light_field, sight.rays), sight, scene.render, behind)
-    if behind is not None:
+    if behind is not None and clear is not None:
         radiance = radiance + clear * behind
     if samples > 1:
         radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)

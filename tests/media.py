@@ -104,7 +104,10 @@ def march_rays(
     emission: Emission, rays: Rays, settings: RenderSettings, behind: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Radiance and transmittance [C, R] along `rays`, a camera's or any others."""
-    return march(emission, look_along(emission.grid, rays, settings), settings, behind)
+    behind = torch.zeros_like(rays.direction[:, 0]) if behind is None else behind
+    radiance, clear = march(emission, look_along(emission.grid, rays, settings), settings, behind)
+    assert clear is not None
+    return radiance, clear
 
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
