@@ -39,10 +39,8 @@ backward pass fills an array of all cells.
 
 def march(
     emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
-) -> tuple[Tensor, Tensor | None]:
-    """Radiance [C, R] scattered towards the camera along its rays (E2.1).
-
-    And transmittance [C, R] where there is light `behind` [C, R] to be seen through the volume.
+) -> Tensor:
+    """Radiance [C, R] along the rays of a camera, with that `behind` [C, R] the volume (E2.1).
 
     Every ray through the box is marched itself. Where pixels are closer together than the volume
     can tell, rays of a lattice are marched instead, and pixels interpolated between them to third
@@ -51,13 +49,12 @@ def march(
     """
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
-        return nothing, 1 - nothing
+        return nothing if behind is None else nothing + behind
     sampler = Sampler(emission, sight.way, settings.steps)
 
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
-        """Radiance, and opacity if asked for, [C or 2 C, P] of those in `crossing`."""
+        """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""
         radiance, mass = _march_by_engine(sampler, rays, crossing)
-        # E2.1: what comes from the volume, and 1 - tau of what is behind it.
         return radiance if behind is None else torch.cat([radiance, opacity_of(emission, mass)])
 
     if sight.lattice is None:
@@ -70,8 +67,10 @@ def march(
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
             values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
-    scattered, *opacity = values.split(emission.colors)
-    return scattered, 1 - opacity[0] if opacity else None
+    if behind is None:
+        return values
+    scattered, opacity = values.split(emission.colors)
+    return scattered + (1 - opacity) * behind
 
 
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
