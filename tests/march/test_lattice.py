@@ -94,7 +94,7 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     own_places = replace(lattice, places=places)
     monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
     interpolated, own = (
-        march_rays(emission, lattice.rays, INTERPOLATED, torch.ones(())),
+        march_rays(emission, lattice.rays, INTERPOLATED),
         march_rays(emission, lattice.rays, OWN),
     )
     for one, other in zip(interpolated, own, strict=True):
