@@ -26,6 +26,8 @@ from ddrecon.kernels.text import TextKernel
 ROOM = "diffusion/solvers/fused"
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
+FINE = 200_000
+"""Grids of so many cells are made by all threads, which takes a launch for each step."""
 STAGES = 128
 """More than there can be: each halves the cells along an axis."""
 
@@ -76,7 +78,7 @@ class Hierarchy:
 
         def make(first: int, last: int) -> list[float]:
             """Does these steps; how strong the last level's scaled conductances are by axis."""
-            parts = threads if work[0][0].numel() > SMALL else 1
+            parts = threads if work[0][0].numel() > FINE else 1
             for step in range(first, last) if parts > 1 else (first,):
                 end = step + 1 if parts > 1 else last
                 if step % steps >= MAKING["WEIGH"] or rows[step // steps, COLUMNS["SCALE"]]:
