@@ -249,9 +249,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         behind = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)
     elif scene.render.background:
         behind = _background(scene.lights, sight.rays)
-    radiance, clear = march(_emission(light_field, sight.rays), sight, scene.render, behind)
-    if behind is not None:
-        radiance = radiance + clear * behind
+    radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     if samples > 1:
         radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)
     return radiance.expand(3, -1).unflatten(-1, camera.size)

@@ -100,11 +100,11 @@ def make_scene(
     )
 
 
-def march_rays(
-    emission: Emission, rays: Rays, settings: RenderSettings, behind: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def march_rays(emission: Emission, rays: Rays, settings: RenderSettings) -> tuple[Tensor, Tensor]:
     """Radiance and transmittance [C, R] along `rays`, a camera's or any others."""
-    return march(emission, look_along(emission.grid, rays, settings), settings, behind)
+    sight = look_along(emission.grid, rays, settings)
+    radiance, seen = (march(emission, sight, settings, one) for one in (None, torch.ones(())))
+    return radiance, seen - radiance
 
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:

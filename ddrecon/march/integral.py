@@ -39,24 +39,23 @@ backward pass fills an array of all cells.
 
 def march(
     emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Radiance [C, R] scattered towards the camera along its rays, and transmittance [C, R] (E2.1).
+) -> Tensor:
+    """Radiance [C, R] along the rays of a camera, with that `behind` [C, R] the volume (E2.1).
 
     Every ray through the box is marched itself. Where pixels are closer together than the volume
     can tell, rays of a lattice are marched instead, and pixels interpolated between them to third
     order. A pixel that this might change by more than `settings.tolerance` of the image's root
-    mean square, with the light `behind` [C, R] seen through the volume, keeps its own ray.
+    mean square keeps its own ray.
     """
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
-        return nothing, 1 - nothing
+        return nothing if behind is None else nothing + behind
     sampler = Sampler(emission, sight.way, settings.steps)
 
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
-        """Radiance and opacity [2 C, P] of those of `rays` that are in `crossing`."""
+        """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""
         radiance, mass = _march_by_engine(sampler, rays, crossing)
-        # E2.1: what comes from the volume, and 1 - tau of what is behind it.
-        return torch.cat([radiance, opacity_of(emission, mass)])
+        return radiance if behind is None else torch.cat([radiance, opacity_of(emission, mass)])
 
     if sight.lattice is None:
         values = _spread(march_these(sight.rays, sight.crossing), sight)
@@ -68,8 +67,10 @@ def march(
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
             values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
+    if behind is None:
+        return values
     scattered, opacity = values.split(emission.colors)
-    return scattered, 1 - opacity
+    return scattered + (1 - opacity) * behind
 
 
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
@@ -83,7 +84,7 @@ def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[
 
 
 def _interpolate(values: Tensor, sight: Sight, places: Tensor) -> Tensor:
-    """`values` [2 C, r, c] of a lattice at the `places` of pixels, [2 C, R] along all rays."""
+    """`values` [K, r, c] of a lattice at the `places` of pixels, [K, R] along all rays."""
     if current_engine() == "warp" and not is_varied(places):
         from ddrecon.march.fused.between import interpolate_pixels
 
@@ -96,18 +97,20 @@ def _find_rough(
 ) -> Tensor:
     """Which pixels among the rays of a lattice are not to be interpolated: numbers [*].
 
-    The `values` [2 C, r, c] of the lattice say that this may change the image by more than
+    The `values` [C or 2 C, r, c] of the lattice say that this may change the image by more than
     `tolerance` of its root mean square.
     """
-    scattered, opacity = values.detach().chunk(2)
-    brightest = 0.0 if behind is None else behind.detach().max()
-    seen = scattered + brightest * (1 - opacity)
+    values = seen = values.detach()
+    if behind is not None:
+        (scattered, opacity), brightest = values.chunk(2), behind.detach().max()
+        seen = scattered + brightest * (1 - opacity)
+        values = torch.cat([scattered, brightest * opacity])
     bound = tolerance * seen.square().mean(dtype=torch.float64).sqrt()
-    return find_rough(torch.cat([scattered, brightest * opacity]), bound.to(values.dtype), lattice)
+    return find_rough(values, bound.to(values.dtype), lattice)
 
 
 def _spread(along: Tensor, sight: Sight) -> Tensor:
-    """Radiance and opacity [2 C, R] of all rays: those `along` the ones that hit, else 0."""
+    """Numbers [K, R] of all rays: those `along` the ones that hit, else 0."""
     count = len(sight.rays.direction)
     if along.shape[1] == count:
         return along

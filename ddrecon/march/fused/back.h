@@ -245,9 +245,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 if (!is_asked[c]) continue;
                 F* const field = bars.fields[c] + offset;
                 if (L::is_cubic(c))
-                    shares.add_cubic(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
+                    shares.template add<true>(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
                 else
-                    shares.add(field, v_bar[c]);
+                    shares.template add<false>(field, v_bar[c]);
             }
         }
 #endif
@@ -264,7 +264,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             }
             Spot<F, false, V> spot = node;
             spot.y = node.y.behind(node.z.cells[i] * lines.rows);
-            spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, linear_bar);
+            Runs<F> runs;
+            runs.find(spot.y, spot.x, lines);
+            spread_to_cells(spot, runs, 0, value_bar, linear_bar);
         }
     }
 

@@ -33,9 +33,9 @@ def pixel_kernel(name: str, bits: int) -> TextKernel:
 
 
 def interpolate_pixels(values: Tensor, places: Tensor, hit: Tensor, count: int) -> Tensor:
-    """Radiance and opacity [2 C, `count`] of all pixels.
+    """Numbers [K, `count`] of all pixels.
 
-    `values` [2 C, r, c] of lattice rays are interpolated at `places` [P, 2] to pixels `hit` [P],
+    `values` [K, r, c] of lattice rays are interpolated at `places` [P, 2] to pixels `hit` [P],
     which ascend; others stay 0.
     """
     out: Tensor = _Interpolate.apply(values, places, hit, count)

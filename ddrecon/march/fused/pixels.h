@@ -28,7 +28,7 @@ template <class F> struct Pixels {
         Packet packet;
         packet.y = Place<F, V>::at(P::load(places, n, 2, total - 1), rows);
         packet.x = Place<F, V>::at(P::load(places + 1, n, 2, total - 1), columns);
-        packet.runs = Runs<F>(packet.y, packet.x, lines());
+        packet.runs.find(packet.y, packet.x, lines());
         return packet;
     }
     INLINE V value_at(const Packet& packet, const F* v) const {
@@ -98,7 +98,7 @@ template <class F> struct Pixels {
                 for (int r = 0; r < packet.runs.count; ++r) {
                     const Shares<F> shares(packet.runs.run[r], packet.y, packet.x, lines(), true);
                     for (int k = 0; k < count; ++k)
-                        shares.add_cubic(field + k * size, bars[k], -bars[k]);
+                        shares.template add<true>(field + k * size, bars[k], -bars[k]);
                 }
 #endif
             }

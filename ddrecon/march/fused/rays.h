@@ -1,5 +1,4 @@
 #pragma once
-#include "ddrecon/march/fused/optics.h"
 #include "ddrecon/march/fused/runs.h"
 // A packet of rays: what stands where in a node's values (`kernels.py`), where its nodes lie, what
 // they emit, and the integral of that.
@@ -60,10 +59,10 @@ struct Layout {
         return b * RAY_TERMS + (HAS_TABLES ? c * (HAS_NUMBERS ? 2 : COEFFICIENTS) : 0);
     }
     static constexpr INLINE bool is_cubic(int c) { return c >= FIRST_MASS && c < AFTER_MASSES; }
-    // Whether beam b is a point light.
+    // Whether beam b is a point light: known to be none where there are none.
     static constexpr INLINE bool is_point(int b) {
-        const bool points[] = {POINTS..., false};
-        return points[b];
+        constexpr bool points[] = {POINTS..., false};
+        return (POINTS || ... || false) && points[b];
     }
 };
 
@@ -265,7 +264,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         node.y = at(1, lines.rows);
         node.x = at(2, lines.columns);
         if (!IS_SLICED) node.z = at(0, given.depth);
-        if (IS_SLICED) node.runs = Runs<F>(node.y, node.x, lines);
+        if (IS_SLICED) node.runs.find(node.y, node.x, lines);
         sample(node, n, 0, L::EXTINCTION);
         if (L::SCATTERING) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;

@@ -1,5 +1,6 @@
 #pragma once
 #include "ddrecon/march/fused/cells.h"
+#include "ddrecon/march/fused/optics.h"
 // Packets of places that are close to each other: their values, in vectors of cells. Some lanes, a
 // run, lie between the same two rows and within LANES columns. Columns of a row are read in one
 // piece, and lanes pick theirs by a permutation: 1.4 times as fast as lane by lane.
@@ -11,8 +12,7 @@ constexpr int MOST_RUNS = 5;
 
 #if defined(__CUDA_ARCH__)
 template <class F> struct Runs {
-    INLINE Runs() {}
-    template <class N> INLINE Runs(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
+    template <class N> INLINE void find(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
 };
 #else
 // `lanes` (bits) that are a run, the first of which is `lane`; they need columns `low` to `high`,
@@ -26,8 +26,7 @@ struct Run {
 template <class F> struct Runs {
     int count;
     Run run[LANES];
-    Runs() {}
-    Runs(
+    INLINE void find(
         const Place<F, typename Packets<F>::V>& y, const Place<F, typename Packets<F>::V>& x,
         const Lines& lines) {
         typedef Packets<F> P;
@@ -131,7 +130,7 @@ template <class F> INLINE void spread_place(
 #else
 // What the lanes of a run count for LANES columns of cells, from its first on.
 template <class F> struct Shares {
-    typedef Packets<F> P;
+    typedef Numbers<F> P;
     typedef typename P::V V;
     Run run;
     Lines lines;
@@ -146,50 +145,46 @@ template <class F> struct Shares {
         : run(run), lines(lines), ya(y.a), y_excess(y.excess) {
         for (int r = 0; r < 4; ++r)
             rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
-        // 1 in column k of a run: entries LANES - 1 - k on.
-        F ones[2 * LANES - 1] = {};
-        ones[LANES - 1] = F(1);
-        auto column = [&](int k) -> V { return P::read(ones + LANES - 1 - (k - run.first)); };
-        const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
+        const typename P::I column = P::numbers() + run.first;
         for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            V at[4];
-            for (int c = 0; c < 4; ++c) at[c] = column(((const int*)&x.cells[c])[l]);
-            const F w1 = xa[l], w0 = F(1) - w1;
-            linear[l] = w0 * at[1] + w1 * at[2];
+            const F w1 = P::own(x.a, l), w0 = F(1) - w1, excess = P::own(x.excess, l);
+            auto at = [&](int c, F weight) HERE -> V {
+                const auto is = column == ((const int*)&x.cells[c])[l];
+                return P::pick(__builtin_convertvector(is, typename P::M), P::all(weight), V{});
+            };
+            linear[l] = at(1, w0) + at(2, w1);
             if (is_cubic)
-                cubic[l] = excess[l] * ((w1 - F(2) * w0) * at[1] + (w0 - F(2) * w1) * at[2] +
-                                        w0 * at[0] + w1 * at[3]);
+                cubic[l] = (at(0, excess * w0) + at(1, excess * (w1 - F(2) * w0))) +
+                           (at(2, excess * (w0 - F(2) * w1)) + at(3, excess * w1));
         }
     }
-    // To a row of cells what linear values there have as bars, and corrections along the row.
-    template <bool IS_CUBIC> void add_row(F* row, V bar, V bend_bar = V{}) const {
-        V sum = P::all(F(0));
+    // To the rows of a field what values there have as bars, and corrections if it IS_CUBIC.
+    template <bool IS_CUBIC> void add(F* field, V bar, V bend_bar = V{}) const {
+        const V in_j = bar * ya, bend_j = bend_bar * ya, bend_i = bend_bar - bend_j;
+        const V in_m = y_excess * bend_i, in_p = y_excess * bend_j;
+        const V bar_i = (bar - in_j) + (in_p - F(2) * in_m), bar_j = in_j + (in_m - F(2) * in_p);
+        V sum[4] = {};
         for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            sum += ((const F*)&bar)[l] * linear[l];
-            if (IS_CUBIC) sum += ((const F*)&bend_bar)[l] * cubic[l];
+            const V weight = linear[l];
+            sum[1] += P::own(bar_i, l) * weight;
+            sum[2] += P::own(bar_j, l) * weight;
+            if (!IS_CUBIC) continue;
+            sum[0] += P::own(in_m, l) * weight;
+            sum[3] += P::own(in_p, l) * weight;
+            sum[1] += P::own(bend_i, l) * cubic[l];
+            sum[2] += P::own(bend_j, l) * cubic[l];
         }
+        for (int r = !IS_CUBIC; r < 3 + IS_CUBIC; ++r) write(field + rows[r], sum[r]);
+    }
+    INLINE void write(F* row, V sum) const {
         if (lines.column == 1 && lines.columns >= LANES) {
             P::write(row + run.first, P::read(row + run.first) + sum);
         } else {
-            const F* values = (const F*)&sum;
             for (int j = run.low; j <= run.high; ++j)
-                row[(long long)j * lines.column] += values[j - run.first];
+                row[(long long)j * lines.column] += P::own(sum, j - run.first);
         }
-    }
-    void add(F* field, V bar) const {
-        const V in_j = bar * ya;
-        add_row<false>(field + rows[1], bar - in_j);
-        add_row<false>(field + rows[2], in_j);
-    }
-    void add_cubic(F* field, V bar, V bend_bar) const {
-        const V bend_j = bend_bar * ya, bend_i = bend_bar - bend_j;
-        const V in_m = y_excess * bend_i, in_p = y_excess * bend_j, in_j = bar * ya;
-        add_row<false>(field + rows[0], in_m);
-        add_row<false>(field + rows[3], in_p);
-        add_row<true>(field + rows[1], (bar - in_j) + (in_p - F(2) * in_m), bend_i);
-        add_row<true>(field + rows[2], in_j + (in_m - F(2) * in_p), bend_j);
     }
 };
 #endif

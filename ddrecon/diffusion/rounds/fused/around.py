@@ -1,0 +1,28 @@
+"""Linear functions of what is around a cell, by fused kernels (E2.9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from ddrecon.kernels.cell_function import RowFunction
+
+_PLACE, _GIVEN = "Line3(row, nz, ny, nx), ", "int nz, ny, nx"
+
+
+def rises_fused(q: Tensor) -> Tensor:
+    """As `cell_gradient`."""
+    return _find("Rises", (3, *q.shape), q)
+
+
+def means_fused(field: Tensor) -> Tensor:
+    """As `cell_means`."""
+    return _find("Means", field.shape, field)
+
+
+def _find(name: str, shape: Sequence[int], field: Tensor) -> Tensor:
+    z, y, x = field.shape[1:]
+    header, sizes = "diffusion/rounds/fused/around.h", {"nz": z, "ny": y, "nx": x}
+    function = RowFunction(header, name, (tuple(shape),), x, _PLACE, _GIVEN, sizes)
+    return function.apply(field.new_zeros(1, len(field)), field)[0]
