@@ -140,7 +140,7 @@ def test_what_is_left_shrinks_in_hard_volumes(
     assert all(after < 0.7 * before for before, after in pairwise(left)), left
 
 
-@pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 20.0), (0.8, 20.0)])
+@pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 10.0), (0.8, 20.0)])
 def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
     g: float, thickness: float
 ):
@@ -164,7 +164,7 @@ def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
     diffuse, few, many = (
         float((image(coarse, rounds) - truth).norm() / truth.norm()) for rounds in (0, 3, 8)
     )
-    assert max(few, many) < diffuse + 0.01, (diffuse, few, many)
+    assert max(few, many) < diffuse + 0.005, (diffuse, few, many)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6, -0.5, -0.9])
