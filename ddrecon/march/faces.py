@@ -75,12 +75,7 @@ class _Extend(torch.autograd.Function):
 
     @staticmethod
     def forward(axis: int | None, lines: list[bool], field: Tensor, lit: Tensor) -> Tensor:
-        longer = field.new_empty(len(field), *(count + 2 for count in field.shape[1:]))
-        _inner(longer).copy_(field)
-        for is_line, dark, face in zip(lines, (1 - lit).unbind(), FACES, strict=True):
-            layer, last, before = _layers(longer, face)
-            layer.copy_(dark * _line(last, before).clamp(min=0) if is_line else last)
-        return _beyond(longer, axis, lines)
+        return _extend(axis, lines, field, lit)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -114,21 +109,40 @@ class _Extend(torch.autograd.Function):
         def change(
             longer: Tensor, lit: Tensor, d_field: Tensor | None, d_lit: Tensor | None
         ) -> Any:
-            d_longer = torch.zeros_like(longer)
-            if d_field is not None:
-                _inner(d_longer).copy_(d_field)
-            for k, face in enumerate(FACES):
-                d_layer, d_last, d_before = _layers(d_longer, face)
-                d_value = d_last
-                if ctx.lines[k]:
-                    line = _line_on_face(longer, face, ctx.axis, ctx.lines)
-                    d_value = (1 - lit[k]) * _line(d_last, d_before) * (line > 0)
-                    if d_lit is not None:
-                        d_value = d_value - d_lit[k] * line.clamp(min=0)
-                d_layer.copy_(d_value)
-            return _beyond(d_longer, ctx.axis, ctx.lines)
+            d_field = torch.zeros_like(_inner(longer)) if d_field is None else d_field
+            return _extend(ctx.axis, ctx.lines, d_field, lit, longer, d_lit)
 
         return run_plainly(change, *ctx.saved_tensors, *changes)
+
+
+def _extend(
+    axis: int | None,
+    lines: list[bool],
+    field: Tensor,
+    lit: Tensor,
+    known: Tensor | None = None,
+    d_lit: Tensor | None = None,
+) -> Tensor:
+    """What `_Extend` makes of `field`; or if it is `known` of changes, `field` and `d_lit`."""
+    longer = field.new_empty(len(field), *(count + 2 for count in field.shape[1:]))
+    _inner(longer).copy_(field)
+    for k, face in enumerate(FACES):
+        layer, last, before = _layers(longer, face)
+        value = last
+        if lines[k]:
+            own = line = _line(last, before)
+            if known is not None:
+                line = _line_on_face(known, face, axis, lines)
+            value = (1 - lit[k]) * own * (line > 0)
+            if d_lit is not None:
+                value = value - d_lit[k] * line.clamp(min=0)
+        layer.copy_(value)
+    # From values on faces to those half a cell beyond.
+    for face, is_line in zip(FACES, lines, strict=True):
+        if is_line and face[0] != axis:
+            layer, last, _ = _layers(longer, face, is_whole=True)
+            layer.mul_(2).sub_(last)
+    return longer
 
 
 def _inner(longer: Tensor) -> Tensor:
@@ -148,19 +162,10 @@ def _line(last: Tensor, before: Tensor) -> Tensor:
     return last + 0.5 * (last - before)
 
 
-def _beyond(longer: Tensor, axis: int | None, lines: list[bool]) -> Tensor:
-    """From values on faces those half a cell beyond, but across `axis` (in place)."""
-    for face, is_line in zip(FACES, lines, strict=True):
-        if is_line and face[0] != axis:
-            layer, last, _ = _layers(longer, face, is_whole=True)
-            layer.mul_(2).sub_(last)
-    return longer
-
-
 def _line_on_face(
     longer: Tensor, face: tuple[int, int], axis: int | None, lines: list[bool]
 ) -> Tensor:
-    """`_line` of the values on earlier faces, of which `longer` has those `_beyond`."""
+    """`_line` of the values on earlier faces, of which `longer` has those beyond."""
     line = _line(*_layers(longer, face)[1:])
     for earlier, is_line in zip(FACES[: 2 * face[0]], lines, strict=False):
         if is_line and earlier[0] != axis:
