@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 from media import random_values
 from torch import Tensor
 
-from ddrecon.numerics.decay import SERIES_BELOW, decay_mean, decayed_line, decayed_sum
+from ddrecon.numerics.decay import SERIES_BELOW, decay_mean, decay_terms, decayed_sum
 
 DEPTHS = (0.0, 1e-6, SERIES_BELOW - 1e-3, SERIES_BELOW + 1e-3, 0.3, 5.0, 50.0, 1e4)
 
@@ -65,10 +63,8 @@ def test_both_modes_have_derivatives():
         (weight, begin, end, scale),
         check_forward_ad=True,
     )
-    near, far = (random_values(len(DEPTHS) - 1, 1, 3, seed=seed) for seed in (4, 5))
-    depth = (1e-5 + torch.tensor(DEPTHS[:-1], dtype=torch.float64)).view(-1, 1, 1)
-    inputs = [one.clone().requires_grad_() for one in (near, far, depth)]
-    assert torch.autograd.gradcheck(decayed_line, inputs, check_forward_ad=True)
+    depth = (1e-5 + torch.tensor(DEPTHS[:-1], dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(decay_terms, depth, check_forward_ad=True)
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
@@ -86,15 +82,13 @@ def test_single_precision_follows_double(depth: float):
     assert slopes[0] == pytest.approx(slopes[1], rel=8 * epsilon * max(1 / SERIES_BELOW, depth))
 
 
-@pytest.mark.parametrize("depth", DEPTHS[:-1])
-def test_a_decayed_line_against_quadrature(depth: float):
+@pytest.mark.parametrize("depth", [depth for depth in DEPTHS if depth <= 50])
+def test_what_leaves_a_step_and_is_on_it_against_quadrature(depth: float):
+    """Of what is emitted evenly, and in proportion to the way from the middle."""
     nodes, weights = np.polynomial.legendre.leggauss(60)
-    part = (nodes + 1) / 2
-    expected = float(((0.7 + (2.5 - 0.7) * part) * np.exp(-depth * part) * weights).sum() / 2)
-    near, far, depths = (
-        torch.full((1, 1, 1), value, dtype=torch.float64) for value in (0.7, 2.5, depth)
-    )
-    line, lost = decayed_line(near, far, depths)
-    assert line.item() == pytest.approx(expected, rel=1e-11) and lost.item() == pytest.approx(
-        -math.expm1(-depth), rel=1e-14
-    )
+    part, weights = (nodes + 1) / 2, weights / 2
+    later = weights @ np.exp(-depth * np.outer(part, 1 - part)) * (1 - part)
+    phi, psi, eta = (float(one) for one in decay_terms(torch.tensor(depth, dtype=torch.float64)))
+    for emitted, leaves, own in ((1 + 0 * part, phi, psi), (part - 0.5, depth * eta, -eta)):
+        assert weights @ (emitted * np.exp(-depth * (1 - part))) == pytest.approx(leaves, 1e-12)
+        assert weights @ (emitted * later) == pytest.approx(own, rel=1e-11)

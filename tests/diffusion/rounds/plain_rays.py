@@ -19,51 +19,64 @@ from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 Direction = tuple[float, float, float]
+Cell = tuple[int, int, int]
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
+NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
+"""Gauss's rule on [0, 1]."""
 
 
-def at_previous(values: Tensor, point: list[float], edge: float | None) -> float:
-    """`values` [z, y, x] at a fractional cell index, at least one of which is whole; beyond the box
-    `edge`, or the nearest cell's.
-    """
+def arriving(leaving: Tensor, cell: Cell, moved: list[float], edge: float) -> float:
+    """The mean of what cells around `cell` - `moved` let through; beyond the box, `edge`."""
     total = 0.0
     for corner in product((0, 1), repeat=3):
-        cell, weight = [math.floor(p) + c for p, c in zip(point, corner, strict=True)], 1.0
-        for p, c in zip(point, corner, strict=True):
-            weight *= (p % 1) if c else 1 - p % 1
-        if weight == 0:
-            continue
-        is_outside = any(not 0 <= i < n for i, n in zip(cell, values.shape, strict=True))
-        nearest = tuple(min(max(i, 0), n - 1) for i, n in zip(cell, values.shape, strict=True))
-        total += weight * (edge if is_outside and edge is not None else float(values[nearest]))
+        part, at = 1.0, []
+        for i, m, c in zip(cell, moved, corner, strict=True):
+            part *= abs(m) if c else 1 - abs(m)
+            at.append(i - c * int(math.copysign(1, m)))
+        if part > 1e-12:
+            is_inside = all(0 <= i < n for i, n in zip(at, leaving.shape, strict=True))
+            total += part * (float(leaving[tuple(at)]) if is_inside else edge)
     return total
 
 
-def by_cells(medium: Medium, scatters: Tensor, direction: Direction, inflow: float = 0.0) -> Tensor:
-    """I [z, y, x] of a gray medium, cell after cell (E2.9).
+def rise_at(q: Tensor, cell: Cell, moved: list[float]) -> float:
+    """How much `q` [z, y, x] rises over `moved` cells, by differences of the nearest neighbors."""
+    total = 0.0
+    for axis, m in enumerate(moved):
+        ends = [list(cell), list(cell)]
+        ends[0][axis] = max(cell[axis] - 1, 0)
+        ends[1][axis] = min(cell[axis] + 1, q.shape[axis] - 1)
+        if apart := ends[1][axis] - ends[0][axis]:
+            total += m * float(q[tuple(ends[1])] - q[tuple(ends[0])]) / apart
+    return total
 
-    The integral along each step is taken by Gauss's rule.
+
+def by_cells(
+    medium: Medium, scatters: Tensor, even: Tensor, direction: Direction, inflow: float = 0.0
+) -> Tensor:
+    """Means of I [z, y, x] of a gray medium, cell after cell (E2.9); `even` has the slope of q.
+
+    With what is emitted at the part s of a way, and I there, integrated by Gauss's rule.
     """
     extinction, scattering = medium.extinction.value[0], medium.remaining_scattering[0]
     axis, step = fastest_axis(medium.grid, direction)
-    speed = [c / h for c, h in zip(direction, medium.grid.spacing, strict=True)]
-    radiance = torch.zeros_like(extinction)
-    s, weights = (torch.from_numpy(array) for array in np.polynomial.legendre.leggauss(30))
+    moved = [step * c / h for c, h in zip(direction, medium.grid.spacing, strict=True)]
+    leaving, means = torch.zeros_like(extinction), torch.zeros_like(extinction)
     for cell in sorted(
-        product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * speed[axis]
+        product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * moved[axis]
     ):
-        point = [round(i - v * step, 12) for i, v in zip(cell, speed, strict=True)]
-        depth = 0.5 * step * (float(extinction[cell]) + at_previous(extinction, point, 0.0))
-        scattered = 0.5 * step * (float(scattering[cell]) + at_previous(scattering, point, 0.0))
-        line = 0.5 * ((1 - s) * scatters[cell] + (1 + s) * at_previous(scatters, point, None))
-        arriving = at_previous(radiance, point, inflow) * math.exp(-depth)
-        radiance[cell] = arriving + scattered * float(
-            0.5 * weights @ (line * torch.exp(-0.5 * depth * (1 + s)))
-        )
-    return radiance
+        depth, strength = step * float(extinction[cell]), step * float(scattering[cell])
+        emitted = strength * (float(scatters[cell]) + rise_at(even, cell, moved) * (NODES - 0.5))
+        before, left = arriving(leaving, cell, moved, inflow), 1 - NODES
+        # what is emitted at s is exp(-depth (t - s)) of it at t: at the end, and on average
+        leaving[cell] = before * math.exp(-depth) + WEIGHTS @ (emitted * np.exp(-depth * left))
+        rest = [t * (WEIGHTS @ np.exp(-depth * t * NODES)) for t in left]
+        means[cell] = before * (WEIGHTS @ np.exp(-depth * NODES)) + WEIGHTS @ (emitted * rest)
+    return means
 
 
 def fastest_axis(grid: Grid, direction: Direction) -> tuple[int, float]:
-    """The axis along which most cells are crossed, and the length of the step across one."""
+    """The axis along which most cells are crossed, and the length of the way through one."""
     steps = [h / max(abs(c), 1e-300) for c, h in zip(direction, grid.spacing, strict=True)]
     return steps.index(min(steps)), min(steps)
 
@@ -73,28 +86,43 @@ def quadrature(directions: int) -> list[tuple[Direction, float]]:
     return list(zip(map(tuple, points.tolist()), weights.tolist(), strict=True))
 
 
-def sweep_by_loops(medium: Medium, source: Tensor, inflow: float, directions: int) -> Tensor:
+def sweep_by_loops(
+    medium: Medium, source: Tensor, even: Tensor, inflow: float, directions: int
+) -> Tensor:
     """The means of I Y_k [K, 1, z, y, x] (E2.8), gray, one direction after another."""
     total = torch.zeros_like(source)
     degree = math.isqrt(len(source)) - 1
     for w, weight in quadrature(directions):
         values = harmonics(torch.tensor(w, dtype=torch.float64), degree).view(-1, 1, 1, 1, 1)
-        total += weight * values * by_cells(medium, (values * source).sum(0)[0], w, inflow)
+        total += weight * values * by_cells(medium, (values * source).sum(0)[0], even, w, inflow)
     return total
 
 
+def mean_density(density: Tensor) -> Tensor:
+    """Cells' means of a density that is linear between centers, and even beyond the last."""
+    found = torch.zeros_like(density)
+    for cell in product(*(range(n) for n in density.shape)):
+        for offset in product((-1, 0, 1), repeat=3):
+            around = zip(cell, offset, density.shape, strict=True)
+            at = tuple(min(max(i + o, 0), n - 1) for i, o, n in around)
+            found[cell] += 6 ** offset.count(0) / 8**3 * density[at]
+    return found
+
+
 def share_by_loops(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1, d exp(-p_1) times a mean step's depth."""
+    """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step."""
     length = weights = 0.0
     for w, weight in quadrature({3: 26, 5: 50}[degree]):
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
     share = torch.ones_like(medium.extinction.value)
+    transport = medium.extinction.value - medium.mean_cosine * medium.remaining_scattering
     for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
-        half = 0.5 * math.exp(-float(medium.mean_cosine)) * extinction * length / max(weights, 1e-9)
-        rho = half / math.tanh(half) - 1 if half > 1e-3 else 0.0
-        share.view(-1)[cell] = 1 / (1 + rho**2)
+        half = 0.5 * extinction * length / max(weights, 1e-9)
+        if half > 1e-3:
+            part = float(transport.flatten()[cell]) / extinction
+            share.view(-1)[cell] = 1 / (1 + 0.7 * (half / math.tanh(half) - 1) * part)
     return share
 
 
@@ -111,25 +139,29 @@ def factors_by_formula(g: float, rounds: int) -> list[float]:
 
 
 def round_by_loops(
-    problem: DiffusionProblem, light: Moments, g: float, degree: int, is_last: bool
+    problem: DiffusionProblem, swept: Medium, light: Moments, g: float, degree: int, is_last: bool
 ) -> Moments:
-    """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves."""
-    medium, (operator, right) = problem.medium, problem.system
+    """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves.
+
+    `swept` is the problem's medium with the means of cells.
+    """
+    operator, right = problem.system
     directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
-    matrix, theta = dense_matrix(operator)[0], share_by_loops(medium, degree)
+    matrix, theta = dense_matrix(operator)[0], share_by_loops(swept, degree)
     p = remaining_by_formula(g, angles)
     each = light.mean.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
     source = each.view(-1, 1, 1, 1, 1) * light.harmonics(angles) + problem.source.harmonics(angles)
-    swept = Moments.of_harmonics(sweep_by_loops(medium, source, float(problem.outside), directions))
-    gain = theta * (swept.mean - light.mean)
+    new = Moments.of_harmonics(
+        sweep_by_loops(swept, source, source[0, 0], float(problem.outside), directions)
+    )
+    gain = theta * (new.mean - light.mean)
     imbalance = right - (matrix @ light.mean.flatten()).view_as(right)
-    total = right + medium.remaining_scattering * gain - theta * imbalance
-    if light.flux is None or swept.flux is None or swept.higher is None:
+    total = right + swept.remaining_scattering * gain - imbalance
+    if light.flux is None or new.flux is None or new.higher is None:
         return Moments(torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)
     part = 1.0 if is_last else (1 - p[1]) / (2 - p[1])
-    turned = tuple(
-        theta * part * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
-    )
+    changes = [theta * (after - was) for after, was in zip(new.flux, light.flux, strict=True)]
+    turned = tuple(part * p[1] * change for change in changes)
     # the same problem with this flux as its only source: what E2.4 adds to the right side
     alone = replace(
         problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside
@@ -137,7 +169,12 @@ def round_by_loops(
     total = total + alone.system[1]
     u = torch.linalg.solve(matrix, total.flatten()).view_as(right)
     parts = zip(
-        problem.flux(u), alone.flux(0 * u), swept.flux, problem.flux(light.mean), strict=True
+        problem.flux(u),
+        alone.flux(0 * u),
+        changes,
+        light.flux,
+        problem.flux(light.mean),
+        strict=True,
     )
-    z, y, x = (flux + extra + theta * (new - old) for flux, extra, new, old in parts)
-    return Moments(u + gain, (z, y, x), theta * swept.higher)
+    z, y, x = (flux + more + change + was - old for flux, more, change, was, old in parts)
+    return Moments(u + gain, (z, y, x), new.higher)

@@ -1,7 +1,8 @@
-"""Radiance along one direction: closed forms, a slow twin, reversal, derivatives."""
+"""Radiance along one direction: closed forms, energy, a slow twin, reversal, derivatives."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
@@ -9,6 +10,7 @@ from plain_rays import by_cells
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import radiance_along
+from ddrecon.diffusion.rounds.sweep import cell_gradient
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
@@ -36,68 +38,130 @@ def random_source(grid: Grid, colors: int = 1) -> Tensor:
     return 1 + random_values(colors, *grid.shape, seed=1)
 
 
+def outside(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64).view(-1, 1, 1, 1)
+
+
 @each_direction
 def test_slices_at_once_are_cells_one_by_one(direction):
     grid = box_grid((3, 4, 5))
     medium, scatters = medium_of(4 * random_values(3, 4, 5), grid), random_source(grid)
-    torch.testing.assert_close(
-        radiance_along(medium, scatters, None, direction)[0],
-        by_cells(medium, scatters[0], direction),
-        rtol=1e-12,
-        atol=0,
-    )
+    even = random_values(*grid.shape, seed=2)
+    found, _ = radiance_along(medium, scatters, cell_gradient(even[None]), outside(0.3), direction)
+    expected = by_cells(medium, scatters[0], even, direction, 0.3)
+    torch.testing.assert_close(found[0], expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_along_an_axis_a_uniform_medium_follows_the_closed_form(axis: int, sign: int):
-    grid, albedo = box_grid((4, 5, 6)), 0.9
-    medium = medium_of(torch.full((4, 5, 6), 0.7, dtype=torch.float64), grid, albedo)
+@pytest.mark.parametrize("depth", [1e-4, 0.5, 30.0])
+def test_along_an_axis_a_linear_source_follows_the_closed_form(axis: int, sign: int, depth: float):
+    """Of q = q_0 + b s, I is a (b (s - l / k) + q_0 l), l = 1 - exp(-k s); its mean over cells."""
+    grid, albedo, q_0, b = box_grid((4, 5, 6)), 0.9, 2.0, 3.0
+    step, count = grid.spacing[axis], grid.shape[axis]
+    k = depth / step
+    medium = medium_of(torch.full(grid.shape, k / 4, dtype=torch.float64), grid, albedo)
+    ends = step * torch.arange(count + 1, dtype=torch.float64)
+    middle = (ends[1:] + ends[:-1]) / 2
+    lines = [q_0 + b * middle]
+    nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(60))
+    s = middle[:, None] + 0.5 * step * nodes
+    lost = -torch.expm1(-k * s)
+    lines.append((albedo * (b * (s - lost / k) + q_0 * lost)) @ weights / 2)
+    layout = [-1 if a == axis else 1 for a in range(3)]
+    scatters, expected = (
+        (line if sign > 0 else line.flip(0)).view(layout).expand(grid.shape) for line in lines
+    )
     direction = tuple(float(sign * (a == axis)) for a in range(3))
-    scatters = torch.full((1, 4, 5, 6), 2.0, dtype=torch.float64)
-    found = radiance_along(medium, scatters, None, direction)
-    crossed = (torch.arange(grid.shape[axis], dtype=torch.float64) + 0.5) * grid.spacing[axis]
-    crossed = (crossed if sign > 0 else crossed.flip(0)).view(
-        [-1 if a == axis else 1 for a in range(3)]
+    found, _ = radiance_along(
+        medium, scatters[None], cell_gradient(scatters[None]), None, direction
     )
-    torch.testing.assert_close(
-        found[0],
-        (2 * albedo * (1 - torch.exp(-4 * 0.7 * crossed))).expand(grid.shape),
-        rtol=1e-12,
-        atol=0,
-    )
+    torch.testing.assert_close(found[0], expected, rtol=1e-9, atol=0)
 
 
 @each_direction
 def test_a_white_medium_in_a_white_room_stays_white(direction):
     grid = box_grid((5, 4, 6))
     medium = medium_of(30 * half_empty(5, 4, 6), grid, albedo=1.0, colors=3)
-    room = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64).view(3, 1, 1, 1)
-    found = radiance_along(medium, room.expand(3, *grid.shape), room, direction)
-    torch.testing.assert_close(found, room.expand_as(found), rtol=1e-13, atol=0)
+    room = outside(2, 3, 5)
+    white = room.expand(3, *grid.shape)
+    found, leaving = radiance_along(medium, white, cell_gradient(white), room, direction)
+    torch.testing.assert_close(found, white, rtol=1e-13, atol=0)
+    torch.testing.assert_close(leaving, torch.zeros_like(white), rtol=0, atol=1e-13)
+
+
+@each_direction
+@pytest.mark.parametrize("thickness", [1e-6, 1.0, 1e4])
+def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: float):
+    """Beside light that enters and would leave without a medium."""
+    grid = box_grid((4, 5, 3))
+    medium = medium_of(thickness * half_empty(4, 5, 3), grid)
+    scatters, room = random_source(grid), outside(0.7)
+    mean, leaving = radiance_along(medium, scatters, cell_gradient(scatters), room, direction)
+    speed = [c / h for c, h in zip(direction, grid.spacing, strict=True)]
+    fastest = max(map(abs, speed))
+    # the part of what leaves a cell that goes on to others
+    inside = torch.ones(grid.shape, dtype=torch.float64)
+    for axis, along in enumerate(speed):
+        inside.select(axis, -1 if along > 0 else 0).mul_(1 - abs(along) / fastest)
+    emitted = (medium.remaining.value * scatters).sum() / fastest
+    absorbed = (medium.extinction.value * mean).sum() / fastest
+    torch.testing.assert_close(
+        emitted, absorbed + (leaving * (1 - inside)).sum(), rtol=1e-12, atol=1e-13
+    )
+
+
+@each_direction
+def test_what_a_cell_is_to_another_this_is_to_it_on_the_way_back(direction):
+    """Of even sources in cells, a sweep is the transpose of that of the opposite direction."""
+    grid = box_grid((4, 5, 3))
+    medium, one = medium_of(6 * half_empty(4, 5, 3), grid), random_source(grid)
+    other, even = one.flip(2), torch.zeros(3, *one.shape, dtype=torch.float64)
+    back = tuple(-c for c in direction)
+    there, _ = radiance_along(medium, one, even, None, direction)
+    here, _ = radiance_along(medium, other, even, None, back)
+    strength = medium.remaining.value
+    torch.testing.assert_close(
+        (strength * other * there).sum(), (strength * one * here).sum(), rtol=1e-13, atol=0
+    )
+
+
+@pytest.mark.parametrize("depth", [1.0, 5.0, 100.0])
+def test_long_waves_spread_as_far_as_light_goes_whatever_the_depth_of_cells(depth: float):
+    """Of q = x^2 / 2, light along x and against it is q + q'' / kappa_t^2, far from faces."""
+    grid = Grid((1, 1, 121), (0.0, 0.0, 0.0), (1.0, 1.0, 121.0))
+    medium = medium_of(torch.full(grid.shape, depth / 4, dtype=torch.float64), grid, albedo=1.0)
+    q = (0.5 * (torch.arange(121, dtype=torch.float64) - 60) ** 2).view(1, *grid.shape)
+    along, against = (
+        radiance_along(medium, q, cell_gradient(q), None, (0.0, 0.0, way))[0] for way in (1.0, -1.0)
+    )
+    more = ((along + against) / 2 - q)[0, 0, 0, 55:66] * depth**2
+    torch.testing.assert_close(more, torch.ones_like(more), rtol=0, atol=1e-8)
 
 
 @each_direction
 def test_turning_grid_and_direction_around_turns_the_radiance(direction):
     grid = box_grid((4, 5, 3))
-    medium, scatters = medium_of(random_values(4, 5, 3), grid), random_source(grid)
-    turned = scatters.flip(1, 2, 3)
-    opposite = tuple(-c for c in direction)
-    found = radiance_along(
-        medium_of(random_values(4, 5, 3).flip(0, 1, 2), grid), turned, None, opposite
+    density, scatters = random_values(4, 5, 3), random_source(grid)
+    back, turned = tuple(-c for c in direction), scatters.flip(1, 2, 3)
+    found, other = (
+        radiance_along(medium_of(one, grid), q, cell_gradient(q), None, way)[0]
+        for one, q, way in (
+            (density, scatters, direction),
+            (density.flip(0, 1, 2), turned, back),
+        )
     )
-    torch.testing.assert_close(
-        found.flip(1, 2, 3), radiance_along(medium, scatters, None, direction), rtol=1e-13, atol=0
-    )
+    torch.testing.assert_close(other.flip(1, 2, 3), found, rtol=1e-13, atol=0)
 
 
 @each_direction
-def test_radiance_is_never_negative_where_nothing_that_scatters_is(direction):
+def test_radiance_of_even_sources_is_never_negative(direction):
     grid = box_grid((6, 5, 4))
     for seed, thickness in enumerate((1e-6, 1.0, 1e3, 1e6)):
         medium = medium_of(thickness * half_empty(6, 5, 4, seed=seed), grid)
         sharp = random_values(1, *grid.shape, seed=seed) ** 20
-        assert bool((radiance_along(medium, sharp, None, direction) >= 0).all())
+        even = torch.zeros(3, *sharp.shape, dtype=torch.float64)
+        assert bool((radiance_along(medium, sharp, even, None, direction)[0] >= 0).all())
 
 
 @each_direction
@@ -112,7 +176,7 @@ def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int
     def radiance(density: Tensor, g: Tensor, scatters: Tensor, inflow: Tensor) -> Tensor:
         extinction = density.new_tensor([3.0, 9.0, 20.0][:colors])
         medium = scale_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
-        return radiance_along(medium, scatters, inflow, direction)
+        return radiance_along(medium, scatters, cell_gradient(scatters), inflow, direction)
 
     assert torch.autograd.gradcheck(
         radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True

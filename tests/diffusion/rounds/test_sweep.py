@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
-from plain_rays import factors_by_formula, round_by_loops, share_by_loops, sweep_by_loops
+from plain_rays import (
+    factors_by_formula,
+    mean_density,
+    round_by_loops,
+    share_by_loops,
+    sweep_by_loops,
+)
 
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import sweep
-from ddrecon.diffusion.rounds.transport import _transport_share, run_rounds
+from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
+from ddrecon.diffusion.rounds.transport import (
+    _mean_step,
+    _transport_share,
+    average_cells,
+    run_rounds,
+)
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
@@ -44,31 +57,49 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
     medium = gray_medium(shape, 0.4 * has_flux, varies)
     source = random_light(shape, degree).harmonics(degree)
     inflow = torch.full((1, 1, 1, 1), 0.3, dtype=torch.float64)
-    swept = sweep(medium, source, inflow, 3)
-    expected = sweep_by_loops(medium, source, 0.3, 26)
+    swept = sweep(medium, source, cell_gradient(source[0]), inflow, 3)
+    expected = sweep_by_loops(medium, source, source[0, 0], 0.3, 26)
     torch.testing.assert_close(swept, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_what_scatters_evenly_is_swept_alike_with_all_its_moments():
     shape = (3, 2, 4)
     medium, even = gray_medium(shape, 0.0), random_light(shape, 0)
-    one = sweep(medium, even.harmonics(0), None, 5)
-    many = sweep(medium, even.harmonics(5), None, 5)
+    one, many = (
+        sweep(medium, even.harmonics(degree), cell_gradient(even.mean), None, 5)
+        for degree in (0, 5)
+    )
     torch.testing.assert_close(many[:1], one, rtol=1e-13, atol=0)
 
 
+@pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4), (1, 1, 6), (1, 1, 1)], ids=str)
-def test_the_share_of_transport_is_that_of_the_mean_step(shape: tuple[int, int, int]):
-    medium = gray_medium(shape, 0.0)
-    torch.testing.assert_close(
-        _transport_share(medium, 5), share_by_loops(medium, 5), rtol=1e-10, atol=0
-    )
+def test_the_share_of_a_change_is_that_of_the_mean_step(shape: tuple[int, int, int], g: float):
+    medium = gray_medium(shape, g)
+    share = _transport_share(medium, _mean_step(medium.grid, 5))
+    torch.testing.assert_close(share, share_by_loops(medium, 5), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4)], ids=str)
+def test_sweeps_see_the_means_of_cells(shape: tuple[int, int, int]):
+    """Of each field, whether both coefficients have the same one or not."""
+    for varies in (False, True):
+        medium = gray_medium(shape, 0.4, varies)
+        found = average_cells(medium)
+        for one, mean in (
+            (medium.extinction, found.extinction),
+            (medium.remaining, found.remaining),
+        ):
+            expected = mean.scale.view(-1, 1, 1, 1) * mean_density(one.field[0])
+            torch.testing.assert_close(mean.value, expected, rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
 def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
     shape, degree = (2, 2, 3), 3 * (g != 0)
-    medium = scale_medium(gray_volume(shape, g), 3)
+    volume = gray_volume(shape, g)
+    medium = scale_medium(volume, 3)
+    swept = scale_medium(replace(volume, density=mean_density(volume.density)), 3)
     problem = DiffusionProblem(
         medium,
         lambda extinction: 1 / (3 * extinction + 0.5),
@@ -80,9 +111,9 @@ def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
     start = solve_conservative(problem, solve)
     for rounds in (1, 2):
         expected = start
-        factors = factors_by_formula(g, rounds) if g else [1.0] * rounds
+        factors = factors_by_formula(g, rounds) if g and rounds > 1 else [1.0] * rounds
         for number, factor in enumerate(factors, 1):
-            new = round_by_loops(problem, expected, g, 3, number == rounds)
+            new = round_by_loops(problem, swept, expected, g, 3, number == rounds)
             old = expected.harmonics(degree)
             blended = old + factor * (new.harmonics(degree) - old)
             expected = Moments.of_harmonics(blended)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,15 +16,19 @@ from torch.nn.functional import interpolate
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep
-from ddrecon.diffusion.rounds.transport import run_rounds
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep
+from ddrecon.diffusion.rounds.transport import average_cells, run_rounds
 from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import reduced_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
+from ddrecon.validate.hard import Shape, full, layer
+from ddrecon.validate.hard import ball as hard_ball
 
+CUBES = (1.0, 1.0, 1.0)
 WHITE = {"sigma_a": (0.0,), "sigma_s": (10.0,)}
 
 
@@ -51,7 +56,8 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     medium = scale_medium(scene.volume)
     source = reduced_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
-    swept = sweep(medium, Moments(last).plus(source).harmonics(0), None, 3)[0]
+    light = last + source.mean
+    swept = sweep(average_cells(medium), light[None], cell_gradient(light), None, 3)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
@@ -78,7 +84,37 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
     # A backward or forward peak is no part of diffusion: there the first round is the measure.
     first, later = (light_after(scene, rounds) for rounds in (int(g != 0), 6))
     assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(first.norm())
-    assert float((later - light_after(scene, 7)).norm()) < 0.05 * float(later.norm())
+    changes = [float((light_after(scene, n + 1) - light_after(scene, n)).norm()) for n in (3, 6)]
+    assert changes[1] < 0.5 * changes[0] or changes[1] < 0.05 * float(later.norm()), changes
+
+
+def left_of_noise(
+    density: Tensor, spacing: Triple, depth: float, g: float, degree: int, rounds: Sequence[int]
+) -> list[float]:
+    """Sizes of what so many rounds leave of noise, which holds all waves, without any source.
+
+    `depth` is that of cells of density 1 along their shortest side.
+    """
+    cells, random = density.shape, torch.Generator().manual_seed(7)
+    z, y, x = (n * step for n, step in zip(cells, spacing, strict=True))
+    sigma = depth / min(spacing)
+    scene = make_scene(
+        density,
+        sigma_a=(1e-4 * sigma,),
+        sigma_s=((1 - 1e-4) * sigma,),
+        g=g,
+        grid=Grid((cells[0], cells[1], cells[2]), (0.0, 0.0, 0.0), (z, y, x)),
+    )
+    medium = scale_medium(scene.volume, degree)
+    known = (degree + 1) ** 2 if g else 1
+    noise = torch.randn(known, 1, *cells, generator=random, dtype=torch.float64)
+    nothing = Moments.of_harmonics(torch.zeros_like(noise))
+    problem = DiffusionProblem(
+        medium, Closure("geometric", medium.grid), nothing, noise.new_zeros(1, 1, 1, 1), g != 0
+    )
+    solve = SolverWithMemory(multigrid, 1e-8, SolveMemory(is_warm=False))
+    ends = (run_rounds(problem, Moments.of_harmonics(noise), solve, n, degree) for n in rounds)
+    return [float(light.harmonics(medium.degree if g else 0).norm()) for light in ends]
 
 
 @pytest.mark.parametrize(
@@ -86,24 +122,22 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
     [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.85, 5, 1.5), (0.85, 7, 1.5), (0.95, 5, 1.5), (0.95, 7, 6.0)],
 )
 def test_rounds_forget_where_they_began(g: float, degree: int, thickness: float):
-    """From noise, which holds all waves, and in a box full of it, where diffusion passes few on."""
-    cells, random = (1, 16, 16, 16), torch.Generator().manual_seed(7)
-    scene = make_scene(
-        torch.ones(cells[1:], dtype=torch.float64),
-        sigma_a=(0.001,),
-        sigma_s=(16 * thickness,),
-        g=g,
-        tolerance=1e-8,
-    )
-    medium = scale_medium(scene.volume, degree)
-    noise = torch.randn((degree + 1) ** 2, *cells, generator=random, dtype=torch.float64)
-    nothing = Moments.of_harmonics(torch.zeros_like(noise))
-    problem = DiffusionProblem(
-        medium, Closure("geometric", medium.grid), nothing, noise.new_zeros(1, 1, 1, 1), True
-    )
-    solve = SolverWithMemory(multigrid, 1e-8, SolveMemory(is_warm=False))
-    light = run_rounds(problem, Moments.of_harmonics(noise), solve, 16, degree)
-    assert float(light.harmonics(degree).norm()) < 1e-3 * float(noise.norm())
+    """In a box full of medium, where diffusion passes few waves on."""
+    (begun, left) = left_of_noise(full((16, 16, 16)), CUBES, thickness, g, degree, (0, 16))
+    assert left < 1e-3 * begun
+
+
+@pytest.mark.parametrize(
+    ("g", "degree", "thickness"), [(0.0, 3, 0.5), (-0.8, 3, 6.0), (0.85, 5, 2.0)]
+)
+@pytest.mark.parametrize("spacing", [CUBES, (1.0, 1.0, 20.0), (20.0, 1.0, 1.0), (1.0, 5.0, 0.2)])
+@pytest.mark.parametrize("density", [full, hard_ball, layer])
+def test_what_is_left_shrinks_in_hard_volumes(
+    density: Callable[[Shape], Tensor], spacing: Triple, g: float, degree: int, thickness: float
+):
+    """Up to faces and corners, where density jumps by 1e6, and in flat and long cells."""
+    left = left_of_noise(density((6, 5, 7)), spacing, thickness, g, degree, (0, 6, 12, 18))
+    assert all(after < 0.7 * before for before, after in pairwise(left)), left
 
 
 @pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 20.0), (0.8, 20.0)])
@@ -125,28 +159,12 @@ def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
         return render(scene)
 
     coarse = ball(8, 0.4)
-    fine = interpolate(coarse[None, None], scale_factor=2, mode="trilinear")[0, 0]
+    fine = interpolate(coarse[None, None], scale_factor=4, mode="trilinear")[0, 0]
     truth = image(fine, 4)
     diffuse, few, many = (
         float((image(coarse, rounds) - truth).norm() / truth.norm()) for rounds in (0, 3, 8)
     )
-    assert max(few, many) < diffuse + 0.005, (diffuse, few, many)
-
-
-def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is():
-    def change(thickness: float) -> float:
-        scene = make_scene(
-            torch.ones(8, 8, 8),
-            sigma_a=(0.0,),
-            sigma_s=(8 * thickness,),
-            directional=(3.0,),
-            tolerance=1e-9,
-        )
-        diffuse = light_after(scene, 0)
-        return float((light_after(scene, 3) - diffuse).norm() / diffuse.norm())
-
-    changes = [change(thickness) for thickness in (30.0, 300.0, 3000.0)]
-    assert changes[2] < 0.2 * changes[1] < 0.04 * changes[0] < 0.04, changes
+    assert max(few, many) < diffuse + 0.01, (diffuse, few, many)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6, -0.5, -0.9])
@@ -216,7 +234,7 @@ def test_memory_does_not_grow_with_directions():
         medium, source = scale_medium(scene.volume), torch.ones(1, 3, 10, 10, 10).double()
         found = []
         with saved_tensors_hooks(lambda one: found.append(one.detach()) or one, lambda one: one):
-            total = sweep(medium, source, None, degree).sum()
+            total = sweep(medium, source, cell_gradient(source[0]), None, degree).sum()
         assert total.requires_grad
         return len({one.data_ptr() for one in found if one.numel() >= 1000})
 
