@@ -74,4 +74,4 @@ class Emission:
             return None
         first = len(self.extinction.field) + len(self.diffuse)
         last = first + sum(len(beam.mass) for beam in self.beams)
-        return ThirdOrder(first, last, self.extinction.mass_bound)
+        return ThirdOrder(first, last, self.extinction.mass_bound, border=1)

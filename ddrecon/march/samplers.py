@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
+from ddrecon.march.faces import extend_fields
 from ddrecon.medium.coefficients import Volume, along_colors
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
 from ddrecon.numerics.remember import remember
@@ -76,9 +77,14 @@ class Sampler:
         return torch.linspace(0, 1, nodes, dtype=like.dtype, device=like.device)
 
     @functools.cached_property
+    def fields(self) -> dict[str, Tensor]:
+        """Those of the emission up to the faces of the box, [channels, z + 2, y + 2, x + 2]."""
+        return extend_fields(self.emission, self.way.axis)
+
+    @functools.cached_property
     def values(self) -> Tensor:
-        """All channels in all planes [N, channels, rows, columns], or cells [channels, z, y, x]."""
-        cells = torch.cat(list(self.emission.fields.values()))
+        """All channels in all planes [N, channels, rows, columns], or of all `fields`."""
+        cells = torch.cat(list(self.fields.values()))
         if self.way.axis is None:
             return cells
         row, column = across(self.way.axis)
@@ -100,7 +106,9 @@ class Sampler:
         places = []
         for one in reversed(axes):
             place = rays.origin[:, one] + distance * rays.direction[:, one]
-            places.append(2 * (place - grid.lower[one]) / grid.extent[one] - 1)
+            # From -1 to 1 with the layer more on both sides; beyond the box as on its face.
+            inside = (2 * (place - grid.lower[one]) / grid.extent[one] - 1).clamp(-1, 1)
+            places.append(inside * (grid.shape[one] / (grid.shape[one] + 2)))
         points = torch.stack(places, -1)
         if axis is None:
             return sample_volume(values, points, third_order).transpose(0, 1), distance
@@ -110,8 +118,8 @@ class Sampler:
 
 @remember
 def order_of_slices(count: int, way: Way, device: torch.device) -> Tensor:
-    """Which of `count` slices of cells lies in each plane, before cells are subdivided."""
-    index = torch.arange(-1, count + 1, dtype=torch.int32, device=device).clamp(0, count - 1)
+    """Which of `count` slices lies in each plane, before cells are subdivided."""
+    index = torch.arange(count, dtype=torch.int32, device=device)
     return index.flip(0) if way.is_reversed else index
 
 
@@ -132,9 +140,10 @@ def planes_across(
 def support_of_planes(support: Tensor, way: Way, steps: int) -> Tensor:
     """Where `support` [z, y, x] is not 0 in the planes of slices: bool [N, rows, columns]."""
     assert way.axis is not None
-    order = order_of_slices(support.shape[way.axis], way, support.device)
-    slices = (support != 0).permute(way.axis, *across(way.axis)).index_select(0, order)
-    return subdivide(slices[:, None].float(), steps)[:, 0] > 0
+    longer = pad((support != 0)[None, None].float(), [1] * 6, mode="replicate")[0, 0]
+    slices = longer.permute(way.axis, *across(way.axis))
+    slices = slices.flip(0) if way.is_reversed else slices
+    return subdivide(slices[:, None], steps)[:, 0] > 0
 
 
 def choose_steps(volume: Volume) -> int:

@@ -60,8 +60,8 @@ def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None)
 
     # a (1 - a) / 2 times the second difference along each axis; `points` count axes from the last.
     corrections = [
-        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bend
-        for axis, bend in zip(axes, bends, strict=True)
+        third_order_weight(points[..., 1 - axis], size, third_order.border)[:, None] * bend
+        for axis, size, bend in zip(axes, values.shape[2:], bends, strict=True)
     ]
     return subtract_correction(linear, torch.stack(corrections).sum(0), third_order)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.numerics.autodiff import is_varied
 
@@ -24,12 +25,14 @@ class ThirdOrder:
     """Channels, `first` to before `last`, that are interpolated to third order rather than second.
 
     The correction x is bounded smoothly, as x / sqrt(1 + (`bound` x)^2), so that jumps of a field
-    do no harm. `bound` is 1 over the most it may be; 0 sets no limit.
+    do no harm. `bound` is 1 over the most it may be; 0 sets no limit. With a `border` of 1, not 0,
+    values at the ends of an axis belong to faces, and all is linear up to them.
     """
 
     first: int
     last: int
     bound: Tensor | float = 0.0
+    border: int = 0
 
     @property
     def channels(self) -> slice:
@@ -51,11 +54,17 @@ def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None)
     low, high = values[:-1], values[1:]
     parts = [low + (high - low) * (i / steps) for i in range(steps)]
     if third_order is not None:
-        bend = second_difference(values[:, third_order.channels], 0)
+        curved, border = values[:, third_order.channels], third_order.border
+        if border:
+            # Those on faces, half a step away, as if they were a whole one away.
+            ends = 2 * curved[:1] - curved[1:2], 2 * curved[-1:] - curved[-2:-1]
+            curved = torch.cat([ends[0], curved[1:-1], ends[1]])
+        bend = second_difference(curved, 0)[border : len(values) - border]
         for i in range(1, steps):
             a = i / steps
             # The second difference there, itself linear between neighbors.
             correction = 0.5 * a * (1 - a) * (bend[:-1] * (1 - a) + bend[1:] * a)
+            correction = pad(correction, [0] * 2 * (values.ndim - 1) + [border] * 2)
             parts[i] = subtract_correction(parts[i], correction, third_order)
     return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
 
@@ -90,11 +99,11 @@ def ramp(place: Tensor, tolerance: float) -> Tensor:
     return held.clamp(0, 1) + slope * (place - held)
 
 
-def third_order_weight(coordinate: Tensor, size: int) -> Tensor:
+def third_order_weight(coordinate: Tensor, size: int, border: int) -> Tensor:
     """a (1 - a) / 2 at `coordinate` in [-1, 1] along `size` cells.
 
-    It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers; on a kink its slope
-    is the mean of both sides'.
+    It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers within the `border`;
+    on a kink its slope is the mean of both sides'.
     """
     place = ((coordinate + 1) * size - 1) / 2
     offset = place - place.round()
@@ -102,9 +111,10 @@ def third_order_weight(coordinate: Tensor, size: int) -> Tensor:
 
     # The same from either neighbor: a = |offset| from the nearer one.
     inner = 0.5 * offset.abs() * (1 - offset.abs())
-    within = torch.where((place > 0) & (place < size - 1), inner, torch.zeros_like(inner))
+    first, last = border, size - 1 - border
+    within = torch.where((place > first) & (place < last), inner, torch.zeros_like(inner))
 
     # At centers the value is 0. Slopes of both sides, -1/2 and 1/2, cancel, but at the outermost
     # ones, where that of the outer side is 0.
-    end = (place.round() == 0).to(place.dtype) - (place.round() == size - 1).to(place.dtype)
+    end = (place.round() == first).to(place.dtype) - (place.round() == last).to(place.dtype)
     return torch.where(is_on_kink, 0.25 * end * (place - place.detach()), within)

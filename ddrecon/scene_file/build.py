@@ -45,15 +45,14 @@ a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and
 """
 FEW_ANGLES = 0.1
 """A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
-THICK = 2.0
-"""Where a cell has more optical depths and light is scattered forward, one round of two moments is
-nearer to the truth than any of more: what is not scaled out as a peak has to cross the cell. Only
-where the phase function is given.
+THICK = 1.5, 4.0
+"""Where a cell has more optical depths than one of these, a round more: theta of E7.2 is less than
+1. Measured on half-spaces and slabs (docs/accuracy.md).
 """
 FLAT, BACKWARD = 0.5, 0.2
 """A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
-side of a plane, which takes more directions. So does a backward peak of more than that part of
-scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
+side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
+that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
 """
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
@@ -239,22 +238,24 @@ def choose_rounds(
         return settings
     moments = phase.moments(3)
     left = float(moments[:, 2].abs().max())
-    is_forward = float(moments[:, 1].min()) > 0 and not bool(phase.backward_tail(1, 1).any())
-    is_thick = is_forward and volume is not None and greatest_depth(volume) > THICK
     optimized = tree.optimize.parameters if tree.optimize else {}
     if any(name == "g" or name.startswith(PHASE) for name in optimized):
         left = max(left, OPTIMIZED)
-    elif is_thick:
-        left = 0.0
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    is_flat &= not is_thick and not any(name.endswith("density") for name in optimized)
-    if is_flat or float(phase.backward_tail(3, 1).max()) > BACKWARD:
-        rounds, degree = rounds + (left > MORE_ROUNDS[1]), 5
+    has_density = not any(name.endswith("density") for name in optimized)
+    depth = greatest_depth(volume) if volume is not None and has_density else 0.0
+    thick_rounds = sum(depth > bound for bound in THICK)
+    if thick_rounds or (is_flat and has_density) or _turns_back(phase):
+        rounds, degree = rounds + max(left > MORE_ROUNDS[1], thick_rounds), 5
     return replace(
         settings,
         transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,
         degree=degree if settings.degree is None else settings.degree,
     )
+
+
+def _turns_back(phase: PhaseFunction) -> bool:
+    return float(phase.backward_tail(3, 1).max()) > BACKWARD
 
 
 def _is_flat(media: Iterable[Volume]) -> bool:

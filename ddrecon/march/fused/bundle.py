@@ -65,12 +65,13 @@ def pack_rays(
 ) -> Packed:
     """Those rays that `hit` the box, by slices across `axis` unless that is None.
 
-    Origins and directions in cells, counted from cells' centers; `near` and `far` [u]. For slices
-    the coordinate across them comes first, in u, then those of rows and columns.
+    Origins and directions in cells, counted from centers of the layers that fields begin with;
+    `near` and `far` [u]. For slices the coordinate across them comes first, in u, then those of
+    rows and columns.
     """
     origin, direction = origin[hit], direction[hit]
     spacing = origin.new_tensor(grid.spacing)
-    places = (origin - origin.new_tensor(grid.lower)) / spacing - 0.5
+    places = (origin - origin.new_tensor(grid.lower)) / spacing + 0.5
     speeds = direction / spacing
     if axis is not None:
         order = list(across(axis))

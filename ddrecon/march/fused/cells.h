@@ -14,7 +14,9 @@ struct Lines {
 };
 
 // The four cells around a place on a line, which lies a part `a` of the way from the second to the
-// third; and a (1 - a) / 2, the `excess` of second differences that linear values have.
+// third; and a (1 - a) / 2, the `excess` of second differences that linear values have. Faces are
+// midway between the outermost cells of a line and the next: values stay beyond them, and are
+// linear up to them.
 template <class F, class N> struct Place {
     typedef Packets<F> P;
     typedef typename P::V V;
@@ -22,20 +24,21 @@ template <class F, class N> struct Place {
     I cells[4];
     N a, excess;
     static INLINE Place at(V y, int size) {
-        const V none = P::all(F(0)), end = P::all(F(size - 1));
+        const V none = P::all(F(0)), low = P::all(F(0.5)), high = P::all(F(size) - F(1.5));
         // Also where y is not a number.
-        const V inside = P::least(P::pick(y > none, y, none), end);
-        const I zero = P::whole(none), top = zero + (size - 1);
-        const I last = zero + (size > 1 ? size - 2 : 0), cell = P::whole(inside);
+        const V inside = P::least(P::pick(y > low, y, low), high);
+        const I zero = P::whole(none), i = P::whole(inside);
         Place q;
-        const I i = P::pick(cell > last, last, cell), j = P::pick(i + 1 > top, top, i + 1);
         q.cells[0] = P::pick(i > zero, i - 1, zero);
         q.cells[1] = i;
-        q.cells[2] = j;
-        q.cells[3] = P::pick(j + 1 > top, top, j + 1);
+        q.cells[2] = i + 1;
+        q.cells[3] = P::pick(i < zero + (size - 2), i + 2, i + 1);
         q.a = inside - P::real(i);
-        q.excess = P::pick((y > none) & (y < end), F(0.5) * q.a * (F(1) - q.a), none);
+        q.excess = P::pick(is_curved(y, size), F(0.5) * q.a * (F(1) - q.a), none);
         return q;
+    }
+    static INLINE typename P::M is_curved(V y, int size) {
+        return (y > P::all(F(1))) & (y < P::all(F(size - 2)));
     }
     // The same place of lines that begin `by` cells on.
     INLINE Place behind(I by) const {
@@ -109,7 +112,7 @@ template <class F, bool IS_SLICED, class N> struct Spot {
 };
 
 // A place as seen from one `side`, where it is a kink: on a cell's center slopes are the mean of
-// both sides (`numerics/third_order.py`). Beyond the outermost centers values stay.
+// both sides (`numerics/third_order.py`).
 template <class F> struct Kink {
     typedef Packets<F> P;
     typedef typename P::V V;
@@ -121,17 +124,18 @@ template <class F> struct Kink {
     }
     // Its derivative by y is along `direction`.
     template <class N> static INLINE Place<F, N> place(V y, int size, F side, int direction) {
-        const V none = P::all(F(0)), end = P::all(F(size - 1));
-        const V seen = P::pick(is_at(y, size), y + side * SIDE * F(size), y);
+        const V none = P::all(F(0)), low = P::all(F(0.5)), high = P::all(F(size) - F(1.5));
+        const V one = P::all(F(1)), seen = P::pick(is_at(y, size), y + side * SIDE * F(size), y);
         const Place<F, V> at = Place<F, V>::at(seen, size);
-        const V a = P::least(P::most(y, none), end) - P::real(at.cells[1]);
-        const V live = P::pick((seen > none) & (seen < end), P::all(F(1)), none);
+        const V a = P::least(P::most(y, low), high) - P::real(at.cells[1]);
+        const V live = P::pick((seen > low) & (seen < high), one, none);
+        const V bent = P::pick(Place<F, V>::is_curved(seen, size), one, none);
         Place<F, N> q = {
             {at.cells[0], at.cells[1], at.cells[2], at.cells[3]},
             N(a),
-            N(live * (F(0.5) * a * (F(1) - a)))};
+            N(bent * (F(0.5) * a * (F(1) - a)))};
         q.a.by[direction] = live;
-        q.excess.by[direction] = live * (F(0.5) - a);
+        q.excess.by[direction] = bent * (F(0.5) - a);
         return q;
     }
 };

@@ -72,14 +72,14 @@ class Cells:
 
 def cells_of(sampler: Sampler) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
-    emission, planes, way = sampler.emission, sampler.planes, sampler.way
-    fields, support = list(emission.fields.values()), emission.support
+    planes, way, support = sampler.planes, sampler.way, sampler.emission.support
+    fields = list(sampler.fields.values())
     if way.axis is None:
         return Cells(planes), fields
     if support is not None:
         support = support_of_planes(support, way, sampler.steps)
     if sampler.steps == 1:
-        order = order_of_slices(emission.grid.shape[way.axis], way, planes.device)
+        order = order_of_slices(len(planes), way, planes.device)
         return Cells(planes, way.axis, order, support), fields
     # Slices between those of cells are interpolated beforehand.
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)

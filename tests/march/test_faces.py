@@ -1,0 +1,111 @@
+"""Fields up to the faces of the box: light that is linear is so up to there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, make_camera, march_rays, random_values
+from torch import Tensor
+
+from ddrecon.cameras import cast_rays
+from ddrecon.engine import use_engine
+from ddrecon.light.beam import Beam
+from ddrecon.light.point_light import PointBeam
+from ddrecon.march.box import intersect_box
+from ddrecon.march.emission import Emission
+from ddrecon.march.faces import FACES, extend_fields, shine_through
+from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.settings import RenderSettings
+
+GRID = box_grid((3, 5, 4))
+TRAVEL = torch.tensor([-0.6, 0.8, 0.0], dtype=torch.float64)
+POSITION = torch.tensor([0.0, 0.1, 4.0], dtype=torch.float64)
+
+
+def emission_of(diffuse: Tensor, *masses: Tensor) -> Emission:
+    """A thin medium with some diffuse light, one directional and one point light."""
+    one = torch.ones(1, dtype=torch.float64)
+    density = torch.ones(GRID.shape, dtype=torch.float64)
+    medium = scale_medium(Volume(GRID, density, 1e-13 * one, 1e-12 * one, 0 * one[0]))
+    lights = [
+        (Beam, TRAVEL, one.view(1, 1, 1, 1)),
+        (PointBeam, POSITION, one.view(1, 1, 1, 1), 0.1),
+    ]
+    beams = tuple(kind(mass, *rest) for mass, (kind, *rest) in zip(masses, lights, strict=False))
+    matter = medium.extinction, medium.scattering
+    return Emission(GRID, *matter, beams, diffuse, medium.seen, medium.peak)
+
+
+def linear(*point: Tensor) -> Tensor:
+    return 2 + 0.5 * point[0] - 0.7 * point[1] + 0.3 * point[2]
+
+
+CAMERAS = {
+    "straight": {"half_width": 0.1},
+    "oblique": {"eye": (0.2, 0.3, 2.5), "half_width": 0.05},
+    "inside": {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
+}
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
+def test_linear_light_in_a_thin_medium_is_summed_exactly(engine: str, steps: int, view: dict):
+    """kappa_s times the length in the box times the light in its middle."""
+    use_engine(engine)
+    rays = cast_rays(make_camera(size=(5, 6), **view))
+    diffuse = linear(*GRID.centers(TRAVEL))[None]
+    settings = RenderSettings(steps_per_voxel=steps, tolerance=0.0)
+    scattered = march_rays(emission_of(diffuse), rays, settings)[0][0]
+    near, far = intersect_box(GRID, rays)
+    middle = rays.origin + 0.5 * (near + far)[:, None] * rays.direction
+    expected = 1e-12 * (far - near) * linear(*middle.unbind(1))
+    torch.testing.assert_close(scattered, expected, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("axis", [None, 0, 1, 2])
+def test_masses_are_zero_where_light_enters_and_others_go_on(axis: int | None):
+    """Constant light stays constant, and so does matter; linear masses are linear where unlit."""
+    mass = linear(*GRID.centers(TRAVEL))[None]
+    fields = extend_fields(emission_of(torch.full_like(mass, 3.0), mass, mass), axis)
+    for name, value in (("extinction", 1.0), ("diffuse", 3.0)):
+        torch.testing.assert_close(fields[name], torch.full_like(fields[name], value))
+    for name, lit in (("mass 0", [(0, 1), (1, 0)]), ("mass 1", [(2, 1)])):
+        for face in FACES:
+            layer, last, before = (
+                fields[name].select(1 + face[0], -1 - k if face[1] else k)[:, 1:-1, 1:-1]
+                for k in range(3)
+            )
+            on_face = layer if axis == face[0] else 0.5 * (layer + last)
+            expected = 0 * last if face in lit else 1.5 * last - 0.5 * before
+            torch.testing.assert_close(on_face, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_light_through_a_face_begins_smoothly():
+    """A direction, or a place, a little to the one side and to the other."""
+    one = torch.ones(1, dtype=torch.float64)
+    for way in (-1e-6, 0.0, 1e-6):
+        along = Beam(one, torch.tensor([way, 1.0, 0.0]), one)
+        beyond = PointBeam(one, torch.tensor([-way + GRID.lower[0], 0.0, 0.0]), one, 0.1)
+        for beam in (along, beyond):
+            assert float(shine_through(beam, GRID)[0]) <= 1e-8
+
+
+@pytest.mark.parametrize("axis", [None, 0, 1, 2])
+def test_extended_fields_have_both_derivatives(axis: int | None):
+    """By light, by masses, and by where it comes from; some of what goes on would be negative."""
+    diffuse, *masses = (random_values(1, *GRID.shape, seed=k).pow(4) for k in range(3))
+    direction, position = TRAVEL + 0.05, torch.tensor([-0.6, 0.1, 0.2], dtype=torch.float64)
+
+    def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
+        masses, places = rest[:2], rest[2:]
+        emission = emission_of(diffuse, *masses)
+        beam, point = emission.beams
+        beams = replace(beam, direction=places[0]), replace(point, position=places[1])
+        fields = extend_fields(replace(emission, beams=beams), axis)
+        return fields["diffuse"], fields["mass 0"], fields["mass 1"]
+
+    given = [one.requires_grad_() for one in (diffuse, *masses, direction, position)]
+    assert torch.autograd.gradcheck(extend, given, check_forward_ad=True)
