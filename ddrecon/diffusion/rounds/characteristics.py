@@ -127,7 +127,7 @@ def radiance_along(
                 for first, part in zip(more, (passed, source), strict=True)
             )
     arriving, leaving = follow(passed, source, course)
-    if way and entering is not None:
+    if isinstance(grid, Slab) and way and entering is not None:
         arriving, leaving = (
             part.narrow(dim, int(way > 0), grid.size) for part in (arriving, leaving)
         )

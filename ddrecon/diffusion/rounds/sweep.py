@@ -61,7 +61,7 @@ def sweep(
     def add(number: int, entering: Tensor) -> Tensor:
         row = values[number]
 
-        def follow() -> Tensor:
+        def follow() -> tuple[Tensor, Tensor]:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
             return radiance_along(medium, scatters, gradient, inflow, directions[number], entering)
