@@ -160,12 +160,12 @@ def _gain(
     the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and L1 -
     3 F(L0), None for zero.
     """
-    length = _mean_step(whole_of(medium.grid), degree)
+    step = _mean_step(whole_of(medium.grid), degree)
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        return gain_fused(medium, change, off, cosine, DAMPING, length)
-    share = recompute(_transport_share, medium, length)
+        return gain_fused(medium, change, off, cosine, DAMPING, step)
+    share = recompute(_transport_share, medium, step)
     gain = Moments(change.mean, change.flux).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
     turned = None if gain.flux is None else Moments(source, gain.flux).scaled(1.0, cosine).flux
@@ -190,30 +190,39 @@ def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     return imbalance
 
 
-def _transport_share(medium: Medium, length: float) -> Tensor:
+def _transport_share(medium: Medium, step: tuple[float, float]) -> Tensor:
     """theta = 1 / (1 + sigma rho kappa_tr / kappa_t), the share of a change that counts (E7.2).
 
-    rho is by how much too much sweeps of waves from cell to cell diffuse, of steps of a mean
-    `length` [u]. Returns `[C, z, y, x]` in (0, 1].
+    rho is by how much too much sweeps of waves from cell to cell diffuse; `step`: as `_mean_step`.
+    Returns `[C, z, y, x]` in (0, 1].
     """
+    length, shared = step
     depth = length * medium.extinction.value
-    # rho = d (psi / phi - 1/2) = d^2 eta / phi
+    # rho = d (psi / phi - 1/2) + shared d = d (d eta / phi + shared)
     phi, _, eta = decay_terms(depth)
     p_1 = remaining_moments(medium)[1] if medium.seen.degree else 0.0
     transport_depth = depth - length * p_1 * medium.remaining_scattering
-    return 1 / (1 + DAMPING * depth * eta / phi * transport_depth)
+    return 1 / (1 + DAMPING * (depth * eta / phi + shared) * transport_depth)
 
 
 @functools.cache
-def _mean_step(grid: Grid, degree: int) -> float:
-    """The mean length of a step along the directions of the quadrature [u]."""
-    # the length of a step along each direction; along an axis of one cell nothing varies, so such
-    # steps do not count
+def _mean_step(grid: Grid, degree: int) -> tuple[float, float]:
+    """The mean length of a step along the directions of the quadrature [u].
+
+    And the part of it by whose depth light diffuses too much, along the worst axis, because it goes
+    on to several cells (E7.2). Along an axis of one cell nothing varies: such steps do not count.
+    """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
-    courses = [Course.of(grid, tuple(point)) for point in points.tolist()]
-    step_lengths = weights.new_tensor(
-        [course.step if grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses]
-    )
-    # their mean over directions; a grid of one cell has none, and then theta is 1
-    weight_of_steps = weights[step_lengths > 0].sum().clamp(min=1e-9)
-    return float(weights @ step_lengths / weight_of_steps)
+    total = weight_of_steps = 0.0
+    shared = [0.0, 0.0, 0.0]
+    for point, weight in zip(points.tolist(), weights.tolist(), strict=True):
+        course = Course.of(grid, tuple(point))
+        if grid.shape[course.order[0] - 1] > 1:
+            total, weight_of_steps = total + weight * course.step, weight_of_steps + weight
+        for axis, moved in enumerate(course.moved):
+            if grid.shape[axis] > 1:
+                spread = abs(moved) * (1 - abs(moved)) * grid.spacing[axis] ** 2
+                shared[axis] += 1.5 * weight * spread / course.step
+    # a grid of one cell has no steps, and then theta is 1
+    length = total / max(weight_of_steps, 1e-9)
+    return length, max(shared) / max(length, 1e-300)

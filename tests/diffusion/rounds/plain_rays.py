@@ -110,19 +110,28 @@ def mean_density(density: Tensor) -> Tensor:
 
 
 def share_by_loops(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step."""
+    """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step.
+
+    And kappa_t 3/2 of the mean of t (1 - t) h^2 / step, along the axis where that is most.
+    """
     length = weights = 0.0
+    shared = [0.0, 0.0, 0.0]
     for w, weight in quadrature({3: 26, 5: 50}[degree]):
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
+        for one, h in enumerate(medium.grid.spacing):
+            t = step * abs(w[one]) / h
+            shared[one] += (medium.grid.shape[one] > 1) * 1.5 * weight * t * (1 - t) * h**2 / step
     share = torch.ones_like(medium.extinction.value)
     transport = medium.extinction.value - medium.mean_cosine * medium.remaining_scattering
     for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
         half = 0.5 * extinction * length / max(weights, 1e-9)
-        if half > 1e-3:
-            part = float(transport.flatten()[cell]) / extinction
-            share.view(-1)[cell] = 1 / (1 + 0.7 * (half / math.tanh(half) - 1) * part)
+        if half > 0:
+            rho = half / math.tanh(half) - 1 + max(shared) * extinction
+            share.view(-1)[cell] = 1 / (
+                1 + 0.7 * rho * float(transport.flatten()[cell]) / extinction
+            )
     return share
 
 

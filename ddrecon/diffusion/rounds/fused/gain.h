@@ -18,10 +18,11 @@ template <class F> INLINE Sloped<F> find_lag(F depth) {
 // theta (E7.2) of what a sweep changes of light's mean and flux, and what of that is a source to
 // diffusion (E2.10, E2.8). In: extinction, scattering unless it has the same field, the change of
 // mean and flux, and what light is off diffusion's. Out: the source, the gain of mean and flux, the
-// flux that is turned. Numbers, for fields of 1: the depth of a mean step; the same, and p_1 times
-// that of scattering, by sigma; the scale of scattering; the factor of the flux.
+// flux that is turned. Numbers, for fields of 1: the depth of a mean step; the part of it that is
+// shared; the depth, and p_1 times that of scattering, by sigma; the scale of scattering; the
+// factor of the flux.
 template <bool HAS_FLUX, bool SHARES_FIELD, bool IS_OFF> struct Gain {
-    enum { DEPTH, DAMPED, TURNED, STRENGTH, COSINE, NUMBERS };
+    enum { DEPTH, SHARED, DAMPED, TURNED, STRENGTH, COSINE, NUMBERS };
     static constexpr int PARTS = HAS_FLUX ? 4 : 1, SCATTERING = SHARES_FIELD ? 0 : 1;
     static constexpr int CHANGE = SCATTERING + 1, OFF = CHANGE + PARTS;
     static constexpr int INS = OFF + (IS_OFF ? PARTS : 0), OUTS = 2 * PARTS;
@@ -29,7 +30,7 @@ template <bool HAS_FLUX, bool SHARES_FIELD, bool IS_OFF> struct Gain {
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {
         const N depth = number[DEPTH] * in[0], lag = along(depth, find_lag(value_of(depth)));
         const N by = number[DAMPED] * in[0] - number[TURNED] * in[SCATTERING];
-        const N share = 1 / (1 + lag * by);
+        const N share = 1 / (1 + (lag + number[SHARED]) * by);
         const N *change = in + CHANGE, *off = in + OFF, moved = share * change[0];
         out[0] = number[STRENGTH] * in[SCATTERING] * moved;
         if constexpr (IS_OFF) out[0] -= off[0];

@@ -17,9 +17,9 @@ def gain_fused(
     off: Moments | None,
     cosine: Tensor,
     damping: float,
-    length: float,
+    step: tuple[float, float],
 ) -> tuple[Moments, Tensor, Vector | None]:
-    """As `_gain` in `transport.py`; `length`: of the mean step [u], by which theta is (E7.2)."""
+    """As `_gain` in `transport.py`; `step`: the mean one, by which theta is (E7.2)."""
     extinction, scattering = medium.extinction.field, medium.remaining.field
     is_so = change.flux is not None, scattering is extinction, off is not None
     fields = [extinction] if scattering is extinction else [extinction, scattering]
@@ -28,8 +28,10 @@ def gain_fused(
             fields += [light.mean, *(light.flux or ())]
     strength, moments = medium.remaining.scale, remaining_moments(medium)
     p_1 = moments[1] if len(moments) > 1 else torch.zeros_like(strength)
+    length, shared = step
     depth, turned = length * medium.extinction.scale, length * p_1 * strength
-    numbers = depth, damping * depth, damping * turned, strength, cosine
+    lag = torch.full_like(depth, shared)
+    numbers = depth, lag, damping * depth, damping * turned, strength, cosine
     colors = max(map(Tensor.numel, numbers))
     source, mean, *flux = apply_cell(
         "diffusion/rounds/fused/gain.h",
