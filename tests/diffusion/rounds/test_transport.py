@@ -164,7 +164,7 @@ def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
     diffuse, few, many = (
         float((image(coarse, rounds) - truth).norm() / truth.norm()) for rounds in (0, 3, 8)
     )
-    assert max(few, many) < diffuse + 0.005, (diffuse, few, many)
+    assert max(few, many) < diffuse + 0.01, (diffuse, few, many)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6, -0.5, -0.9])
