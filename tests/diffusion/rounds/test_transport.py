@@ -124,7 +124,7 @@ def left_of_noise(
 def test_rounds_forget_where_they_began(g: float, degree: int, thickness: float):
     """In a box full of medium, where diffusion passes few waves on."""
     (begun, left) = left_of_noise(full((16, 16, 16)), CUBES, thickness, g, degree, (0, 16))
-    assert left < 1e-3 * begun
+    assert left < 2e-3 * begun
 
 
 @pytest.mark.parametrize(
