@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.numerics.autodiff import is_fused
 from ddrecon.slabs.ghosts import Ghosts
 
 Prepared = TypeVar("Prepared")
@@ -92,6 +93,10 @@ class Operator:
         if self.ghosts is not None:
             # Each rank has the rows of its own cells: so a face that two have is counted once.
             adjoint = self.ghosts.without(adjoint)
+        if is_fused():
+            from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
+
+            return find_cotangents(self, adjoint, u)
         conductance_bars = (
             difference(adjoint, axis).mul_(difference(u, axis)).neg_().sum_to_size(c.shape)
             for axis, c in zip(AXES, self.conductances, strict=True)

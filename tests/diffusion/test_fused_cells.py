@@ -22,7 +22,12 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import faces
-from ddrecon.diffusion.fused.product import product_kernel, subtract_product
+from ddrecon.diffusion.fused.product import (
+    cotangents_kernel,
+    find_cotangents,
+    product_kernel,
+    subtract_product,
+)
 from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
@@ -133,6 +138,7 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
         product_kernel(32),
+        cotangents_kernel(32),
     ]
     assert_compiles(kernels, tmp_path)
 
@@ -149,3 +155,6 @@ def test_the_product_with_the_operator_is_torchs(shape: Shape, colors: tuple[int
     )
     found = subtract_product(u, u, operator.loss, *operator.conductances)
     torch.testing.assert_close(found, u - operator.apply(u), rtol=1e-13, atol=1e-13)
+    use_engine("torch")
+    bars = operator.cotangents(found, u)
+    torch.testing.assert_close(find_cotangents(operator, found, u), bars, rtol=1e-13, atol=1e-13)

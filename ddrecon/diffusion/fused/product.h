@@ -25,4 +25,22 @@ template <class F> INLINE void subtract_product(
     }
 }
 
+// Of what solves the operator's system (E3.2): loss_bar = -lambda u, and c_bar = -(G lambda)(G u).
+template <class F> INLINE void find_cotangents(
+    const Row& row, const Mesh<F>& mesh, const F* adjoint, const F* light, F* const* bars) {
+    const F *l = adjoint + row.at, *u = light + row.at;
+    F *loss = bars[0] + row.at, *faces[3];
+    UNROLLED
+    for (int a = 0; a < 3; ++a) faces[a] = mesh.at_faces(bars[1 + a], a, row.color);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        loss[i] = -l[i] * u[i];
+        UNROLLED
+        for (int a = 0; a < 3; ++a) {
+            const F rise = mesh.beyond(u, a, 1, i) - u[i];
+            if (mesh.inside(a, 1, i)) faces[a][i] = (l[i] - mesh.beyond(l, a, 1, i)) * rise;
+        }
+    }
+}
+
 } // namespace ddrecon

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -18,16 +19,29 @@ def subtract_product(
 ) -> Tensor:
     """What is `begun` less A u [C, z, y, x], for the `loss` and the conductances along all axes."""
     found, matrix = u.new_empty(u.shape), (loss, z, y, x)
-    colors, nz, ny, nx = u.shape
-    width = 1 if u.is_cuda else nx
-    rows = nz * ny * nx // width
-    given = {
-        "matrix": matrix, "is_each": [len(part) == colors for part in matrix], "light": u,
-        "begun": begun, "width": width, "rows": rows, "colors": colors,
-        "nz": nz, "ny": ny, "nx": nx,
-    }  # fmt: skip
-    product_kernel(8 * u.element_size()).launch(colors * rows, given, {"found": found})
+    given = {"matrix": matrix, "is_each": [len(part) == len(u) for part in matrix], "begun": begun}
+    _launch(product_kernel, given | {"light": u}, {"found": found})
     return found
+
+
+def find_cotangents(operator: Operator, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+    """What `operator.cotangents` returns."""
+    like = operator.loss, *operator.conductances
+    bars = [u.new_empty(len(u), *part.shape[1:]) for part in like]
+    _launch(cotangents_kernel, {"adjoint": adjoint, "light": u}, {"bars": bars})
+    return tuple(bar.sum_to_size(part.shape) for bar, part in zip(bars, like, strict=True))
+
+
+def _launch(
+    kernel: Callable[[int], TextKernel], given: dict[str, Any], made: dict[str, Any]
+) -> None:
+    """Runs a `kernel` for all rows of cells of `light`."""
+    light = given["light"]
+    colors, nz, ny, nx = light.shape
+    width = 1 if light.is_cuda else nx
+    rows = nz * ny * nx // width
+    given |= {"width": width, "rows": rows, "colors": colors, "nz": nz, "ny": ny, "nx": nx}
+    kernel(8 * light.element_size()).launch(colors * rows, given, made)
 
 
 def find_imbalance(operator: Operator, right: Tensor, u: Tensor) -> Tensor:
@@ -72,13 +86,23 @@ class _Imbalance(torch.autograd.Function):
 @functools.cache
 def product_kernel(bits: int) -> TextKernel:
     """The kernel of what is begun less A u; loss and conductances have all colors or one."""
-    text = """
+    call = "subtract_product(row, mesh, is_each, matrix, light, begun, found)"
+    given = "int is_each[4]; F *matrix[4], *light, *begun, *found"
+    return _kernel("subtract_product", bits, call, given, "found")
+
+
+@functools.cache
+def cotangents_kernel(bits: int) -> TextKernel:
+    """The kernel of the cotangents of loss and conductances, in all colors."""
+    call, given = "find_cotangents(row, mesh, adjoint, light, bars)", "F *adjoint, *light, *bars[4]"
+    return _kernel("find_cotangents", bits, call, given, "bars")
+
+
+def _kernel(name: str, bits: int, call: str, given: str, made: str) -> TextKernel:
+    text = f"""
     const Row row(item, width, rows, colors);
     const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
-    subtract_product(row, mesh, is_each, matrix, light, begun, found);
+    {call};
     """
-    given = """
-    int width, rows, colors, nz, ny, nx, is_each[4]; F *matrix[4], *light, *begun, *found
-    """
-    header = "diffusion/fused/product.h"
-    return TextKernel("subtract_product", bits, text, given, "found", header)
+    given = f"int width, rows, colors, nz, ny, nx; {given}"
+    return TextKernel(name, bits, text, given, made, "diffusion/fused/product.h")

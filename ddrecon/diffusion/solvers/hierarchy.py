@@ -17,6 +17,7 @@ doi:10.1137/0902035).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -207,7 +208,11 @@ class Level:
         """The grid of `operator` and all coarser ones."""
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
-        for axis in strong_axes(matrix):
+        means = [c.sum() / max(c.numel(), 1) for c in matrix.conductances]
+        if matrix.ghosts is not None:
+            # All ranks coarsen the same axes.
+            means = sum_over_ranks(means)
+        for axis in strong_axes(taken.shape, torch.stack(means).tolist()):
             way, operator = coarsen(operator, axis)
             ways.append(way)
         return Level(matrix, taken, tuple(ways), _coarser(operator))
@@ -268,16 +273,10 @@ def _coarser(operator: Operator) -> Level | Coarsest | Gathered:
     return Coarsest.of(operator) if has_few else Level.of(operator)
 
 
-def strong_axes(matrix: ScaledMatrix) -> list[int]:
-    """The axes to coarsen, all that have more than one cell and are not weak."""
-    axes = [axis for axis in AXES if matrix.scale.shape[axis] > 1]
-    means = [matrix.conductances[axis - 1].mean() for axis in axes]
-    if matrix.ghosts is not None:
-        # All ranks coarsen the same axes.
-        means = sum_over_ranks(means)
-    strengths = torch.stack(means).tolist() if axes else []
-    return [
-        axis
-        for axis, strength in zip(axes, strengths, strict=True)
-        if not strength < STRONG * max(strengths)
-    ]
+def strong_axes(shape: Sequence[int], means: Sequence[float]) -> list[int]:
+    """The axes to coarsen of a grid of this `shape` [C, z, y, x], by its mean scaled conductances.
+
+    All that have more than one cell and are not weak.
+    """
+    strengths = {axis: means[axis - 1] for axis in AXES if shape[axis] > 1}
+    return [axis for axis in strengths if not strengths[axis] < STRONG * max(strengths.values())]

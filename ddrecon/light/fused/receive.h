@@ -53,19 +53,23 @@ template <class F, int CHUNK> struct Receiver {
                 INDEPENDENT
                 for (int t = 0; t < count; ++t) seen[i][t] = visible(s * e[t], along * f[t]);
             }
-            // Four beams at a time; beyond the last, weights and light are 0.
-            for (int i = lights; i % 4; ++i)
-                for (int t = 0; t < count; ++t) seen[i][t] = N(F(0));
             for (int a = 0; a < moments; ++a) {
-                N sums[CHUNK], own[4];
+                N sums[CHUNK];
                 for (int t = 0; t < count; ++t) sums[t] = N(F(0));
-                for (int i = 0; i < lights; i += 4) {
-                    for (int j = 0; j < 4; ++j)
-                        own[j] = i + j < lights ? N(weights[weight(i + j, a, c)]) : N(F(0));
+                const auto own = [&](int i) HERE { return N(weights[weight(i, a, c)]); };
+                int i = 0;
+                // Of many beams four at a time.
+                for (; i + 4 <= lights; i += 4) {
+                    const N one = own(i), two = own(i + 1), three = own(i + 2), four = own(i + 3);
                     INDEPENDENT
                     for (int t = 0; t < count; ++t)
-                        sums[t] += own[0] * seen[i][t] + own[1] * seen[i + 1][t] +
-                                   own[2] * seen[i + 2][t] + own[3] * seen[i + 3][t];
+                        sums[t] += one * seen[i][t] + two * seen[i + 1][t] +
+                                   three * seen[i + 2][t] + four * seen[i + 3][t];
+                }
+                for (; i < lights; ++i) {
+                    const N one = own(i);
+                    INDEPENDENT
+                    for (int t = 0; t < count; ++t) sums[t] += one * seen[i][t];
                 }
                 F* __restrict out = made + moment(a, c) + begin;
                 for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);

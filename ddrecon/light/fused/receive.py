@@ -15,7 +15,7 @@ from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 CHUNK = 256
 """Cells that one item does on a processor; on a GPU it is one."""
 MOST_BEAMS = 48
-"""So many beams at most are received at once: a multiple of four."""
+"""So many beams at most are received at once."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 

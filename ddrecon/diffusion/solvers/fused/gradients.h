@@ -4,10 +4,10 @@
 
 namespace ddrecon {
 
-// What a launch does, of a color's shares: the cycle's way down, its coarser levels (one share does
-// them all), its way up, a direction, a step along it; or whole iterations, of a color that is one
-// share.
-enum Act { DOWN, COARSER, UP, DIRECT, ADVANCE, SOLVE };
+// What a launch does, of a color's shares: the start; the cycle's way down, its coarser levels (one
+// share does them all), its way up, a direction, a step along it; or whole iterations, of a color
+// that is one share.
+enum Act { START, DOWN, COARSER, UP, DIRECT, ADVANCE, SOLVE };
 
 // A share of the slices of a color, from which on `cell` are `count` cells.
 template <class F> struct Share {
@@ -23,6 +23,34 @@ template <class F> struct Share {
           cell(from * level.slice),
           count((to - from) * level.slice) {}
 };
+
+// From a guess of u: y = u / S, what it leaves of S b, and squares of both.
+template <class F> APART void start(const Solve<F>& solve, const Share<F>& own) {
+    const Level<F>& l = own.level;
+    const Slots<F>& slot = own.slot;
+    const Size slice = l.slice, before = solve.color * l.cells;
+    slot.clear(4);
+    double norm = 0.0, square = 0.0;
+    int ready = own.from > 0 ? own.from - 1 : 0;
+    for (int z = own.from; z < own.to; ++z) {
+        for (; ready <= z + 1 && ready < l.nz; ++ready) {
+            const F* __restrict u = solve.guess + before + ready * slice;
+            const F* __restrict scale = l.scale + ready * slice;
+            F* __restrict v = slot.ring(0, ready);
+            for (Size i = 0; i < slice; ++i) v[i] = u[i] / scale[i];
+        }
+        const F* __restrict b = solve.source + before + z * slice, * __restrict v = slot.ring(0, z);
+        const F* __restrict scale = l.scale + z * slice;
+        F* __restrict y = solve.vector(Y) + z * slice, * __restrict right = slot(4);
+        F* const r = solve.vector(R) + z * slice;
+        for (Size i = 0; i < slice; ++i) right[i] = scale[i] * b[i], y[i] = v[i];
+        stencil(l, slot, 0, z, right, F(-1), F(1), F(1), r);
+        norm += inner(right, right, slice);
+        square += inner(r, r, slice);
+    }
+    solve.sum(SOURCE_NORM) = norm;
+    solve.sum(RESIDUAL) = square;
+}
 
 // d, and q = A d.
 template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own) {
@@ -77,6 +105,7 @@ template <class F> APART void advance(const Solve<F>& solve, const Share<F>& own
 
 template <class F>
 INLINE void act(const Solve<F>& solve, int what, const Share<F>& own, F* mine, F* memory) {
+    if (what == START) return start(solve, own);
     if (solve.is_done()) {
         if (what == ADVANCE)
             solve.sum(RESIDUAL + solve.later()) = solve.sum(RESIDUAL + solve.now());

@@ -20,13 +20,14 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, lower_cells
 from ddrecon.diffusion.solvers.hierarchy import FEW_CELLS, Coarsest, strong_axes
-from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.text import TextKernel
 
 ROOM = "diffusion/solvers/fused"
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
+FINE = 200_000
+"""Grids of so many cells are made by all threads, which takes a launch for each step."""
 STAGES = 128
 """More than there can be: each halves the cells along an axis."""
 
@@ -59,45 +60,59 @@ class Hierarchy:
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
         """All grids of `operator`."""
-        matrix = _lay_out(operator)
-        table, memory = torch.zeros(STAGES, COLUMNS["COLUMNS"], dtype=torch.int64), list[Tensor]()
-        rows, stage, coarser = table.numpy(), 0, margin(matrix[0].shape[3])
+        given, like = (*operator.conductances, operator.loss), operator.loss
+        shape = max(map(len, given)), *like.shape[1:]
+        table = torch.zeros(STAGES, COLUMNS["COLUMNS"], dtype=torch.int64)
+        rows, memory, work = table.numpy(), list[Tensor](), list[Tensor]()
+        stage, coarser, steps, threads = 0, margin(shape[3]), MAKING["STEPS"], thread_count(like)
+        sums = like.new_empty(threads, 3, dtype=torch.float64)
+        sources = {"table": table, "matrix": given, "colors": shape[0]}
+        sources["is_each"] = [len(part) == shape[0] for part in given]
+        kernel = prepare_kernel(8 * like.element_size()).bind(sources, {"sums": sums})
 
-        def write(name: str, *values: int | Tensor) -> None:
-            """Numbers, or where arrays lie, in the stage's row from this column on."""
-            memory.extend(value for value in values if isinstance(value, Tensor))
-            for column, value in enumerate(values, COLUMNS[name]):
-                rows[stage, column] = value.data_ptr() if isinstance(value, Tensor) else value
+        def add(kept: list[Tensor], name: str, count: int) -> Tensor:
+            """So many arrays of `shape`, of which the row of the `stage` knows from a column on."""
+            kept.append(arrays := _new_arrays(like, shape, count))
+            rows[stage, COLUMNS[name] :][:count] = [one.data_ptr() for one in arrays]
+            return arrays
 
-        def write_size() -> None:
-            write("NZ", *matrix[0].shape[1:], -1, -1)
+        def make(first: int, last: int) -> list[float]:
+            """Does these steps; how strong the last level's scaled conductances are by axis."""
+            parts = threads if work[0][0].numel() > FINE else 1
+            for step in range(first, last) if parts > 1 else (first,):
+                end = step + 1 if parts > 1 else last
+                if step % steps >= MAKING["WEIGH"] or rows[step // steps, COLUMNS["SCALE"]]:
+                    kernel.launch(parts, parts, first=step, last=end, parts=parts)
+            totals = zip(sums[:parts].sum(0).tolist(), shape[1:], strict=True)
+            return [total * n / max(n - 1, 1) for total, n in totals]
 
-        write_size()
-        while not stage or matrix[0][0].numel() > FEW_CELLS:
-            *faces, scale, _ = level = _new_arrays(matrix[0], matrix[0].shape, 5)
-            for step in ("SCALE_CELLS", "SCALE_FACES"):
-                _run(step, matrix, level)
-            write("SZ", *level)
+        rows[:, COLUMNS["AXIS"]] = rows[:, COLUMNS["NEXT"]] = -1
+        rows[0, :3] = shape[1:]
+        add(work, "CZ", 4)
+        scale, is_level = add(memory, "SZ", 5)[3], True
+        strengths = make(0, MAKING["WEIGH"])
+        while is_level and (axes := strong_axes(shape, strengths)):
             first = stage
-            for axis in strong_axes(ScaledMatrix(scale, _compact(faces))):
-                halved = [(n + 1) // 2 if a == axis else n for a, n in enumerate(matrix[0].shape)]
-                coarse, weights = (_new_arrays(matrix[0], halved, count) for count in (4, 2))
-                for step in ("WEIGH", "COARSEN"):
-                    _run(step, matrix, [*coarse, *weights], axis)
-                write("AXIS", axis - 1)
-                write("BELOW", *weights)
-                stage, matrix = stage + 1, coarse
-                write_size()
-            if stage == first:
-                break
+            for axis in axes:
+                rows[stage, COLUMNS["AXIS"]] = axis - 1
+                shape = *shape[:axis], (shape[axis] + 1) // 2, *shape[axis + 1 :]
+                add(memory, "BELOW", 2)
+                stage += 1
+                rows[stage, :3] = shape[1:]
+                matrix = add(work, "CZ", 4)
+            size = room(matrix[0].numel(), shape[3])
             rows[first, COLUMNS["NEXT"]] = stage
-            size = room(matrix[0][0].numel(), matrix[0].shape[3])
-            write("SOURCE", coarser, coarser + size)
-            coarser += 2 * size
-        else:
-            coarsest = Operator(_compact(matrix[:3]), matrix[3])
-            write("INVERSE", Coarsest.of(coarsest).inverse.contiguous())
-        return Hierarchy(len(matrix[0]), table, memory[3], coarser, memory)
+            rows[stage, COLUMNS["SOURCE"] :][:2] = coarser, coarser + size
+            coarser, is_level = coarser + 2 * size, matrix[0][0].numel() > FEW_CELLS
+            if is_level:
+                add(memory, "SZ", 5)
+            strengths = make(first * steps + MAKING["WEIGH"], stage * steps + 2 * is_level)
+            del work[:-1]
+        if not is_level:
+            z, y, x = (lower_cells(faces, axis) for axis, faces in zip(AXES, matrix, strict=False))
+            memory.append(Coarsest.of(Operator((z, y, x), matrix[3])).inverse.contiguous())
+            rows[stage, COLUMNS["INVERSE"]] = memory[-1].data_ptr()
+        return Hierarchy(shape[0], table, scale, coarser, memory)
 
 
 def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
@@ -123,53 +138,21 @@ def room(cells: int, width: int) -> int:
     return -(-cells // 16) * 16 + margin(width)
 
 
-def _new_arrays(like: Tensor, shape: Sequence[int], count: int) -> list[Tensor]:
+def _new_arrays(like: Tensor, shape: Sequence[int], count: int) -> Tensor:
     """So many arrays beside each other, each after a margin of zeros, with another behind all."""
     before, cells = margin(shape[-1]), math.prod(shape)
     size = room(cells, shape[-1])
     block = like.new_empty(count * size + before)
     rows = block[: count * size].view(count, size)
     rows[:, :before] = block[-before:] = 0
-    return [row[before : before + cells].view(*shape) for row in rows]
-
-
-def _lay_out(operator: Operator) -> list[Tensor]:
-    """Conductances and loss of `operator`, of as many colors as one of them has."""
-    given = (*operator.conductances, operator.loss)
-    colors = max(map(len, given))
-    arrays = _new_arrays(operator.loss, (colors, *operator.loss.shape[1:]), 4)
-    for axis, array, faces in zip(AXES, arrays[:3], operator.conductances, strict=True):
-        lower_cells(array, axis).copy_(faces)
-        array.select(axis, -1).zero_()
-    arrays[3].copy_(operator.loss)
-    return arrays
-
-
-def _compact(faces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """`faces` along z, y and x without those on the box (views)."""
-    z, y, x = (lower_cells(array, axis) for axis, array in zip(AXES, faces, strict=True))
-    return z, y, x
-
-
-def _run(step: str, matrix: list[Tensor], made: list[Tensor], axis: int = 1) -> None:
-    """A `step` of making a grid, whose arrays are `made`, of the same or a finer one's `matrix`."""
-    colors, nz, ny, nx = made[0].shape
-    given = {
-        "width": nx, "rows": nz * ny, "colors": colors, "nz": nz, "ny": ny, "nx": nx,
-        "step": MAKING[step], "axis": axis - 1, "finer": matrix[0].shape[1:], "matrix": matrix,
-    }  # fmt: skip
-    rest = [None] * (6 - len(made))
-    kernel = prepare_kernel(8 * matrix[0].element_size())
-    kernel.launch(colors * nz * ny, given, {"made": [*made, *rest]})
+    return rows[:, before : before + cells].view(count, *shape)
 
 
 @functools.cache
 def prepare_kernel(bits: int) -> TextKernel:
-    """A step of making a hierarchy, in a row of cells."""
+    """Steps of making a hierarchy, each of one of the parts of its rows."""
     text = """
-    const Row row(item, width, rows, colors);
-    const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
-    prepare(row, mesh, step, axis, ny, finer, matrix, made);
+    prepare<F>({table, {}}, {matrix, is_each}, colors, first, last, item, parts, sums + 3 * item);
     """
-    given = "int width, rows, colors, nz, ny, nx, step, axis, finer[3]; F *matrix[4], *made[6]"
-    return TextKernel("prepare", bits, text, given, "made", f"{ROOM}/prepare.h")
+    given = "long *table; F *matrix[4]; int is_each[4], colors, first, last, parts; double *sums"
+    return TextKernel("prepare", bits, text, given, "sums", f"{ROOM}/prepare.h")

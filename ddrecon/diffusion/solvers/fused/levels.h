@@ -11,11 +11,13 @@ typedef long long Size;
 
 // What the table says of each stage: how many cells it has; along which AXIS they become pairs, or
 // -1, the coarsest; where a level begins the stage of the NEXT one, else -1; and where arrays lie,
-// as addresses. Of weights of the coarsening; the scaled matrix; the inverse of the coarsest. Right
-// side and solution of a level lie so far into a color's `coarser`.
+// as addresses. Of the matrix, while grids are made; weights of the coarsening; the scaled matrix;
+// the inverse of the coarsest. Right side and solution of a level lie so far into a color's
+// `coarser`.
 // clang-format off
 enum Column {
-    NZ, NY, NX, AXIS, NEXT, BELOW, ABOVE, SZ, SY, SX, SCALE, TAKEN, INVERSE, SOURCE, U, COLUMNS
+    NZ, NY, NX, AXIS, NEXT, CZ, CY, CX, LOSS, BELOW, ABOVE, SZ, SY, SX, SCALE, TAKEN, INVERSE, SOURCE,
+    U, COLUMNS
 };
 // clang-format on
 
@@ -136,6 +138,7 @@ enum Sum {
 // What all launches of a solve are given; and what one of them is, of a `part` of a `color`.
 template <class F> struct Solve {
     Grids<F> grids;
+    const F *source, *guess;
     F* vectors;
     double* sums;
     Size first_vector, vector_size;

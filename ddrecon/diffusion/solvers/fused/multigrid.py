@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.fused.product import subtract_product
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.hierarchy import (
     ROOM,
@@ -85,39 +85,25 @@ class Run:
         self.scratch = source.new_empty(self.colors * self.shares * slots)
         self.sums = source.new_zeros(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
+        # Beside the residual lie numbers that the cycle reads, and multiplies by zero.
+        first = self.edge + VECTORS["R"] * self.size
+        self.vectors[first - self.edge : first] = 0
+        self.vectors[first + source.numel() : first + self.size] = 0
+        guess = torch.zeros_like(source) if guess is None else guess
         given = {
-            "table": hierarchy.table, "first_vector": self.edge, "vector_size": self.size,
-            "scratch_size": slots, "share": hierarchy.coarser, "tolerance": tolerance,
-            "tiny": self.tiny, "matrices": hierarchy.colors, "colors": self.colors,
-            "shares": self.shares,
+            "table": hierarchy.table, "source": source, "guess": guess, "first_vector": self.edge,
+            "vector_size": self.size, "scratch_size": slots, "share": hierarchy.coarser,
+            "tolerance": tolerance, "tiny": self.tiny, "matrices": hierarchy.colors,
+            "colors": self.colors, "shares": self.shares,
         }  # fmt: skip
         made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
         made["coarser"] = self.coarser
         self.kernel = solve_kernel(8 * source.element_size()).bind(given, made)
-        self._start(operator, guess)
-
-    def _start(self, operator: Operator, guess: Tensor | None) -> None:
-        """y and r from a guess; of colors that it does not help, from zero."""
-        y, r, scale = self.vector("Y"), self.vector("R"), self.hierarchy.scale
-        # Beside the residual lie numbers that the cycle reads, and multiplies by zero.
-        first = self.edge + VECTORS["R"] * self.size
-        self.vectors[first - self.edge : first] = 0
-        self.vectors[first + r.numel() : first + self.size] = 0
-        torch.mul(scale, self.source, out=r)
-        reached = norm = torch.linalg.vector_norm(r, dim=(1, 2, 3))
-        if guess is None:
-            y.zero_()
-        else:
-            matrix = operator.loss, *operator.conductances
-            torch.div(guess, scale, out=y)
-            torch.mul(scale, subtract_product(self.source, guess, *matrix), out=r)
-            reached = torch.linalg.vector_norm(r, dim=(1, 2, 3))
-            useless = ~(reached < norm)
-            if useless.any():
-                y[useless], r[useless] = 0, (scale * self.source)[useless]
-                reached = torch.where(useless, norm, reached)
-        self.sums[SUMS["RESIDUAL"], :, 0] = reached.double() ** 2
-        self.sums[SUMS["SOURCE_NORM"], :, 0] = norm.double() ** 2
+        self._launch("START")
+        helps = self._norms("RESIDUAL") <= self._norms("SOURCE_NORM")
+        if not helps.all():
+            # Colors that the guess does not help start from zero.
+            self._launch("START", guess=guess.where(helps.view(-1, 1, 1, 1), 0.0))
 
     def iterate(self, most: int) -> tuple[int, float]:
         """How many iterations it took, of at most so many, and the relative residual left."""
@@ -125,8 +111,9 @@ class Run:
         while residual > self.tolerance and done < most:
             end = min(done + (TOGETHER if is_one else 1), most)
             for act in ("SOLVE",) if is_one else SHARED:
-                self._launch(act, done, end)
-            done, residual = end, self._residual(end)
+                self._launch(act, first=done, last=end)
+            left, norm = self._norms("RESIDUAL", end), self._norms("SOURCE_NORM")
+            done, residual = end, float((left / norm.clamp(min=self.tiny)).max())
         return int(self.sums[SUMS["COUNT"]].max()), residual
 
     def vector(self, name: str) -> Tensor:
@@ -134,17 +121,15 @@ class Run:
         first = self.edge + VECTORS[name] * self.size
         return self.vectors[first:][: self.source.numel()].view_as(self.source)
 
-    def _residual(self, iteration: int) -> float:
-        """The relative residual before an iteration, largest over the colors."""
-        rows = [SUMS["RESIDUAL"] + iteration % 2, SUMS["SOURCE_NORM"]]
-        left, norm = self.sums[rows].sum(-1).sqrt()
-        return float((left / norm.clamp(min=self.tiny)).max())
+    def _norms(self, name: str, iteration: int = 0) -> Tensor:
+        """Of each color the root of a sum, of those that come twice before an iteration."""
+        return self.sums[SUMS[name] + iteration % 2].sum(-1).sqrt()
 
-    def _launch(self, act: str, first: int, last: int) -> None:
+    def _launch(self, act: str, **changed: Any) -> None:
         parts = 1 if act == "COARSER" else self.shares
         items = self.colors * parts
         threads = min(self.threads, items)
-        self.kernel.launch(items, threads, act=ACTS[act], first=first, last=last, parts=parts)
+        self.kernel.launch(items, threads, act=ACTS[act], parts=parts, **changed)
 
 
 @functools.cache
@@ -153,15 +138,15 @@ def solve_kernel(bits: int) -> TextKernel:
     text = f"""
     const int color = item / parts, part = item - color * parts;
     const Solve<F> solve = {{
-        {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, vectors, sums, first_vector, vector_size,
-        tolerance, tiny, matrices, colors, shares, color, part, 0}};
+        {{table, {{F({STEPS[0]!r}), F({STEPS[1]!r})}}}}, source, guess, vectors, sums, first_vector,
+        vector_size, tolerance, tiny, matrices, colors, shares, color, part, 0}};
     F *const mine = coarser + color * share, *const memory = scratch + item * scratch_size;
     iterate(solve, act, first, last, mine, memory);
     """
     given = """
     int act, first, last, parts, matrices, colors, shares; double tolerance, tiny, *sums;
     long *table, first_vector, vector_size, scratch_size, share;
-    F *vectors, *scratch, *coarser
+    F *source, *guess, *vectors, *scratch, *coarser
     """
     made = "vectors scratch sums coarser"
     return TextKernel("multigrid", bits, text, given, made, f"{ROOM}/gradients.h")
