@@ -8,12 +8,12 @@ the light (Chandrasekhar, Radiative Transfer, 1950, chapter III).
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
 from half_spaces import IRRADIANCE, VIEWS, half_space, relative_rms, seen
 from media import convergence_order
+from published import PHASES, Layer, h_function, ordinates
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import solve_light, view_components
@@ -30,40 +30,13 @@ ERRORS = {0: 0.08, 1: 0.006, 4: 0.015}
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
 
 
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(96)
-NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2
-
-
-@cache
-def h_at_nodes(albedo: float) -> np.ndarray:
-    """H at `NODES`: 1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu', iterated with
-    the mean of old and new.
-    """
-    values = np.ones_like(NODES)
-    for _ in range(2000):
-        new = 1 / h_reciprocal(albedo, values, NODES)
-        if np.abs(new - values).max() < 1e-13:
-            break
-        values = (values + new) / 2
-    return values
-
-
-def h_reciprocal(albedo: float, values: np.ndarray, cosines: np.ndarray) -> np.ndarray:
-    integrand = WEIGHTS * NODES * values / (cosines[..., None] + NODES)
-    return math.sqrt(1 - albedo) + albedo / 2 * integrand.sum(-1)
-
-
-def h_function(albedo: float, cosine: float) -> float:
-    return float(1 / h_reciprocal(albedo, h_at_nodes(albedo), np.array(cosine)))
-
-
 def single(albedo: float, sun: float, view: float) -> float:
     """Radiance scattered once: I1 = w / (4 pi) E mu0 / (mu + mu0)."""
     return albedo / (4 * math.pi) * IRRADIANCE * sun / (view + sun)
 
 
 def exact(albedo: float, sun: float, view: float) -> float:
-    return single(albedo, sun, view) * h_function(albedo, view) * h_function(albedo, sun)
+    return single(albedo, sun, view) * math.prod(h_function(albedo, np.array([view, sun])))
 
 
 def p1_multiple(albedo: float, sun: float, view: float) -> float:
@@ -76,13 +49,6 @@ def p1_multiple(albedo: float, sun: float, view: float) -> float:
     a = albedo * IRRADIANCE / (4 * math.pi) / ((1 - albedo) - 1 / (3 * sun**2))
     b = -a * (1 / 2 + 1 / (3 * sun)) / (1 / 2 + decay / 3)
     return albedo * (a * sun / (view + sun) + b / (1 + decay * view))
-
-
-@pytest.mark.parametrize(
-    ("cosine", "value"), [(0.0, 1.0), (0.1, 1.2474), (0.5, 2.0128), (1.0, 2.9078)]
-)
-def test_h_of_a_medium_that_absorbs_nothing_is_the_tabulated_one(cosine: float, value: float):
-    assert h_function(1.0, cosine) == pytest.approx(value, abs=1e-4)
 
 
 @each_albedo
@@ -119,3 +85,15 @@ def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int):
     found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, rounds=rounds))]
     wanted = [exact(albedo, sun, view) for sun in SUNS for view in VIEWS]
     assert relative_rms(found, wanted) < ERRORS[rounds]
+
+
+@pytest.mark.parametrize(("albedo", "g"), [(0.9, -0.7), (0.99, -0.4), (0.99, 0.7)])
+def test_radiance_of_peaked_scattering_is_that_of_ordinates(albedo: float, g: float):
+    """Measured: 0.0034, 0.0117 and 0.0154 after three rounds, where P1 is 0.028 to 0.060 off."""
+    pytest.importorskip("PythonicDISORT", reason="discrete ordinates are an extra (`dev`)")
+    layer = Layer(albedo, PHASES["isotropic"] | {"g": g})
+    wanted = (IRRADIANCE / np.pi * ordinates(layer, np.array(VIEWS))["up"]).tolist()
+    diffuse, found = (
+        relative_rms(seen(half_space(albedo, 1.0, 96, rounds, g)), wanted) for rounds in (0, 3)
+    )
+    assert found < 0.018 and found < 0.4 * diffuse

@@ -1,0 +1,186 @@
+"""How far images are from published truth, by transport rounds and degree: tables in Markdown.
+
+    python benchmarks/dial.py [--only NAME,...] [-D KEY=VALUE]... [--json]
+
+Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
+radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`); `once`, of that
+part of `up` that is scattered once. `half-space` and `step cloud` are one cell across, a million
+times as wide: their default is that of so thick a cell. All others have cubes. `box`: by how much,
+in percent, the image of a plain box changes from 8 to 16 rounds.
+
+NAME is part of a row's name, `-D` overrides keys of all scenes, `seconds` are those of the default.
+Slabs need PythonicDISORT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from accuracy import print_header, print_row
+
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "exact"))
+from published import PHASES, Layer, StepCloud, percent_off, show
+
+ROUNDS, DEGREES = (1, 2, 4, 8, 16), (3, 5)
+
+
+def by_dial(rounds: int, degree: int) -> tuple[str, str]:
+    return f"diffusion.transport_rounds={rounds}", f"diffusion.degree={degree}"
+
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "n = 0": ("diffusion.transport_rounds=0",),
+    **{f"L = {degree}, n = {n}": by_dial(n, degree) for degree in DEGREES for n in ROUNDS},
+}
+"""Overrides by column: n transport rounds of degree L."""
+SUNS = {"overhead": 1.0, "60 degrees": 0.5}
+LAYERS: dict[str, Layer | StepCloud] = {
+    **{
+        f"step cloud {name}": StepCloud(name, albedo, sun)
+        for name, albedo, sun in (
+            ("overhead", 0.999999, 1.0),
+            ("slanted", 0.999999, 0.5),
+            ("absorbing", 0.99, 0.5),
+        )
+    },
+    **{
+        f"half-space albedo {albedo} sun {name}": Layer(albedo, sun=sun)
+        for albedo in (0.6, 0.9, 0.99, 0.999)
+        for name, sun in SUNS.items()
+    },
+    "slab g 0.75 depth 2 albedo 0.9": Layer(0.9, PHASES["g 0.75"], 2.0, across=32.0),
+    **{
+        f"slab {name} depth {depth:g} albedo 0.99": Layer(
+            0.99, phase, depth, cell=cell, across=across
+        )
+        for name, phase in PHASES.items()
+        if name != "isotropic"
+        for depth, cell, across in ((1.0, 0.25, 32.0), (8.0, 0.5, 64.0))
+    },
+    **{
+        f"cells of {cell} half-space albedo 0.9 sun {name}": Layer(
+            0.9, sun=sun, cell=cell, across=32.0
+        )
+        for name, sun in SUNS.items()
+        for cell in (4.0, 2.0, 1.0, 0.5)
+    },
+    **{
+        f"cells of {cell} half-space albedo 0.99 sun overhead": Layer(0.99, cell=cell, across=64.0)
+        for cell in (4.0, 2.0, 1.0)
+    },
+    **{
+        f"cells of {cell} slab g 0.75 depth 8 albedo 0.9": Layer(
+            0.9, PHASES["g 0.75"], 8.0, cell=cell, across=40.0
+        )
+        for cell in (4.0, 2.0, 1.0, 0.5)
+    },
+}
+BOXES = {
+    f"box depth {depth} g {g} albedo {albedo}": (depth, g, albedo)
+    for depth, albedo in ((0.4, 0.999), (1.7, 0.95), (1.7, 0.999), (6.7, 0.999), (20.0, 0.999))
+    for g in (0.0, 0.6, 0.85, 0.95, -0.8)
+}
+"""By optical depth of a cell, g and albedo."""
+
+
+def box(depth: float, g: float, albedo: float) -> dict[str, Any]:
+    """24^3 cells of optical depth `depth`, seen by a perspective camera."""
+    camera = {
+        "type": "perspective",
+        "origin": [0, 0.4, 2.5],
+        "target": [0, 0, 0],
+        "up": [0, 1, 0],
+        "fov": 30,
+        "resolution": [32, 32],
+    }
+    return {
+        "volume": {
+            "bounds": {"min": [-0.5] * 3, "max": [0.5] * 3},
+            "resolution": [24] * 3,
+            "density": 1.0,
+            "sigma_t": 24 * depth,
+            "albedo": albedo,
+            "g": g,
+        },
+        "lights": [{"type": "directional", "direction": [-1, -2, -1], "irradiance": math.pi}],
+        "views": [{"name": "view", "camera": camera}],
+    }
+
+
+def print_layers(
+    layers: dict[str, Layer | StepCloud], overrides: list[str]
+) -> Iterator[dict[str, Any]]:
+    """A row for each number of each layer; yields them."""
+    print_header("case", "truth", "once", *MODELS, "seconds")
+    for name, layer in layers.items():
+        truth, errors, seconds = layer.truth(), dict[str, list[float]](), list[float]()
+        for model in (MODELS["default"], *MODELS.values()):
+            start = time.perf_counter()
+            found = layer.seen([*overrides, *model])
+            seconds.append(time.perf_counter() - start)
+            for key, wanted in truth.items():
+                errors.setdefault(key, []).append(percent_off(found[key], wanted))
+        once = ""
+        if isinstance(layer, Layer):
+            found = layer.seen([*overrides, "diffusion.model=none"])
+            once = f"{percent_off(found['up'], layer.once()):.2f}"
+        for key, (_, *row) in errors.items():
+            value = f"{truth[key]:.5f}" if np.ndim(truth[key]) == 0 else ""
+            shown = (f"{error:+.2f}" if value else f"{error:.2f}" for error in row)
+            print_row(
+                f"{name}: {key}", value, once if key == "up" else "", *shown, f"{seconds[1]:.2f}"
+            )
+            yield {
+                "case": name,
+                "of": key,
+                "errors": dict(zip(MODELS, row, strict=True)),
+                "seconds": dict(zip(MODELS, seconds[1:], strict=True)),
+            }
+
+
+def print_boxes(
+    boxes: dict[str, tuple[float, float, float]], overrides: list[str]
+) -> Iterator[dict[str, Any]]:
+    """A row for each box: changes from 8 to 16 rounds by degree."""
+    degrees = (3, 5, 7)
+    print_header("case", *(f"L = {degree}" for degree in degrees), "seconds")
+    for name, numbers in boxes.items():
+        start, row = time.perf_counter(), list[float]()
+        for degree in degrees:
+            few, many = (show(box(*numbers), [*overrides, *by_dial(n, degree)]) for n in (8, 16))
+            row.append(percent_off(few, many))
+        print_row(name, *(f"{change:.3f}" for change in row), f"{time.perf_counter() - start:.1f}")
+        yield {"case": name, "changes": dict(zip(degrees, row, strict=True))}
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="")
+    parser.add_argument("-D", dest="overrides", action="append", default=[])
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    parts = given.only.split(",")
+    layers, boxes = (
+        {name: row for name, row in rows.items() if any(part in name for part in parts)}
+        for rows in (LAYERS, BOXES)
+    )
+    rows = [*print_layers(layers, given.overrides)] if layers else []
+    rows += [*print_boxes(boxes, given.overrides)] if boxes else []
+    if given.json:
+        print(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main()

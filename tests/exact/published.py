@@ -1,0 +1,252 @@
+"""Layers without end sideways and a cloud, as scenes and by independent means.
+
+A scene holds the layer between z = -depth and 0 in equal cells, lit from above by a sun of
+irradiance pi. Optical depths are lengths. What is looked at are its reflectance `R`, its
+transmittance `T` with the light that is not scattered, and pi I / (mu0 pi) at `VIEWS`: `up` above
+and `down` below it.
+
+Half-spaces that scatter isotropically are known by Ambartsumian's H, the others by discrete
+ordinates (PythonicDISORT), the cloud by the consensus of many codes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.polynomial.legendre import leggauss, legval
+from numpy.typing import NDArray
+
+from ddrecon.io.volumes.table import write_field
+from ddrecon.renderer import render
+from ddrecon.scene_file.build import load_scene
+
+Array = NDArray[np.float64]
+Seen = dict[str, Array]
+"""By `R`, `T`, `up` and `down`; a half-space has no `T` and no `down`."""
+VIEWS = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+"""Cosines of views with the normal, in a plane across the sun's."""
+
+
+def _gauss(count: int) -> tuple[Array, Array]:
+    """Nodes and weights on cosines from 0 to 1."""
+    nodes, weights = leggauss(count)
+    return (nodes + 1) / 2, weights / 2
+
+
+NODES, WEIGHTS = _gauss(96)
+FLUX_NODES, FLUX_WEIGHTS = _gauss(16)
+"""Where our radiance is integrated to a flux: where azimuths are alike, these are enough."""
+PHASES: dict[str, dict[str, Any]] = {
+    "isotropic": {"type": "henyey_greenstein", "g": 0.0},
+    "Rayleigh": {"type": "rayleigh"},
+    "g 0.75": {"type": "henyey_greenstein", "g": 0.75},
+    "haze": {"type": "two_lobe", "g": [0.824, -0.55], "weight": 0.9724},
+}
+"""As in a scene file."""
+DEEP = 5.0
+"""How many diffusion lengths of a half-space there are in its scene."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer of optical depth `depth`, a half-space where that is infinite.
+
+    `phase` as in a scene file; `sun`: cosine of the sun with the normal; `cell`: depth of a cell.
+    With `across` 0 it is one column, a million times as wide as deep. Else the cells are cubes,
+    `across` optical depths of them.
+    """
+
+    albedo: float
+    phase: dict[str, Any] = field(default_factory=lambda: PHASES["isotropic"])
+    depth: float = math.inf
+    sun: float = 1.0
+    cell: float = 0.25
+    across: float = 0.0
+
+    @property
+    def shown_depth(self) -> float:
+        """The depth of its scene, a whole number of cells."""
+        if self.depth < math.inf:
+            return self.depth
+        decay = math.sqrt(3 * (1 - self.albedo) * (1 - self.albedo * self.moments(2)[1]))
+        return self.cell * math.ceil(DEEP / decay / self.cell)
+
+    def moments(self, count: int) -> Array:
+        """Legendre moments of its phase function."""
+        degrees = np.arange(count)
+        match self.phase["type"]:
+            case "rayleigh":
+                return np.where(degrees == 2, 0.1, degrees == 0)
+            case "two_lobe":
+                (one, other), weight = self.phase["g"], self.phase["weight"]
+                return weight * one**degrees + (1 - weight) * other**degrees
+        return np.asarray(self.phase["g"] ** degrees, float)
+
+    def seen(self, overrides: Sequence[str] = ()) -> Seen:
+        """What ddrecon makes of it."""
+        depth, layers = self.shown_depth, round(self.shown_depth / self.cell)
+        columns = max(round(self.across / self.cell), 1)
+        half = self.across / 2 or 5e5 * depth
+        sides = [(1, 0.0, "R", "up"), (-1, -depth, "T", "down")]
+        sides = sides[: 1 if self.depth == math.inf else 2]
+        cameras = [
+            _camera([0.0, math.sqrt(1 - cosine**2), side * cosine], [0.0, 0.0, height], 1e-3, 1)
+            for side, height, *_ in sides
+            for cosine in (*FLUX_NODES.tolist(), *VIEWS.tolist())
+        ]
+        volume = {
+            "bounds": {"min": [-half, -half, -depth], "max": [half, half, 0.0]},
+            "resolution": [columns, columns, layers],
+            "density": 1.0,
+            "sigma_t": 1.0,
+            "albedo": self.albedo,
+            "phase": self.phase,
+        }
+        radiance = show(_scene(volume, self.sun, cameras), overrides) / self.sun
+        found: Seen = {}
+        for (_, height, flux, views), part in zip(
+            sides, np.split(radiance, len(sides)), strict=True
+        ):
+            at_nodes, found[views] = np.split(part.flatten(), [len(FLUX_NODES)])
+            direct = math.exp(height / self.sun) if flux == "T" else 0.0
+            found[flux] = 2 * (FLUX_WEIGHTS * FLUX_NODES * at_nodes).sum() + direct
+        return found
+
+    def truth(self) -> Seen:
+        """By H where that is known, else by ordinates."""
+        if self.depth == math.inf and not self.moments(3)[1:].any():
+            return h_reflection(self.albedo, self.sun)
+        return ordinates(self)
+
+    def once(self) -> Array:
+        """Of `up`, the part that is scattered once."""
+        moments = self.moments(256)
+        phase = legval(-self.sun * VIEWS, moments * (2 * np.arange(len(moments)) + 1))
+        passed = np.exp(-self.depth * (1 / self.sun + 1 / VIEWS))
+        return self.albedo / 4 * phase * (1 - passed) / (VIEWS + self.sun)
+
+
+@dataclass(frozen=True)
+class StepCloud:
+    """I3RC's step cloud: optical depths 2 and 18 in turn, each 0.25 km wide and thick, g 0.85.
+
+    It does not vary along y, where it is one cell, and repeats along x: the middle of five periods
+    is seen from the zenith. Cahalan et al. 2005, doi:10.1175/BAMS-86-9-1275, case 1.
+    """
+
+    name: str
+    albedo: float
+    sun: float
+
+    def seen(self, overrides: Sequence[str] = ()) -> Seen:
+        """pi I / (F mu0) above each of 32 columns, `up`."""
+        columns = np.tile(np.repeat([8.0, 72.0], 16), 5)
+        corners = np.array([[0.0, -500.0, 0.0], [2.5, 500.0, 0.25]])
+        camera = _camera([0.0, 0.0, 1.0], [1.25, 0.0, 0.25], 0.5, 128)
+        with tempfile.TemporaryDirectory() as name:
+            path = Path(name) / "cloud.npz"
+            density = np.broadcast_to(columns, (16, 1, len(columns)))
+            write_field(path, "density", density, corners)
+            low, high = corners.tolist()
+            volume = {"bounds": {"min": low, "max": high}, "density": {"file": str(path)}}
+            medium = {"sigma_t": 1.0, "albedo": self.albedo, "g": 0.85}
+            images = show(_scene(volume | medium, self.sun, [camera]), overrides)
+        return {"up": images.reshape(32, -1).mean(1) / self.sun}
+
+    def truth(self) -> Seen:
+        """That of the consensus."""
+        rows = Path(__file__).with_name("step_cloud.csv").read_text().splitlines()
+        table = {name: numbers for name, *numbers in (row.split(",") for row in rows)}
+        return {"up": np.array(table[self.name], float)}
+
+
+def _camera(side: list[float], target: list[float], width: float, pixels: int) -> dict[str, Any]:
+    """A row of pixels of parallel rays, `width` wide, that look from `side` of `target`."""
+    return {
+        "type": "orthographic",
+        "origin": [there + part for there, part in zip(target, side, strict=True)],
+        "target": target,
+        "up": [0, 1, 0],
+        "width": width,
+        "resolution": [pixels, 1],
+    }
+
+
+def _scene(volume: dict[str, Any], sun: float, cameras: list[dict[str, Any]]) -> dict[str, Any]:
+    """A scene file of `volume`, lit at cosine `sun` by irradiance pi that travels towards +x."""
+    travel = [math.sqrt(1 - sun**2), 0.0, -sun]
+    views = [{"name": f"view{number}", "camera": camera} for number, camera in enumerate(cameras)]
+    light = {"type": "directional", "direction": travel, "irradiance": math.pi}
+    return {"volume": volume, "lights": [light], "views": views}
+
+
+def show(scene: dict[str, Any], overrides: Sequence[str] = ()) -> Array:
+    """Gray images [views, h, w] of a scene file."""
+    with tempfile.TemporaryDirectory() as name, torch.no_grad():
+        path = Path(name) / "scene.yaml"
+        path.write_text(json.dumps(scene))
+        return render(load_scene(path, overrides=overrides)).mean(1).double().numpy()
+
+
+@cache
+def h_at_nodes(albedo: float) -> Array:
+    """Ambartsumian's H at `NODES`, by means of old and new, of which each halves the error.
+
+    1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu'.
+    """
+    values = np.ones_like(NODES)
+    for _ in range(50):
+        values = (values + h_function(albedo, NODES, values)) / 2
+    return values
+
+
+def h_function(albedo: float, cosines: Array, at_nodes: Array | None = None) -> Array:
+    """H at `cosines`, of what it is `at_nodes`."""
+    at_nodes = h_at_nodes(albedo) if at_nodes is None else at_nodes
+    integrand = WEIGHTS * NODES * at_nodes / (np.asarray(cosines)[..., None] + NODES)
+    return 1 / (math.sqrt(1 - albedo) + albedo / 2 * integrand.sum(-1))
+
+
+def h_reflection(albedo: float, sun: float) -> Seen:
+    """A half-space that scatters isotropically: R(mu) = w / 4 / (mu + mu0) H(mu) H(mu0)."""
+    h_sun = h_function(albedo, np.array(sun))
+    return {
+        "R": 1 - h_sun * math.sqrt(1 - albedo),
+        "up": albedo / 4 / (VIEWS + sun) * h_function(albedo, VIEWS) * h_sun,
+    }
+
+
+def ordinates(layer: Layer, views: Array = VIEWS) -> Seen:
+    """A layer by 64 ordinates, as PythonicDISORT solves them, seen at cosines `views`."""
+    from PythonicDISORT.pydisort import pydisort
+    from PythonicDISORT.subroutines import interpolate
+
+    streams, depth = 64, min(layer.depth, 10 * layer.shown_depth)
+    moments = layer.moments(4 * streams)
+    solved = pydisort(
+        depth, layer.albedo, streams, moments, layer.sun, 1.0, 0.0,
+        NLeg=streams, f_arr=moments[streams], NT_cor=True,
+    )  # fmt: skip
+    up, down, radiance = solved[1], solved[2], interpolate(solved[4], NT_cor=True)
+    scale = math.pi / layer.sun
+    found = {"R": up(0.0) / layer.sun, "up": scale * radiance(views, 0.0, math.pi / 2)}
+    if layer.depth < math.inf:
+        found["T"] = sum(down(depth)) / layer.sun
+        found["down"] = scale * radiance(-views, depth, math.pi / 2)
+    return found
+
+
+def percent_off(found: Array, wanted: Array) -> float:
+    """The relative error of a number, with its sign, and the relative RMS error of several."""
+    if np.ndim(wanted) == 0:
+        return float(100 * (found / wanted - 1))
+    return float(100 * np.linalg.norm(found - wanted) / np.linalg.norm(wanted))

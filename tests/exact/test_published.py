@@ -1,0 +1,87 @@
+"""Our default settings against what is published of layers without end and of a cloud."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from published import PHASES, Layer, StepCloud, h_function, h_reflection, ordinates, percent_off
+
+SLAB = Layer(0.9, PHASES["g 0.75"], 2.0, across=32.0)
+VAN_DE_HULST = {
+    "R": np.array(0.09739),
+    "T": np.array(0.66096),
+    "up": np.array([0.13304, 0.13856, 0.11956, 0.09411, 0.07132]),
+    "down": np.array([0.16486, 0.22473, 0.27785, 0.36889, 0.72155]),
+}
+"""`SLAB` in van de Hulst's Multiple Light Scattering, 1980."""
+FOUR_ROUNDS = "diffusion.degree=5", "diffusion.transport_rounds=4"
+"""By default a cloud of one cell across is taken for one of thick cells."""
+
+# What is claimed of our defaults, in percent; of clouds, what four rounds of degree 5 come to.
+HALF_SPACE = {"R": 2.5, "up": 4.5}
+VAN_DE_HULST_SLAB = {"R": 2.5, "up": 9.0, "T": 1.0, "down": 2.5}
+SLABS = {
+    ("Rayleigh", 1.0): {"R": 1.0, "up": 2.5, "T": 1.0, "down": 5.5},
+    ("Rayleigh", 8.0): {"R": 1.5, "up": 4.5, "T": 17.0, "down": 21.0},
+    ("g 0.75", 1.0): {"R": 7.0, "up": 12.5, "T": 0.5, "down": 2.5},
+    ("g 0.75", 8.0): {"R": 3.0, "up": 11.0, "T": 1.0, "down": 4.5},
+    ("haze", 1.0): {"R": 6.0, "up": 13.0, "T": 0.5, "down": 2.5},
+    ("haze", 8.0): {"R": 2.0, "up": 9.0, "T": 2.0, "down": 3.5},
+}
+"""By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
+CLOUDS = {
+    StepCloud("overhead", 0.999999, 1.0): 6.0,
+    StepCloud("slanted", 0.999999, 0.5): 3.0,
+    StepCloud("absorbing", 0.99, 0.5): 3.5,
+}
+
+
+def assert_within(percent: dict[str, float], found: dict[str, Any], truth: dict[str, Any]) -> None:
+    off = {key: percent_off(found[key], truth[key]) for key in truth}
+    assert all(abs(off[key]) < percent[key] for key in truth), off
+
+
+@pytest.fixture
+def _has_ordinates() -> None:
+    pytest.importorskip("PythonicDISORT", reason="discrete ordinates are an extra (`dev`)")
+
+
+def test_h_of_a_medium_that_absorbs_nothing_is_the_tabulated_one():
+    found = h_function(1.0, np.array([0.0, 0.1, 0.5, 1.0]))
+    assert found == pytest.approx([1.0, 1.2474, 2.0128, 2.9078], abs=1e-4)
+
+
+@pytest.mark.usefixtures("_has_ordinates")
+def test_ordinates_are_van_de_hulsts_and_ambartsumians():
+    half_spaces = [(Layer(0.9, sun=sun), h_reflection(0.9, sun)) for sun in (1.0, 0.5)]
+    for layer, wanted in [(SLAB, VAN_DE_HULST), *half_spaces]:
+        found = ordinates(layer)
+        assert all(found[key] == pytest.approx(wanted[key], abs=6e-6) for key in wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sun", [1.0, 0.5])
+@pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99, 0.999])
+def test_half_spaces_are_ambartsumians(albedo: float, sun: float):
+    assert_within(HALF_SPACE, Layer(albedo, sun=sun).seen(), h_reflection(albedo, sun))
+
+
+@pytest.mark.slow
+def test_slab_is_van_de_hulsts():
+    assert_within(VAN_DE_HULST_SLAB, SLAB.seen(), VAN_DE_HULST)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_has_ordinates")
+@pytest.mark.parametrize(("name", "depth"), SLABS)
+def test_slabs_are_those_of_discrete_ordinates(name: str, depth: float):
+    layer = Layer(0.9, PHASES[name], depth, cell=min(depth / 4, 0.5), across=32.0)
+    assert_within(SLABS[name, depth], layer.seen(), ordinates(layer))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cloud", CLOUDS, ids=lambda cloud: cloud.name)
+def test_step_cloud_is_the_consensus_of_many_codes(cloud: StepCloud):
+    assert_within({"up": CLOUDS[cloud]}, cloud.seen(FOUR_ROUNDS), cloud.truth())
