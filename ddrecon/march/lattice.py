@@ -77,7 +77,9 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
         return None
     rays = _lattice_rays(grid, axis, hitting, first, (rows, columns))
     near, far = intersect_box(grid, rays)
-    crossing = Crossing(torch.arange(len(near), device=near.device), near, torch.maximum(near, far))
+    # Where a ray that misses enters may be infinitely far.
+    near, far = (torch.where(far > near, each, 0) for each in (near, far))
+    crossing = Crossing(torch.arange(len(near), device=near.device), near, far)
     own = torch.stack([place - a for place, a in zip(places, first, strict=True)], -1)
     return Lattice(rays, crossing, (rows, columns), own)
 

@@ -178,3 +178,12 @@ def test_an_empty_volume_passes_derivatives_to_every_cell(scene_of):
     image = render(with_values(scene, {"density": density}))
     (bar,) = torch.autograd.grad(image.sum(), density)
     assert bool((bar != 0).all())
+
+
+@pytest.mark.parametrize("size", [1.0, 1000.0])
+def test_rays_along_an_axis_that_miss_are_lattice_rays_in_any_unit(size: float, scene_of):
+    scene = scene_of({"eye": (0.0, 0.0, 5.0 * size), "is_perspective": False, "half_width": size})
+    grid = Grid((6, 8, 7), (-size / 2,) * 3, (size / 2,) * 3)
+    volume = replace(scene.volume, grid=grid, density=(blob(box_grid((6, 8, 7))) / size).float())
+    by_lattice, own = images(replace(scene, volume=volume))
+    assert float((by_lattice - own).norm()) < 0.02 * float(own.norm())
