@@ -70,7 +70,7 @@ class Moments:
                 parts.append(torch.stack([y, z, x]) / _FIRST)
         higher = self.spelled().higher
         if higher is not None:
-            parts.append(higher)
+            parts.append(higher.expand(-1, *self.mean.shape))
         elif degree > 1:
             missing = count_harmonics(degree) - 4
             parts.append(torch.zeros_like(self.mean).expand(missing, *self.mean.shape))

@@ -80,3 +80,11 @@ def test_both_modes_agree_with_differences_within_the_bend():
     assert torch.autograd.gradcheck(
         along_z, (mean, flux), eps=1e-7, atol=1e-5, check_forward_ad=True
     )
+
+
+def test_higher_moments_of_one_color_are_those_of_all():
+    """As of a white beam in colored ambient light."""
+    light = Moments(
+        torch.ones(3, 1, 2, 1), (torch.ones(3, 1, 2, 1),) * 3, torch.ones(12, 1, 1, 2, 1)
+    )
+    assert light.harmonics(3)[4:].equal(torch.ones(12, 3, 1, 2, 1))
