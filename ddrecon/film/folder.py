@@ -1,0 +1,254 @@
+"""The folder of a film: a run's folder for each of its frames, and what they begin with."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddrecon.errors import SceneError, UsageError
+from ddrecon.film.shared import SHARED, hold, read_shared
+from ddrecon.io.files.atomic import refusals, write_json
+from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.table import read_field, write_field, write_fields
+from ddrecon.numerics.flow import carry, find_flow
+from ddrecon.ranks import rank_count
+from ddrecon.reconstruct import tuning
+from ddrecon.run.checkpoint import differences
+from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file
+from ddrecon.scene import Scene
+from ddrecon.scene_file.frames import at_frame, require_frames
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
+from ddrecon.scene_file.schema import FramesSection
+from ddrecon.settings import AUTO
+
+SHARE = 6
+"""A frame that begins with another makes so many times fewer iterations."""
+VELOCITY = "velocity"
+"""The name of a frame's motion, and of its file."""
+
+
+SEQUENCE = "sequence"
+"""The folder of exported volumes, `film_0000.vdb` and so on."""
+FILM_FILES = (
+    *("scene.yaml", "environment.json", "film.json", "report.html", "movie.png"),
+    *(SHARED, "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
+    *("calibration/checkpoints/*.pt", "calibration/[0-9]*/volumes/*.npz"),
+    *("frames/[0-9]*/start.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
+)
+"""What files of a film are called, but for those of its frames' runs."""
+
+
+@dataclass
+class Film:
+    """The film that `scene_file` asks for, in the folder `path`.
+
+    `build` makes the scene of a frame as tensors; `shared` is what `shared.json` says.
+    """
+
+    scene_file: SceneFile
+    path: Path
+    build: Callable[[SceneFile], Scene]
+    shared: dict[str, Any] = field(default_factory=dict)
+
+    def choose(self, part: str | None) -> list[int]:
+        """The frames that `part` names, `A:B`, both among them; None is all. Raises UsageError."""
+        found = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
+        first, last = (int(end) if end else None for end in found.groups()) if found else (1, 0)
+        chosen = [
+            number
+            for number in self.frames.numbers
+            if (first is None or number >= first) and (last is None or number <= last)
+        ]
+        if not chosen:
+            ends = f"{self.frames.first}:{self.frames.last}"
+            raise UsageError(f"--frames {part}: names no frame; expected a part of {ends}")
+        return chosen
+
+    @property
+    def frames(self) -> FramesSection:
+        """Which frames there are."""
+        assert self.scene_file.tree.frames is not None
+        return self.scene_file.tree.frames
+
+    def of(self, number: int) -> Path:
+        """The folder of the run of the frame `number`."""
+        return self.path / "frames" / f"{number:04d}"
+
+    def done(self) -> list[int]:
+        """The frames that are finished: the report of each is written last."""
+        return [n for n in self.frames.numbers if (self.of(n) / "report.html").is_file()]
+
+    def calibrated(self, number: int) -> Path:
+        """The folder of the volumes that the frame `number` had in the calibration."""
+        return self.path / "calibration" / f"{number:04d}"
+
+    def scene_of(self, number: int, is_between: bool) -> SceneFile:
+        """The scene of the frame `number`, with what is shared held.
+
+        It begins with the frames before it, or with those on both sides where it `is_between` them.
+        What it begins with is written to its folder.
+        """
+        described = describe(at_frame(self.scene_file, number))
+        hold(described, self.shared.get("values", {}), self.path / SHARED)
+        optimize = described["optimize"]
+        if not optimize["parameters"]:
+            raise SceneError(
+                f"{self.scene_file.path}: optimize.parameters: all are the same in every frame; "
+                "name a field, such as density"
+            )
+        if fields := self._start(number, [*optimize["parameters"]], is_between):
+            start = self.of(number) / "start.npz"
+            start.parent.mkdir(parents=True, exist_ok=True)
+            bounds = next(iter(fields.values())).bounds
+            assert bounds is not None
+            write_fields(start, {name: one.values for name, one in fields.items()}, bounds)
+            for name in fields:
+                init = {"file": str(start.absolute()), "name": name}
+                optimize["parameters"][name]["init"] = init
+            planned = optimize["iterations"]
+            planned = tuning.PLANNED if planned == AUTO else planned
+            optimize |= {"iterations": math.ceil(planned / SHARE), "refine_at": []}
+        return read_described(described, self.scene_file.path)
+
+    def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Field]:
+        """What the frame `number` begins with: those of the variables `names` that are fields.
+
+        None where no frame before it is done, nor one after it where it `is_between` them.
+        """
+        before = [n for n in self.done() if n < number]
+        after = [n for n in self.done() if n > number and is_between]
+        if not before and not after:
+            return _fields_in(self.calibrated(number), names)
+        if not before or not after:
+            nearest = before[-1] if before else after[0]
+            fields, motion = _fields_in(self.of(nearest), names), self._velocity(nearest)
+            if motion is None:
+                return fields
+            # The air goes on as it went, and its motion with it.
+            way = motion * (number - nearest)
+            way = carry(way, way)
+            return _map(lambda value: carry(value, way), fields)
+        last, following = before[-1], after[0]
+        ours, theirs = (_fields_in(self.of(each), names) for each in (last, following))
+        motion = self._flow(last, following)
+        forth = _map(lambda value: carry(value, (number - last) * motion), ours)
+        back = _map(lambda value: carry(value, (number - following) * motion), theirs)
+        return {
+            name: Field((one.values + back[name].values) / 2, one.bounds)
+            for name, one in forth.items()
+        }
+
+    def _flow(self, number: int, other: int) -> Tensor:
+        """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
+        sums = []
+        for each in (number, other):
+            fields = _fields_in(self.of(each), self._parameters())
+            moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
+            values = [torch.from_numpy(fields[name].values) for name in moving]
+            sums.append(torch.stack([v if v.ndim == 3 else v.mean(-1) for v in values]).sum(0))
+        return find_flow(*sums) / (other - number)
+
+    def _parameters(self) -> list[str]:
+        """The variables that the film optimizes."""
+        optimize = self.scene_file.tree.optimize
+        return [*optimize.parameters] if optimize else []
+
+    def write_velocity(self, number: int) -> None:
+        """Writes the motion of the frame `number` from the one before, [u] a frame, for blur.
+
+        The first frame has that of the second.
+        """
+        before = [n for n in self.done() if n < number]
+        if not before:
+            return
+        motion = self._flow(before[-1], number)
+        one = next(iter(_fields_in(self.of(number), self._parameters()).values()))
+        values = motion.flip(0).permute(1, 2, 3, 0).numpy() * _cell(one)
+        for each in [number, *([before[0]] if len(before) == 1 else [])]:
+            assert one.bounds is not None
+            file = volume_file(self.of(each), VELOCITY)
+            write_field(file, VELOCITY, values.astype(np.float32), one.bounds)
+
+    def _velocity(self, number: int) -> Tensor | None:
+        """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
+        file = volume_file(self.of(number), VELOCITY)
+        if not file.is_file():
+            return None
+        one = read_field(file, VELOCITY)
+        return torch.from_numpy(one.values / _cell(one)).float().permute(3, 0, 1, 2).flip(0)
+
+
+def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
+    """Makes the folder of `film` ready, whose calibration may be `shared` from a file.
+
+    What an earlier one has left there is removed, unless this one is to `resume` it. Raises
+    UsageError for a folder that is not empty, unless it may be, or that holds another film;
+    SceneError where pictures are missing, or nothing is optimized.
+    """
+    if rank_count() > 1:
+        raise UsageError(
+            "torchrun does not share out a film: start parts of it, --frames A:B, as jobs of their"
+            " own, with --resume and the same -o"
+        )
+    scene_file, path = film.scene_file, film.path
+    if scene_file.tree.optimize is None:
+        raise SceneError(f"{scene_file.path}: optimize: missing section; say what to reconstruct")
+    require_frames(scene_file)
+    known = path / "scene.yaml"
+    given = None if shared is None else read_shared(shared)
+    with refusals(path):
+        path.mkdir(parents=True, exist_ok=True)
+    if resume and known.is_file():
+        there, now = describe(read_scene(known)), describe(scene_file)
+        for scene in (there, now):
+            scene.get("optimize", {}).pop("iterations", None)
+        if changes := differences(there, now):
+            advice = "use another output folder"
+            raise UsageError(
+                [f"{path}: holds another film: {change}; {advice}" for change in changes]
+            )
+    elif not resume:
+        if any(path.iterdir()) and not may_exist:
+            raise UsageError(
+                f"{path}: the folder is not empty; choose another, or say --overwrite or --resume"
+            )
+        for frame in path.glob("frames/[0-9]*"):
+            remove_run(frame, scene_file)
+        remove_files(path, FILM_FILES, [scene_file.path, *([shared] if shared else [])])
+    if given is not None:
+        if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given["values"]:
+            raise UsageError(f"{path / SHARED}: holds another calibration; leave --shared out")
+        write_json(path / SHARED, given)
+    dump_scene(scene_file, known)
+
+
+def _fields_in(folder: Path, names: list[str]) -> dict[str, Field]:
+    """Those of the variables `names` that are fields, as the run in `folder` has them."""
+    files = {name: volume_file(folder, name) for name in names}
+    return {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
+
+
+def _cell(field: Field) -> np.ndarray:
+    """The sides (x, y, z) [u] of a cell of `field`."""
+    sides: np.ndarray = np.ptp(np.asarray(field.bounds), axis=0) / np.array(field.resolution)
+    return sides
+
+
+def _map(change: Callable[[Tensor], Tensor], fields: dict[str, Field]) -> dict[str, Field]:
+    """`fields` with their values [..., z, y, x] changed, within what they were between."""
+    changed = {}
+    for name, one in fields.items():
+        value = torch.from_numpy(one.values)
+        value = value if value.ndim == 3 else value.permute(3, 0, 1, 2)
+        value = change(value).clamp(value.min(), value.max())
+        value = value if value.ndim == 3 else value.permute(1, 2, 3, 0)
+        changed[name] = Field(value.contiguous().numpy(), one.bounds)
+    return changed

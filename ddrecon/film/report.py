@@ -1,0 +1,162 @@
+"""What a film has come to, of all frames that are done, whoever did them: its record and page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+import torch
+
+from ddrecon.errors import UsageError
+from ddrecon.film.folder import Film
+from ddrecon.io.files.atomic import write_json
+from ddrecon.io.images.table import read_image, webp_of, write_animation
+from ddrecon.pictures import srgb
+from ddrecon.report.curve import draw_curve
+from ddrecon.report.page import (
+    ALIVE,
+    captioned,
+    embed,
+    page_text,
+    paragraph,
+    scrub,
+    section,
+    side_by_side,
+    table,
+    write_page,
+)
+from ddrecon.report.pictures import pixels, shrink
+from ddrecon.run.report import registered_text
+from ddrecon.scene_file.load import read_scene
+
+RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
+KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim", "registered")
+"""What of a run's summary is told of each frame."""
+SHOWN = 48
+"""Frames whose pictures are on the page; all are in their folders."""
+WIDEST = 768
+"""Pixels across target, render and difference, at most."""
+
+
+def write_film_report(film: Film) -> dict[str, Any]:
+    """What `film.json` says of the frames that are done; writes it, a page and a movie."""
+    rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
+    for number in film.done():
+        summaries[number] = json.loads((film.of(number) / "summary.json").read_text())
+        kept = {key: summaries[number].get(key) for key in KEPT}
+        known: dict[str, Any] = {k: value for k, value in kept.items() if value is not None}
+        rows.append({"frame": number} | known)
+    found = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | found
+    write_json(film.path / RECORD, record)
+    if rows:
+        sections = [section("Quality", side_by_side(*_curves(rows)))]
+        sections += [section("Frames", *_figures(film, summaries))]
+        if found.get("values"):
+            sections += [section("Calibration", *_calibration(film.shared))]
+        title = f"ddrecon: {film.path.absolute().name}"
+        write_page(film.path / REPORT, title, _lead(record), sections, is_alive=True)
+    return record
+
+
+def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
+    """The `record` of a film in `folder`, as lines."""
+    return [_lead(record), f"volumes and all else written to {folder}"]
+
+
+def film_page(folder: Path) -> str:
+    """The page of the film in `folder`, alive as long as frames are missing."""
+    if not (folder / RECORD).is_file() or not (folder / REPORT).is_file():
+        if (
+            not (folder / "scene.yaml").is_file()
+            or not read_scene(folder / "scene.yaml").tree.frames
+        ):
+            raise UsageError(f"{folder}: holds no film")
+        return page_text(f"ddrecon: {folder.name}", "just begun", [], is_alive=True, state=ALIVE)
+    record = json.loads((folder / RECORD).read_text())
+    text = (folder / REPORT).read_text(encoding="utf-8")
+    is_done = len(record["frames"]) == record["asked"]
+    return text if is_done else text.replace("<body", f"<body {ALIVE}", 1)
+
+
+def _lead(record: Mapping[str, Any]) -> str:
+    rows = record["frames"]
+    mean_of = {key: mean(row[key] for row in rows) for key in ("seconds", "psnr")}
+    told = f"PSNR {mean_of['psnr']:.2f} dB"
+    if all("test_psnr" in row for row in rows):
+        told += f", test PSNR {mean(row['test_psnr'] for row in rows):.2f} dB"
+    if all("registered" in row for row in rows):
+        parts = [row["registered"] for row in rows]
+        registered = {key: mean(part[key] for part in parts) for key in parts[0]}
+        told += f" (registered {registered_text(registered)})"
+    return f"{len(rows)} of {record['asked']} frames, {mean_of['seconds']:.1f} s each: {told}"
+
+
+def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """PSNR and SSIM by frame."""
+    drawn = []
+    for title, kind in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
+        keys = {"trained on": kind, "held out": f"test_{kind}"}
+        series = {
+            name: [(float(row["frame"]), row[key]) for row in rows if key in row]
+            for name, key in keys.items()
+        }
+        found = [(float(row["frame"]), row["registered"]) for row in rows if "registered" in row]
+        series["registered"] = [(frame, registered[kind]) for frame, registered in found]
+        drawn.append(draw_curve(title, {n: s for n, s in series.items() if s}, "frame"))
+    return drawn
+
+
+def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
+    """Pictures of the views held out, or of the first one, frame after frame; writes the movie."""
+    views = next(iter(summaries.values()))["views"]
+    shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
+    numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
+    parts = [paragraph("Target, render and what differs in them, four times enlarged.")]
+    for index, name in enumerate(shown):
+        strips = [_strip(of.of(number) / "previews" / f"{name}.png") for number in numbers]
+        figures = [
+            captioned(
+                embed(webp_of(srgb.encode_bytes(strip)), f"{name}, frame {number}"),
+                f"{name}, frame {number}: {summaries[number]['views'][name]['psnr']:.2f} dB",
+            )
+            for number, strip in zip(numbers, strips, strict=True)
+        ]
+        parts.append(scrub(figures))
+        if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
+            write_animation(of.path / MOVIE, strips, 1.0)
+            parts.append(paragraph(f"As a movie: {MOVIE}."))
+    return parts
+
+
+def _strip(path: Path) -> np.ndarray:
+    image = torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
+    return pixels(shrink(image, WIDEST))
+
+
+def _calibration(shared: Mapping[str, Any]) -> list[str]:
+    """What all frames share, and by how much those that found it disagree."""
+
+    def told(value: Any) -> str:
+        value = value.get("matrix", value) if isinstance(value, dict) else value
+        rows = value if isinstance(value, list) else [value]
+        rows = [number for row in rows for number in (row if isinstance(row, list) else [row])]
+        return ", ".join(f"{x:.4g}" if isinstance(x, float) else str(x) for x in rows)
+
+    spread = shared.get("spread", {})
+    rows = [
+        (name, told(value), told(spread.get(name, []))) for name, value in shared["values"].items()
+    ]
+    frames = ", ".join(map(str, shared.get("frames", [])))
+    return [
+        paragraph(
+            f"Found from frames {frames} together. The last column is the standard deviation, from "
+            "frame to frame, of what each alone would change with its volume as it is; of a camera "
+            "three turns [rad] and three shifts."
+        ),
+        table(["number", "value", "spread"], rows),
+    ]
