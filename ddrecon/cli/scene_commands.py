@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,11 +30,15 @@ if TYPE_CHECKING:
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
-    from ddrecon.cli.check import describe, lines
+    from ddrecon.cli.check import describe, lines, supports_of
+    from ddrecon.scene_file.frames import each_frame
     from ddrecon.scene_file.load import find_expert_keys
 
     expert = find_expert_keys(scene_file.tree)
-    report = describe(session.build(scene_file), expert, session.share == "cells")
+    scenes = map(session.build, each_frame(scene_file))
+    first = next(scenes)
+    supports = supports_of(chain([first], scenes))
+    report = describe(first, expert, supports, session.share == "cells")
     session.show(report, lines(report))
 
 

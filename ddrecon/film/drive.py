@@ -137,6 +137,8 @@ def calibrate(film: Film, is_quiet: bool) -> None:
     files = [at_frame(film.scene_file, number) for number in numbers]
     scenes = [film.build(scene_file) for scene_file in files]
     together, dtype = Together(scenes), scenes[0].volume.density.dtype
+    if not together.shared:
+        return
     described = {
         f"frame {number}": fingerprint(file, dtype)
         for number, file in zip(numbers, files, strict=True)

@@ -13,6 +13,7 @@ import torch
 
 from ddrecon.errors import UsageError
 from ddrecon.film.folder import Film
+from ddrecon.film.shared import SHARED
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import read_image, webp_of, write_animation
 from ddrecon.pictures import srgb
@@ -142,15 +143,12 @@ def _calibration(shared: Mapping[str, Any]) -> list[str]:
     """What all frames share, and by how much those that found it disagree."""
 
     def told(value: Any) -> str:
-        value = value.get("matrix", value) if isinstance(value, dict) else value
-        rows = value if isinstance(value, list) else [value]
-        rows = [number for row in rows for number in (row if isinstance(row, list) else [row])]
-        return ", ".join(f"{x:.4g}" if isinstance(x, float) else str(x) for x in rows)
+        if not isinstance(value, float | list):
+            return f"in {SHARED}"
+        return ", ".join(f"{number:.4g}" for number in np.ravel(value))
 
-    spread = shared.get("spread", {})
-    rows = [
-        (name, told(value), told(spread.get(name, []))) for name, value in shared["values"].items()
-    ]
+    values, spread = shared["values"], shared.get("spread", {})
+    rows = [(name, told(value), told(spread.get(name, []))) for name, value in values.items()]
     frames = ", ".join(map(str, shared.get("frames", [])))
     return [
         paragraph(

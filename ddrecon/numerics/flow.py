@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate, pad
+from torch.nn.functional import adaptive_avg_pool3d, grid_sample, interpolate
 
 STIFFNESS = 0.03
 """Slopes of the flow weigh this much, where fields are at most 1; chosen on data/film."""
@@ -64,32 +64,26 @@ def carry(field: Tensor, flow: Tensor) -> Tensor:
 def _relax(before: Tensor, after: Tensor, flow: Tensor) -> Tensor:
     """A better `flow`: the changes that are left along it are made small by Jacobi sweeps."""
     here = carry(before, flow)
-    slope = torch.stack(
-        [
-            axis.narrow(dim, 2, count) - axis.narrow(dim, 0, count)
-            for dim, axis, count in _axes((here + after) / 2)
-        ]
-    )
-    slope = slope / 2
+    pairs = _neighbors((here + after) / 2)
+    slope = torch.stack([(above - below) / 2 for below, above in pairs])
     # To first order here(x - d) is here - slope d: slope (new - flow) + after - here is to vanish.
     left = after - here - (slope * flow).sum(0)
     strength = 1 / (STIFFNESS + slope.square().sum(0))
     for _ in range(SWEEPS):
-        around = sum(
-            axis.narrow(dim + 1, end, count) for dim, axis, count in _axes(flow) for end in (0, 2)
-        )
-        mean = around / 6
+        mean = torch.stack([below + above for below, above in _neighbors(flow)]).sum(0) / 6
         flow = mean - slope * ((slope * mean).sum(0) + left) * strength
     return flow
 
 
-def _axes(field: Tensor) -> list[tuple[int, Tensor, int]]:
-    """Each axis of `field` [..., z, y, x], and the field with a cell more at both of its ends."""
-    first, wide = field.ndim - 3, []
-    for dim in range(3):
-        ends = [0, 0, 0, 0, 0, 0]
-        ends[4 - 2 * dim] = ends[5 - 2 * dim] = 1
-        count = field.shape[first + dim]
-        padded = pad(field.reshape(1, -1, *field.shape[first:]), ends, mode="replicate")
-        wide.append((dim, padded.view(*field.shape[:first], *padded.shape[2:]), count))
-    return wide
+def _neighbors(field: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Those of the cells of `field` [..., z, y, x] along each axis, below and above.
+
+    Beyond the faces it is as there.
+    """
+    pairs = []
+    for axis in (-3, -2, -1):
+        count = field.shape[axis] - 1
+        below = [field.narrow(axis, 0, 1), field.narrow(axis, 0, count)]
+        above = [field.narrow(axis, 1, count), field.narrow(axis, count, 1)]
+        pairs.append((torch.cat(below, axis), torch.cat(above, axis)))
+    return pairs

@@ -236,8 +236,8 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     if problem.loss == "photon":
         summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
     summary["ended"] = run.schedule.ending(run.iteration)
-    if (support := describe_support(problem.support, problem.scene.volume.grid)) is not None:
-        summary["support"] = support
+    if problem.support is not None:
+        summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
     return summary
 
 

@@ -21,13 +21,19 @@ def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
     return replace(scene_file, tree=replace(tree, views=views, frames=None))
 
 
+def each_frame(scene_file: SceneFile) -> list[SceneFile]:
+    """The scenes of all frames of a film, or the scene itself."""
+    frames = scene_file.tree.frames
+    return [at_frame(scene_file, number) for number in frames.numbers] if frames else [scene_file]
+
+
 def require_frames(scene_file: SceneFile) -> None:
     """Raises SceneError unless all pictures of the film are there."""
-    problems, frames = Problems(), scene_file.tree.frames
-    for number in frames.numbers if frames else ():
-        for index, view in enumerate(at_frame(scene_file, number).tree.views):
+    problems = Problems()
+    for one in each_frame(scene_file):
+        for index, view in enumerate(one.tree.views):
             for key, path in (("image", view.image), ("mask", view.mask)):
                 if path is not None and not problems.are_many:
                     with problems.collecting():
-                        require(scene_file, f"views.{index}.{key}", path)
+                        require(one, f"views.{index}.{key}", path)
     problems.raise_any()
