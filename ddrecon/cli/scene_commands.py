@@ -181,11 +181,10 @@ def optimize(
         from ddrecon.film.folder import Film, open_film
         from ddrecon.film.report import film_lines
 
-        film = Film(scene_file, output, session.build)
-        chosen, environment = film.choose(part), session.environment()
+        film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
+        chosen, film.environment = film.choose(part), session.environment()
         open_film(film, may_exist=overwrite, resume=resume, shared=shared)
-        is_quiet = session.is_quiet
-        record = drive_film(film, chosen, environment, preview_every, is_quiet, exported)
+        record = drive_film(film, chosen, exported)
         session.show(record, film_lines(record, output))
         return
     given = {"--frames": part, "--shared": shared, "--export": exported}

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -21,7 +22,7 @@ from ddrecon.film.report import write_film_report
 from ddrecon.film.shared import SHARED, read_shared, write_shared
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.folders import claim_folder
-from ddrecon.io.volumes.table import read_together, write_fields
+from ddrecon.io.volumes.table import field_names, read_field, write_fields
 from ddrecon.progress import bar_settings
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.together import Together
@@ -36,13 +37,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.drive import drive_run, open_run
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import (
-    CHECKPOINT_SECONDS,
-    CHECKPOINTS,
-    field_key,
-    volume_file,
-    write_values,
-)
+from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, volume_file, write_volume
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
@@ -67,52 +62,41 @@ def optimize_sequence(
         if film.scene_file.tree.frames is None:
             raise SceneError(f"{path}: frames: missing section; say which, {{first: 0, last: 99}}")
         open_film(film, may_exist=False, resume=True, shared=None)
-        for number in drive_frames(film, film.choose(None), {}, None, is_quiet=True):
+        for number in drive_frames(film, film.frames.numbers):
             scene = build(read_scene(film.of(number) / RESULT))
             yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
 
 
-def drive_film(
-    film: Film,
-    numbers: Sequence[int],
-    environment: dict[str, Any],
-    preview_every: int | None,
-    is_quiet: bool,
-    exported: str | None = None,
-) -> dict[str, Any]:
+def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict[str, Any]:
     """What `film.json` says of `film` after its frames `numbers`, those that are not yet done.
 
     All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
     """
-    for _ in drive_frames(film, numbers, environment, preview_every, is_quiet):
+    for _ in drive_frames(film, numbers):
         write_film_report(film)
     if exported is not None:
         (film.path / SEQUENCE).mkdir(exist_ok=True)
         for number in film.done():
-            sources = sorted((film.of(number) / "volumes").glob("*.npz"))
-            file = film.path / SEQUENCE / f"film_{number:04d}.{exported}"
-            write_fields(file, *read_together(sources))
+            files = sorted((film.of(number) / "volumes").glob("*.npz"))
+            fields = {file.stem: read_field(file, field_names(file)[0]) for file in files}
+            volumes = {name: one.values for name, one in fields.items()}
+            bounds = np.array(next(iter(fields.values())).bounds)
+            write_fields(film.path / SEQUENCE / f"film_{number:04d}.{exported}", volumes, bounds)
     return write_film_report(film)
 
 
-def drive_frames(
-    film: Film,
-    numbers: Sequence[int],
-    environment: dict[str, Any],
-    preview_every: int | None,
-    is_quiet: bool,
-) -> Iterator[int]:
+def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
     """Those of the frames `numbers` of `film` that are done, each when it is.
 
     A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
     again, its error is raised when all others are done.
     """
-    calibrate(film, is_quiet)
+    calibrate(film)
     failed = dict[int, DdreconError]()
     for is_second in (False, True):
         for number in [*failed] if is_second else numbers:
             try:
-                _drive_frame(film, number, is_second, environment, preview_every, is_quiet)
+                _drive_frame(film, number, is_second)
                 failed.pop(number, None)
             except (SolveError, FormatError, SceneError) as error:
                 failed[number] = error
@@ -125,7 +109,7 @@ def drive_frames(
         raise next(iter(failed.values()))
 
 
-def calibrate(film: Film, is_quiet: bool) -> None:
+def calibrate(film: Film) -> None:
     """Has `film` know what its frames share, by its folder or from several frames together."""
     path, count = film.path / SHARED, film.frames.calibrate
     if path.is_file():
@@ -156,7 +140,7 @@ def calibrate(film: Film, is_quiet: bool) -> None:
             total=first.schedule.planned,
             initial=first.iteration,
             desc=f"calibrate by {len(numbers)} frames",
-            **bar_settings(is_quiet),
+            **bar_settings(film.is_quiet),
         )
         with defer_interrupt() as asked, bar:
             while not together.is_done:
@@ -170,38 +154,26 @@ def calibrate(film: Film, is_quiet: bool) -> None:
                 if asked:
                     raise KeyboardInterrupt("in the calibration; go on with --resume")
         for number, run in zip(numbers, together.runs, strict=True):
-            (film.calibrated(number) / "volumes").mkdir(parents=True, exist_ok=True)
+            grid = run.problem.scene.volume.grid
             for p in run.parameters:
                 if p.is_field:
-                    stem = volume_file(film.calibrated(number), p.name).with_suffix("")
-                    grid = run.problem.scene.volume.grid
-                    write_values(stem, field_key(p.name), p.value_on(grid), grid)
+                    write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
         write_shared(path, together, numbers)
         for file in checkpoints.iterdir():
             file.unlink()
     film.shared = read_shared(path)
 
 
-def _drive_frame(
-    film: Film,
-    number: int,
-    is_second: bool,
-    environment: dict[str, Any],
-    preview_every: int | None,
-    is_quiet: bool,
-) -> None:
+def _drive_frame(film: Film, number: int, is_second: bool) -> None:
     """Finishes the frame `number`, from where it was, or anew where it `is_second` time."""
     folder = film.of(number)
     if number not in film.done():
         resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
-        if resume:
-            scene_file = read_scene(folder / "scene.yaml")
-        else:
-            scene_file = film.scene_of(number, is_second)
-        choice = {"may_exist": True, "resume": resume}
-        scene = film.build(scene_file)
-        with open_run(scene, scene_file, folder, environment, **choice) as (run, run_folder):
-            drive_run(run, run_folder, preview_every, is_quiet, f"frame {number}")
+        known = folder / "scene.yaml"
+        scene_file = read_scene(known) if resume else film.scene_of(number, is_second)
+        parts = film.build(scene_file), scene_file, folder, film.environment
+        with open_run(*parts, may_exist=True, resume=resume) as (run, run_folder):
+            drive_run(run, run_folder, film.preview_every, film.is_quiet, f"frame {number}")
         (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(folder, VELOCITY).is_file():
         film.write_velocity(number)

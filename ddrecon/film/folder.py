@@ -50,26 +50,26 @@ FILM_FILES = (
 class Film:
     """The film that `scene_file` asks for, in the folder `path`.
 
-    `build` makes the scene of a frame as tensors; `shared` is what `shared.json` says.
+    `build` makes the scene of a frame as tensors; `environment` and `preview_every` are as of a
+    run. `shared` is what `shared.json` says.
     """
 
     scene_file: SceneFile
     path: Path
     build: Callable[[SceneFile], Scene]
+    environment: dict[str, Any] = field(default_factory=dict)
+    preview_every: int | None = None
+    is_quiet: bool = True
     shared: dict[str, Any] = field(default_factory=dict)
 
     def choose(self, part: str | None) -> list[int]:
         """The frames that `part` names, `A:B`, both among them; None is all. Raises UsageError."""
-        found = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
-        first, last = (int(end) if end else None for end in found.groups()) if found else (1, 0)
-        chosen = [
-            number
-            for number in self.frames.numbers
-            if (first is None or number >= first) and (last is None or number <= last)
-        ]
+        ends = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
+        first, last = (ends[1] or 0, ends[2] or self.frames.last) if ends else (1, 0)
+        chosen = [number for number in self.frames.numbers if int(first) <= number <= int(last)]
         if not chosen:
-            ends = f"{self.frames.first}:{self.frames.last}"
-            raise UsageError(f"--frames {part}: names no frame; expected a part of {ends}")
+            whole = f"{self.frames.first}:{self.frames.last}"
+            raise UsageError(f"--frames {part}: names no frame; expected a part of {whole}")
         return chosen
 
     @property
@@ -194,10 +194,8 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
     SceneError where pictures are missing, or nothing is optimized.
     """
     if rank_count() > 1:
-        raise UsageError(
-            "torchrun does not share out a film: start parts of it, --frames A:B, as jobs of their"
-            " own, with --resume and the same -o"
-        )
+        what = "torchrun does not share out a film: start jobs for parts of it, --frames A:B"
+        raise UsageError(f"{what}, with --resume and the same -o")
     scene_file, path = film.scene_file, film.path
     if scene_file.tree.optimize is None:
         raise SceneError(f"{scene_file.path}: optimize: missing section; say what to reconstruct")
@@ -209,12 +207,11 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
     if resume and known.is_file():
         there, now = describe(read_scene(known)), describe(scene_file)
         for scene in (there, now):
+            scene.pop("frames", None)  # a film may grow
             scene.get("optimize", {}).pop("iterations", None)
         if changes := differences(there, now):
-            advice = "use another output folder"
-            raise UsageError(
-                [f"{path}: holds another film: {change}; {advice}" for change in changes]
-            )
+            what = f"{path}: holds another film; use another output folder"
+            raise UsageError([f"{what}: {change}" for change in changes])
     elif not resume:
         if any(path.iterdir()) and not may_exist:
             raise UsageError(

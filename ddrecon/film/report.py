@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ddrecon.errors import UsageError
 from ddrecon.film.folder import Film
 from ddrecon.film.shared import SHARED
 from ddrecon.io.files.atomic import write_json
@@ -32,7 +31,6 @@ from ddrecon.report.page import (
 )
 from ddrecon.report.pictures import pixels, shrink
 from ddrecon.run.report import registered_text
-from ddrecon.scene_file.load import read_scene
 
 RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
 KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim", "registered")
@@ -71,12 +69,7 @@ def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
 
 def film_page(folder: Path) -> str:
     """The page of the film in `folder`, alive as long as frames are missing."""
-    if not (folder / RECORD).is_file() or not (folder / REPORT).is_file():
-        if (
-            not (folder / "scene.yaml").is_file()
-            or not read_scene(folder / "scene.yaml").tree.frames
-        ):
-            raise UsageError(f"{folder}: holds no film")
+    if not (folder / REPORT).is_file():
         return page_text(f"ddrecon: {folder.name}", "just begun", [], is_alive=True, state=ALIVE)
     record = json.loads((folder / RECORD).read_text())
     text = (folder / REPORT).read_text(encoding="utf-8")

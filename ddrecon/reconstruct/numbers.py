@@ -85,19 +85,9 @@ class NumberSteps:
         self.curvatures: dict[str, tuple[int, Tensor]] = {}
         self.begun, self.sharing, self.heard = 0, sharing, list[Said]()
 
-    def step(
-        self,
-        point: Point,
-        gradients: Mapping[str, Tensor],
-        compared: Comparison,
-        due: Collection[str],
-        iteration: int,
-    ) -> None:
-        """Moves the numbers that are `due`, by name.
-
-        `gradients` are those of the views that were `compared`, at `point`.
-        """
-        self.heard.append(self.hear(point, gradients, compared, due, iteration))
+    def step(self, said: Said) -> None:
+        """Moves the numbers by what the views that were compared have `said`."""
+        self.heard.append(said)
         if len(self.heard) < self.sharing:
             return
         heard, self.heard[:] = [*self.heard], []
@@ -117,7 +107,10 @@ class NumberSteps:
         due: Collection[str],
         iteration: int,
     ) -> Said:
-        """What the views that were `compared` at `point` say of the numbers that are `due`."""
+        """What the views that were `compared` say of the numbers that are `due`, by name.
+
+        `gradients` are theirs, at `point`.
+        """
         shares = dict.fromkeys((view.name for view in compared.views), 0.0)
         for view in compared.views:
             shares[view.name] += compared.share(view)

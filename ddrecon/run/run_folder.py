@@ -167,9 +167,7 @@ class RunFolder:
             return plain(value)
         if not kind_of(name).is_cellwise:
             return write_values(self.path / name, name, value, scene.volume.grid, is_map=True)
-        file = volume_file(self.path, name)
-        write_values(file.with_suffix(""), field_key(name), value, scene.volume.grid)
-        return {"file": f"volumes/{file.name}"}
+        return {"file": write_volume(self.path, name, value, scene.volume.grid)}
 
     def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
         """Everything of `scene` that is not a field, as plain values.
@@ -213,6 +211,13 @@ def volume_file(folder: Path, name: str) -> Path:
     """Where a run in `folder` keeps the field `name`."""
     medium = split_name(name)[0].removeprefix("media.")
     return folder / "volumes" / f"{medium}{field_key(name)}.npz"
+
+
+def write_volume(folder: Path, name: str, value: Tensor, grid: Grid) -> str:
+    """Where in the run's `folder` the field `name` is, which is written there."""
+    file = volume_file(folder, name)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return f"volumes/{write_values(file.with_suffix(''), field_key(name), value, grid)}"
 
 
 def write_values(stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool = False) -> str:

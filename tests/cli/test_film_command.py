@@ -233,7 +233,7 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     other = run(*optimize("-o", "out", "--resume", "-D", "volume.albedo=0.5"))
     assert (
         other.exit_code == 2
-        and "holds another film: volume.albedo is 0.9 there, 0.5 now" in other.stderr
+        and "another output folder: volume.albedo is 0.9 there, 0.5 now" in other.stderr
     )
     shared = json.loads(Path("out/shared.json").read_text())
     shared["values"]["views.top.exposure"] = 1.0
