@@ -181,6 +181,5 @@ def _drive_frame(film: Film, number: int, is_second: bool) -> None:
 
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
     """As many as `count` of `numbers`, spread evenly from the first to the last."""
-    count = min(count, len(numbers))
-    last = len(numbers) - 1
-    return [numbers[round(i * last / max(count - 1, 1))] for i in range(count)]
+    places = np.linspace(0, len(numbers) - 1, min(count, len(numbers)))
+    return [numbers[round(place)] for place in places]

@@ -33,7 +33,7 @@ from ddrecon.report.pictures import pixels, shrink
 from ddrecon.run.report import registered_text
 
 RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
-KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim", "registered")
+KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
 """What of a run's summary is told of each frame."""
 SHOWN = 48
 """Frames whose pictures are on the page; all are in their folders."""
@@ -46,9 +46,10 @@ def write_film_report(film: Film) -> dict[str, Any]:
     rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
     for number in film.done():
         summaries[number] = json.loads((film.of(number) / "summary.json").read_text())
-        kept = {key: summaries[number].get(key) for key in KEPT}
-        known: dict[str, Any] = {k: value for k, value in kept.items() if value is not None}
-        rows.append({"frame": number} | known)
+        told = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
+        registered = summaries[number].get("registered", {})
+        told |= {f"registered_{key}": value for key, value in registered.items()}
+        rows.append({"frame": number, **told})
     found = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
     record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | found
     write_json(film.path / RECORD, record)
@@ -79,28 +80,24 @@ def film_page(folder: Path) -> str:
 
 def _lead(record: Mapping[str, Any]) -> str:
     rows = record["frames"]
-    mean_of = {key: mean(row[key] for row in rows) for key in ("seconds", "psnr")}
-    told = f"PSNR {mean_of['psnr']:.2f} dB"
-    if all("test_psnr" in row for row in rows):
-        told += f", test PSNR {mean(row['test_psnr'] for row in rows):.2f} dB"
-    if all("registered" in row for row in rows):
-        parts = [row["registered"] for row in rows]
-        registered = {key: mean(part[key] for part in parts) for key in parts[0]}
-        told += f" (registered {registered_text(registered)})"
-    return f"{len(rows)} of {record['asked']} frames, {mean_of['seconds']:.1f} s each: {told}"
+    means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
+    told = f"PSNR {means['psnr']:.2f} dB"
+    if "test_psnr" in means:
+        registered = {key: means[f"registered_{key}"] for key in ("psnr", "ssim", "shift")}
+        told += (
+            f", test PSNR {means['test_psnr']:.2f} dB (registered {registered_text(registered)})"
+        )
+    return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {told}"
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """PSNR and SSIM by frame."""
-    drawn = []
-    for title, kind in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
-        keys = {"trained on": kind, "held out": f"test_{kind}"}
+    drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
+    for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
         series = {
-            name: [(float(row["frame"]), row[key]) for row in rows if key in row]
-            for name, key in keys.items()
+            name: [(float(row["frame"]), row[kind + key]) for row in rows if kind + key in row]
+            for name, kind in kinds.items()
         }
-        found = [(float(row["frame"]), row["registered"]) for row in rows if "registered" in row]
-        series["registered"] = [(frame, registered[kind]) for frame, registered in found]
         drawn.append(draw_curve(title, {n: s for n, s in series.items() if s}, "frame"))
     return drawn
 

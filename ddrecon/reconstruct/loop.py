@@ -7,7 +7,7 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import asdict, replace
 from time import perf_counter
@@ -24,7 +24,7 @@ from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row
-from ddrecon.reconstruct.numbers import NumberSteps, Point, Said
+from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
@@ -231,27 +231,22 @@ class Reconstruction:
             if rates[p.name] and (p.is_field or p not in self.numbers.numbers):
                 p.step(gradients[p.name], rates[p.name], self.problem.power)
         due = [name for name, rate in rates.items() if rate]
-        self.numbers.step(self._hear(values, gradients, compared, due))
+        point = self._point(values)
+        self.numbers.step(self.numbers.hear(point, gradients, compared, due, self.iteration))
 
-    def _hear(
-        self,
-        values: Mapping[str, Tensor],
-        gradients: Mapping[str, Tensor],
-        compared: Comparison,
-        due: Collection[str],
-    ) -> Said:
-        """What the views that were `compared` say of the numbers that are `due`, at `values`."""
+    def _point(self, values: Mapping[str, Tensor]) -> Point:
+        """Where the numbers stand: at the `values` of all parameters."""
         before = {name: value.detach() for name, value in values.items()}
-        point = Point(self.level.train, before, self.memory.last)
-        return self.numbers.hear(point, gradients, compared, due, self.iteration)
+        return Point(self.level.train, before, self.memory.last)
 
     def changes_alone(self) -> dict[Parameter, Tensor]:
         """The step, in units of rates, to what all pictures say of the numbers, undamped."""
         values = {parameter.name: parameter.value for parameter in self.parameters}
         compared = Comparison(self.level.train.views, self.level.targets)
-        objective = self._differentiate(values, compared)
+        gradients = self._differentiate(values, compared).gradients
         self.numbers.curvatures = {}
-        said = self._hear(values, objective.gradients, compared, values)
+        point = self._point(values)
+        said = self.numbers.hear(point, gradients, compared, values, self.iteration)
         return self.numbers.changes([said], damping=0.0)
 
     @property

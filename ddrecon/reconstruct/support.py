@@ -73,10 +73,7 @@ def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] 
     places = kept.nonzero().cpu()
     lower, cell = (np.array(sides) for sides in (grid.lower, grid.spacing))
     ends = (lower + cell * end.numpy() for end in (places.amin(0), places.amax(0) + 1))
-    return {
-        "cells": float(kept.float().mean()),
-        "box": [end[::-1].tolist() for end in ends],
-    }
+    return {"cells": float(kept.float().mean()), "box": [end[::-1].tolist() for end in ends]}
 
 
 def support_text(support: dict[str, Any]) -> str:

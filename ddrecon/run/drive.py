@@ -27,6 +27,9 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, dump_scene
 from ddrecon.terms import engine_of_scene
 
+OPTIMIZE = "optimize"
+"""What the progress bar of a run is called that is no frame of a film."""
+
 
 @contextmanager
 def open_run(
@@ -109,26 +112,23 @@ def drive_run(
     folder: RunFolder,
     preview_every: int | None,
     is_quiet: bool,
-    frame: str = "",
+    title: str = OPTIMIZE,
 ) -> dict[str, Any]:
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
-    `preview_every` counts iterations between pictures; `frame` is which one of a film it is. An
-    interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
-    before it is passed on. So do a divergence and the end of another rank; any other failure leaves
-    the checkpoints written so far.
+    `preview_every` counts iterations between pictures; `title` is that of the progress bar, of a
+    frame that of a film. An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and
+    writes a checkpoint before it is passed on. So do a divergence and the end of another rank; any
+    other failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:
         try:
             with tqdm(
-                total=total,
-                initial=run.iteration,
-                desc=frame or "optimize",
-                **bar_settings(is_quiet),
+                total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet)
             ) as bar:
-                if not is_quiet and not frame:
+                if not is_quiet and title == OPTIMIZE:
                     loss = describe_loss(run.problem.settings, run.problem.train)
                     tqdm.write(loss_text(loss), file=sys.stderr)
                 while not run.is_done:
@@ -146,8 +146,7 @@ def drive_run(
                     if is_any(bool(asked)):
                         folder.save(run)
                         raise KeyboardInterrupt(
-                            f"after {run.iteration} iterations{frame and f' of {frame}'}; "
-                            "go on with --resume"
+                            f"after {run.iteration} iterations; go on with --resume"
                         )
         except (DivergenceError, RanksError) as error:
             folder.save(run)

@@ -150,12 +150,9 @@ class RunFolder:
         rows = self.log.rows(run.iteration)
         diagnoses = diagnose(scene.views, found.images, found.quality, rows)
         summary = _summary(run) | {"views": found.quality, "diagnoses": diagnoses}
-        if registered := [
-            one["registered"] for one in found.quality.values() if "registered" in one
-        ]:
-            summary["registered"] = {
-                key: mean(one[key] for one in registered) for key in registered[0]
-            }
+        seen = [one["registered"] for one in found.quality.values() if "registered" in one]
+        if seen:
+            summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
         write_json(self.path / "summary.json", summary)
         write_run_report(self.path / "report.html", found, rows, summary, self.environment)
         return summary
