@@ -119,8 +119,12 @@ def calibrate(film: Film) -> None:
         return
     numbers = spread_out(film.frames.numbers, count)
     files = [at_frame(film.scene_file, number) for number in numbers]
-    scenes = [film.build(scene_file) for scene_file in files]
-    together, dtype = Together(scenes), scenes[0].volume.density.dtype
+    try:
+        scenes = [film.build(scene_file) for scene_file in files]
+        together, dtype = Together(scenes), scenes[0].volume.density.dtype
+    except FormatError as error:
+        advice = f"frames {', '.join(map(str, numbers))} calibrate the film: change frames.first"
+        raise FormatError(error.path, f"{error.reason}; {advice} or frames.last") from error
     if not together.shared:
         return
     described = {

@@ -28,6 +28,7 @@ from ddrecon.scene_file.frames import at_frame, require_frames
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.settings import AUTO
+from ddrecon.variables.kinds import kind_of
 
 SHARE = 6
 """A frame that begins with another makes so many times fewer iterations."""
@@ -99,11 +100,6 @@ class Film:
         described = describe(at_frame(self.scene_file, number))
         hold(described, self.shared.get("values", {}), self.path / SHARED)
         optimize = described["optimize"]
-        if not optimize["parameters"]:
-            raise SceneError(
-                f"{self.scene_file.path}: optimize.parameters: all are the same in every frame; "
-                "name a field, such as density"
-            )
         if fields := self._start(number, [*optimize["parameters"]], is_between):
             start = self.of(number) / "start.npz"
             start.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +117,8 @@ class Film:
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Field]:
         """What the frame `number` begins with: those of the variables `names` that are fields.
 
-        None where no frame before it is done, nor one after it where it `is_between` them.
+        They are those that it had in the calibration where no frame before it is done, nor one
+        after it where it `is_between` them; none where it had none.
         """
         before = [n for n in self.done() if n < number]
         after = [n for n in self.done() if n > number and is_between]
@@ -150,13 +147,14 @@ class Film:
         """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
         sums = []
         for each in (number, other):
-            fields = _fields_in(self.of(each), self._parameters())
+            fields = _fields_in(self.of(each), self.sought)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
             values = [torch.from_numpy(fields[name].values) for name in moving]
             sums.append(torch.stack([v if v.ndim == 3 else v.mean(-1) for v in values]).sum(0))
         return find_flow(*sums) / (other - number)
 
-    def _parameters(self) -> list[str]:
+    @property
+    def sought(self) -> list[str]:
         """The variables that the film optimizes."""
         optimize = self.scene_file.tree.optimize
         return [*optimize.parameters] if optimize else []
@@ -170,7 +168,7 @@ class Film:
         if not before:
             return
         motion = self._flow(before[-1], number)
-        one = next(iter(_fields_in(self.of(number), self._parameters()).values()))
+        one = next(iter(_fields_in(self.of(number), self.sought).values()))
         values = motion.flip(0).permute(1, 2, 3, 0).numpy() * _cell(one)
         for each in [number, *([before[0]] if len(before) == 1 else [])]:
             assert one.bounds is not None
@@ -197,8 +195,9 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
         what = "torchrun does not share out a film: start jobs for parts of it, --frames A:B"
         raise UsageError(f"{what}, with --resume and the same -o")
     scene_file, path = film.scene_file, film.path
-    if scene_file.tree.optimize is None:
-        raise SceneError(f"{scene_file.path}: optimize: missing section; say what to reconstruct")
+    if not any(kind_of(name).is_cellwise for name in film.sought):
+        what = "optimize.parameters: none changes from frame to frame; name one, such as density"
+        raise SceneError(f"{scene_file.path}: {what}")
     require_frames(scene_file)
     known = path / "scene.yaml"
     given = None if shared is None else read_shared(shared)

@@ -215,7 +215,8 @@ def test_a_frame_that_fails_is_named_and_begun_from_both_sides(film: Path, run: 
         (("--shared", "no.json"), "--shared no.json: there is no such file; a film's folder has"),
         (("--shared", "scene.yaml"), "scene.yaml: not JSON"),
         (("-D", "frames="), "is of a film; say which frames: {first: 0, last: 99}"),
-        (("-D", "optimize="), "optimize: missing section; say what to reconstruct"),
+        (("-D", "optimize="), "none changes from frame to frame; name one, such as density"),
+        (("-D", "optimize.parameters={lights.0.irradiance: {}}"), "none changes from frame to"),
     ],
 )
 def test_misuse_is_one_line(
