@@ -6,24 +6,31 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.film.shared import SHARED, hold, read_shared
+from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import refusals, write_json
-from ddrecon.io.volumes.field import Field
-from ddrecon.io.volumes.table import read_field, write_field, write_fields
+from ddrecon.io.volumes.table import read_field
 from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.run.checkpoint import differences
-from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file
+from ddrecon.run.run_folder import (
+    field_key,
+    remove_files,
+    remove_run,
+    volume_file,
+    write_volume,
+)
 from ddrecon.scene import Scene
+from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
 from ddrecon.scene_file.schema import FramesSection
@@ -42,7 +49,7 @@ FILM_FILES = (
     *("scene.yaml", "environment.json", "film.json", "report.html", "movie.png"),
     *(SHARED, "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
     *("calibration/checkpoints/*.pt", "calibration/[0-9]*/volumes/*.npz"),
-    *("frames/[0-9]*/start.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
+    *("frames/[0-9]*/start/volumes/*.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
 )
 """What files of a film are called, but for those of its frames' runs."""
 
@@ -79,6 +86,12 @@ class Film:
         assert self.scene_file.tree.frames is not None
         return self.scene_file.tree.frames
 
+    @cached_property
+    def grid(self) -> Grid:
+        """The grid of all frames."""
+        media = build_media(self.scene_file, torch.float32, torch.device("cpu"))
+        return next(iter(media.values())).grid
+
     def of(self, number: int) -> Path:
         """The folder of the run of the frame `number`."""
         return self.path / "frames" / f"{number:04d}"
@@ -100,21 +113,18 @@ class Film:
         described = describe(at_frame(self.scene_file, number))
         hold(described, self.shared.get("values", {}), self.path / SHARED)
         optimize = described["optimize"]
-        if fields := self._start(number, [*optimize["parameters"]], is_between):
-            start = self.of(number) / "start.npz"
-            start.parent.mkdir(parents=True, exist_ok=True)
-            bounds = next(iter(fields.values())).bounds
-            assert bounds is not None
-            write_fields(start, {name: one.values for name, one in fields.items()}, bounds)
-            for name in fields:
-                init = {"file": str(start.absolute()), "name": name}
-                optimize["parameters"][name]["init"] = init
+        fields = self._start(number, [*optimize["parameters"]], is_between)
+        start = self.of(number).absolute() / "start"
+        for name, value in fields.items():
+            file = start / write_volume(start, name, value, self.grid)
+            optimize["parameters"][name]["init"] = {"file": str(file)}
+        if fields:
             planned = optimize["iterations"]
             planned = tuning.PLANNED if planned == AUTO else planned
             optimize |= {"iterations": math.ceil(planned / SHARE), "refine_at": []}
         return read_described(described, self.scene_file.path)
 
-    def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Field]:
+    def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
         """What the frame `number` begins with: those of the variables `names` that are fields.
 
         They are those that it had in the calibration where no frame before it is done, nor one
@@ -132,16 +142,12 @@ class Film:
             # The air goes on as it went, and its motion with it.
             way = motion * (number - nearest)
             way = carry(way, way)
-            return _map(lambda value: carry(value, way), fields)
+            return {name: carry(value, way) for name, value in fields.items()}
         last, following = before[-1], after[0]
-        ours, theirs = (_fields_in(self.of(each), names) for each in (last, following))
         motion = self._flow(last, following)
-        forth = _map(lambda value: carry(value, (number - last) * motion), ours)
-        back = _map(lambda value: carry(value, (number - following) * motion), theirs)
-        return {
-            name: Field((one.values + back[name].values) / 2, one.bounds)
-            for name, one in forth.items()
-        }
+        ours, theirs = (_fields_in(self.of(each), names) for each in (last, following))
+        forth, back = ((number - each) * motion for each in (last, following))
+        return {name: (carry(ours[name], forth) + carry(theirs[name], back)) / 2 for name in ours}
 
     def _flow(self, number: int, other: int) -> Tensor:
         """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
@@ -149,8 +155,9 @@ class Film:
         for each in (number, other):
             fields = _fields_in(self.of(each), self.sought)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
-            values = [torch.from_numpy(fields[name].values) for name in moving]
-            sums.append(torch.stack([v if v.ndim == 3 else v.mean(-1) for v in values]).sum(0))
+            # Of what has colors their mean.
+            values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
+            sums.append(torch.stack(values).sum(0))
         return find_flow(*sums) / (other - number)
 
     @property
@@ -167,21 +174,19 @@ class Film:
         before = [n for n in self.done() if n < number]
         if not before:
             return
-        motion = self._flow(before[-1], number)
-        one = next(iter(_fields_in(self.of(number), self.sought).values()))
-        values = motion.flip(0).permute(1, 2, 3, 0).numpy() * _cell(one)
+        motion = self._flow(before[-1], number) * self._cell
         for each in [number, *([before[0]] if len(before) == 1 else [])]:
-            assert one.bounds is not None
-            file = volume_file(self.of(each), VELOCITY)
-            write_field(file, VELOCITY, values.astype(np.float32), one.bounds)
+            write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
 
     def _velocity(self, number: int) -> Tensor | None:
         """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
-        file = volume_file(self.of(number), VELOCITY)
-        if not file.is_file():
-            return None
-        one = read_field(file, VELOCITY)
-        return torch.from_numpy(one.values / _cell(one)).float().permute(3, 0, 1, 2).flip(0)
+        field = _fields_in(self.of(number), [VELOCITY]).get(VELOCITY)
+        return None if field is None else field.flip(0) / self._cell
+
+    @property
+    def _cell(self) -> Tensor:
+        """The sides of a cell [u] along z, y and x: [3, 1, 1, 1]."""
+        return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
 def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
@@ -226,25 +231,9 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
     dump_scene(scene_file, known)
 
 
-def _fields_in(folder: Path, names: list[str]) -> dict[str, Field]:
-    """Those of the variables `names` that are fields, as the run in `folder` has them."""
+def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
+    """Those of the variables `names` that are fields [..., z, y, x], as the run in `folder` has."""
     files = {name: volume_file(folder, name) for name in names}
-    return {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
-
-
-def _cell(field: Field) -> np.ndarray:
-    """The sides (x, y, z) [u] of a cell of `field`."""
-    sides: np.ndarray = np.ptp(np.asarray(field.bounds), axis=0) / np.array(field.resolution)
-    return sides
-
-
-def _map(change: Callable[[Tensor], Tensor], fields: dict[str, Field]) -> dict[str, Field]:
-    """`fields` with their values [..., z, y, x] changed, within what they were between."""
-    changed = {}
-    for name, one in fields.items():
-        value = torch.from_numpy(one.values)
-        value = value if value.ndim == 3 else value.permute(3, 0, 1, 2)
-        value = change(value).clamp(value.min(), value.max())
-        value = value if value.ndim == 3 else value.permute(1, 2, 3, 0)
-        changed[name] = Field(value.contiguous().numpy(), one.bounds)
-    return changed
+    read = {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
+    values = {name: torch.from_numpy(field.values) for name, field in read.items()}
+    return {n: v if v.ndim == 3 else v.permute(3, 0, 1, 2).contiguous() for n, v in values.items()}

@@ -58,7 +58,7 @@ def carry(field: Tensor, flow: Tensor) -> Tensor:
         padding_mode="border",
         align_corners=False,
     )
-    return carried.view(field.shape)
+    return carried.view(field.shape).clamp(field.min(), field.max())
 
 
 def _relax(before: Tensor, after: Tensor, flow: Tensor) -> Tensor:

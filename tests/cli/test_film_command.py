@@ -125,7 +125,7 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
         == volumes("out/frames/0000")["volumes/density.npz"]
     )
     start, first = volumes("out/frames/0001"), volumes("out/frames/0000")
-    assert start["start.npz"] == first["volumes/density.npz"]
+    assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
 
 
 @pytest.fixture
