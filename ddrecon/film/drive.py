@@ -72,16 +72,17 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
 
     All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
     """
-    for _ in drive_frames(film, numbers):
-        write_film_report(film)
+    before = film.done()
+    for number in drive_frames(film, numbers):
+        if number not in before:
+            write_film_report(film)
     if exported is not None:
         (film.path / SEQUENCE).mkdir(exist_ok=True)
         for number in film.done():
             files = sorted((film.of(number) / "volumes").glob("*.npz"))
-            fields = {file.stem: read_field(file, field_names(file)[0]) for file in files}
-            volumes = {name: one.values for name, one in fields.items()}
-            bounds = np.array(next(iter(fields.values())).bounds)
-            write_fields(film.path / SEQUENCE / f"film_{number:04d}.{exported}", volumes, bounds)
+            fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
+            path = film.path / SEQUENCE / f"film_{number:04d}.{exported}"
+            write_fields(path, fields, np.array(film.grid.bounds_xyz))
     return write_film_report(film)
 
 
