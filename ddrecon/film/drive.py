@@ -186,5 +186,5 @@ def _drive_frame(film: Film, number: int, is_second: bool) -> None:
 
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
     """As many as `count` of `numbers`, spread evenly from the first to the last."""
-    places = np.linspace(0, len(numbers) - 1, min(count, len(numbers)))
-    return [numbers[round(place)] for place in places]
+    last = len(numbers) - 1
+    return [numbers[round(at)] for at in np.linspace(0, last, min(count, len(numbers)))]

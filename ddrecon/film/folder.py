@@ -41,8 +41,6 @@ SHARE = 6
 """A frame that begins with another makes so many times fewer iterations."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
-
-
 SEQUENCE = "sequence"
 """The folder of exported volumes, `film_0000.vdb` and so on."""
 FILM_FILES = (

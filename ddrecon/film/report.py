@@ -120,7 +120,6 @@ def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
         parts.append(scrub(figures))
         if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
             write_animation(of.path / MOVIE, strips, 1.0)
-            parts.append(paragraph(f"As a movie: {MOVIE}."))
     return parts
 
 

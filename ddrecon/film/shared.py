@@ -61,8 +61,8 @@ def hold(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> 
     They are not optimized any more. Raises UsageError where these are of other cameras or lights.
     """
     views = {view["name"]: view for view in described["views"]}
-    known = {*(f"views.{name}" for name in views)}
-    known |= {f"lights.{index}" for index in range(len(described["lights"]))}
+    lights = (f"lights.{index}" for index in range(len(described["lights"])))
+    known = {*lights, *(f"views.{name}" for name in views)}
     strange = [
         name
         for name in values
