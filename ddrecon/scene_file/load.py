@@ -17,6 +17,7 @@ from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
+from ddrecon.scene_file.transforms import node_of
 from ddrecon.scene_file.view_sources import name_listed, views_of
 from ddrecon.settings import ParameterSettings, Violation
 from ddrecon.variables.kinds import (
@@ -75,6 +76,16 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     problems.raise_any()
     assert root is not None and tree is not None
+    return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
+
+
+def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
+    """The scene that `described` says in plain values, as `describe` returns them.
+
+    It counts as read from the file at `path`. Raises SceneError as `read_scene` does.
+    """
+    root = node_of("", str(path), described)
+    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 
