@@ -1,7 +1,8 @@
 """Views held out, registered: what they would show by a camera that is where it seems to be.
 
 A held-out camera may err as all do, and then says more of itself than of the volume. So its pose
-and exposure are fitted to the finished volume, by Gauss and Newton; the volume stays as it is.
+and exposure are fitted to the finished volume, by Gauss and Newton with the slopes of where it was
+given: shifts are small, and slopes dear. The volume stays as it is.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from itertools import product
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, project
@@ -23,8 +25,8 @@ from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import pose_rate
 from ddrecon.variables.values import with_values
 
-STEPS = 6
-"""Of Gauss and Newton at most; they end when one makes nothing better."""
+STEPS = 8
+"""At most; they end when one makes nothing better."""
 LEAST = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
 FARTHEST = 40.0
@@ -42,6 +44,7 @@ def register(
     name, ways = f"views.{view.name}.camera", torch.eye(6).to(view.camera.pose)
     unit = pose_rate(scene, name, ways[0])
     change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
+    columns: list[Tensor] = []
     for _ in range(STEPS):
         world = with_values(scene, {name: change})
         moved = world.view(view.name)
@@ -52,11 +55,11 @@ def register(
             break
         shift = shift_between(view.camera, moved.camera, scene.volume.grid)
         best = {"psnr": psnr, "ssim": float(target.ssim_of(fitted)), "shift": shift}
-        columns = []
-        for way in ways:
-            with forward_ad.dual_level():
-                moving = {name: forward_ad.make_dual(change, way * unit)}
-                columns.append(change_of(light_field, with_values(scene, moving), view.name))
+        if not columns:
+            for way in ways:
+                with forward_ad.dual_level():
+                    moving = {name: forward_ad.make_dual(change, way * unit)}
+                    columns.append(change_of(light_field, with_values(scene, moving), view.name))
         # Errors are those that PSNR counts, of values as they are compared.
         given = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
         slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / given
