@@ -120,7 +120,7 @@ def interpolate(values: Tensor, places: Tensor) -> Tensor:
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def find_rough(values: Tensor, tolerance: Tensor, lattice: Lattice) -> Tensor:
+def find_rough(values: Tensor, tolerance: float, lattice: Lattice) -> Tensor:
     """Which pixels interpolation may have off by more than `tolerance`: numbers [*].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
@@ -133,7 +133,7 @@ def find_rough(values: Tensor, tolerance: Tensor, lattice: Lattice) -> Tensor:
     uneven = np.pad((np.abs(down) + np.abs(along)).sum(0), 2)
     # Of each place, the largest of the four rays around.
     rows = np.maximum(uneven[1:], uneven[:-1])
-    is_rough = DOUBT * np.maximum(rows[:, 1:], rows[:, :-1]) > tolerance.item()
+    is_rough = DOUBT * np.maximum(rows[:, 1:], rows[:, :-1]) > tolerance
     numbers = is_rough.ravel()[lattice.cells.cpu().numpy()].nonzero()[0]
     rough = torch.from_numpy(numbers).to(values.device)
     rows, columns = lattice.places.detach()[rough].unbind(-1)

@@ -65,7 +65,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     Raises SceneError with one line per problem.
     """
     path, problems = Path(path), Problems()
-    root = tree = None
+    found = None
     with problems.collecting():
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
         if root.value is None:
@@ -73,10 +73,10 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         for text in overrides:
             with problems.collecting():
                 override(root, text, problems)
-        tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
+        found = _scene_of(root, path)
     problems.raise_any()
-    assert root is not None and tree is not None
-    return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
+    assert found is not None
+    return found
 
 
 def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
@@ -84,7 +84,10 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
     It counts as read from the file at `path`. Raises SceneError as `read_scene` does.
     """
-    root = node_of("", str(path), described)
+    return _scene_of(node_of("", str(path), described), path)
+
+
+def _scene_of(root: Node, path: Path) -> SceneFile:
     tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
