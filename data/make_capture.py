@@ -1,15 +1,17 @@
 """Makes data/capture: smoke as five cameras on tripods film it, with all that cameras do to it.
 
     python data/make_capture.py [--paths 256 | --respoil] [-o FOLDER]
+    python data/make_capture.py --film [--paths 512] [-o FOLDER]
 
 The smoke is that of `make_smoke.py`; Mitsuba 3 traces its pictures along ddrecon's own view rays,
 `--paths` a pixel (with DRJIT_LIBLLVM_PATH it is some ten times faster). Then each picture is
 spoiled: exposure, white balance, black level, shot noise, sRGB of 8 bits, a film in H.264, of which
 one frame is taken; and each training camera is told a little wrong. What is true stands in
 truth.json and density.npz. `--respoil` takes the smoke and its pictures from the folder, where they
-are kept, and needs no Mitsuba.
+are kept, and needs no Mitsuba. `--film` makes data/film instead: 24 frames that end with that
+one, at half the pixels, by the same cameras; of each frame its density.
 
-The film needs imageio-ffmpeg: pip install imageio-ffmpeg.
+A film needs imageio-ffmpeg: pip install imageio-ffmpeg.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -35,7 +38,7 @@ from ddrecon.reference.trace import Tracer, open_tracer
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 
-FOLDER = Path(__file__).parent / "capture"
+FOLDER = Path(__file__).parent
 CELLS = (48, 72, 48)
 BOX = ((-0.5, 0.0, -0.5), (0.5, 1.5, 0.5))
 """The volume [m], y up."""
@@ -59,6 +62,8 @@ FRAMES, TAKEN = 24, 17
 """Frames of a film, and the one that is taken: not a first one, which alone is coded by itself."""
 QUALITY = 19
 """The constant rate factor of H.264; 18 is hardly told from what was filmed, 23 is usual."""
+PACE = 2
+"""Steps of the smoke from frame to frame of data/film."""
 
 
 def true_cameras() -> dict[str, Camera]:
@@ -149,16 +154,14 @@ def trace(tracer: Tracer, camera: Camera, paths: int, seed: int) -> np.ndarray:
     return total / SUBPIXELS
 
 
-def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) -> np.ndarray:
-    """The frame [h, w, 3] of 8 bits that is taken of a film of the radiance `picture`.
-
-    The smoke rises by a pixel a frame, and each frame has noise of its own.
-    """
+def spoil(
+    pictures: Sequence[np.ndarray], exposure: np.ndarray, black: float, seed: int
+) -> np.ndarray:
+    """The frames [n, h, w, 3] of 8 bits of a film of the radiance `pictures`, each with noise."""
     generator = np.random.default_rng(seed)
     frames = []
-    for number in range(FRAMES):
-        exposed = np.roll(picture, TAKEN - number, axis=0) * exposure + black
-        noisy = generator.poisson(PHOTONS * exposed.clip(0)) / PHOTONS
+    for picture in pictures:
+        noisy = generator.poisson(PHOTONS * (picture * exposure + black).clip(0)) / PHOTONS
         frames.append(np.round(255 * encode(noisy.clip(0, 1))).astype(np.uint8))
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
@@ -170,8 +173,14 @@ def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) ->
             pixelformat="yuv420p",
             quality=None,
             output_params=["-crf", str(QUALITY)],
+            macro_block_size=1,
         )
-        return imageio.imread(film, index=TAKEN)
+        return imageio.imread(film)
+
+
+def rising(picture: np.ndarray) -> list[np.ndarray]:
+    """A film in which what `picture` shows rises by a pixel a frame; it is the frame `TAKEN`."""
+    return [np.roll(picture, TAKEN - number, axis=0) for number in range(FRAMES)]
 
 
 def exposures() -> dict[str, tuple[np.ndarray, float]]:
@@ -208,41 +217,82 @@ def write_cameras(path: Path, frames: list[dict[str, object]], folder: str) -> N
     path.write_text(json.dumps({"camera_model": "OPENCV", **splits, "frames": frames}, indent=1))
 
 
+def write_density(path: Path, density: np.ndarray) -> None:
+    """Writes the volume that pictures show."""
+    np.savez_compressed(path, density=density.astype(np.float16), bounds=np.array(BOX))
+
+
+def write_told(folder: Path, told: dict[str, Camera], suffix: str) -> None:
+    """Writes the cameras as a calibration tells them; their pictures end in `suffix`."""
+    wrong = [frame(told[name], file_path=f"{name}{suffix}") for name in told]
+    write_cameras(folder / "transforms.json", wrong, "")
+
+
+def smokes() -> list[np.ndarray]:
+    """The density after each step."""
+    return [np.round(smoke * 256) / 256 for smoke in simulate(CELLS[::-1], STEPS, SEED)]
+
+
+def make_capture(folder: Path, paths: int, is_kept: bool) -> None:
+    """Writes data/capture; the pictures that `is_kept` says are in the folder are not traced."""
+    cameras = true_cameras()
+    if is_kept:
+        kept = {name: np.load(folder / "clean" / f"{name}.npy").astype(float) for name in cameras}
+    else:
+        density = smokes()[-1]
+        tracer = open_tracer(scene_of(torch.from_numpy(density), cameras), [])
+        kept = {
+            name: trace(tracer, camera, paths, seed)
+            for seed, (name, camera) in enumerate(cameras.items())
+        }
+        (folder / "clean").mkdir(parents=True, exist_ok=True)
+        write_density(folder / "density.npz", density)
+    truth = []
+    for seed, (name, (exposure, black)) in enumerate(exposures().items()):
+        film = spoil(rising(kept[name]), exposure, black, seed)
+        imageio.imwrite(folder / f"{name}.png", film[TAKEN])
+        np.save(folder / "clean" / f"{name}.npy", kept[name].astype(np.float16))
+        known = {"exposure": exposure.tolist(), "black": black}
+        truth.append(frame(cameras[name], file_path=f"clean/{name}.npy", **known))
+    write_cameras(folder / "truth.json", truth, "clean")
+    write_told(folder, told_cameras(cameras), ".png")
+
+
+def make_film(folder: Path, paths: int) -> None:
+    """Writes data/film."""
+    cameras = {name: camera.resize(2) for name, camera in true_cameras().items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    clean: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
+    for number, density in enumerate(smokes()[-1 - PACE * (FRAMES - 1) :: PACE]):
+        write_density(folder / f"density_{number:04d}.npz", density)
+        tracer = open_tracer(scene_of(torch.from_numpy(density), cameras), [])
+        for seed, (name, camera) in enumerate(cameras.items(), len(cameras) * number):
+            clean[name].append(trace(tracer, camera, paths, seed))
+    truth = []
+    for seed, (name, (exposure, black)) in enumerate(exposures().items()):
+        for number, picture in enumerate(spoil(clean[name], exposure, black, seed)):
+            imageio.imwrite(folder / f"{name}_{number:04d}.png", picture)
+        known = {"exposure": exposure.tolist(), "black": black}
+        truth.append(frame(cameras[name], file_path=f"{name}_{{frame:04d}}.png", **known))
+    write_cameras(folder / "truth.json", truth, "")
+    told = {name: camera.resize(2) for name, camera in told_cameras(true_cameras()).items()}
+    write_told(folder, told, "_{frame:04d}.png")
+
+
 def main() -> None:
     """Writes all of it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--paths", type=int, default=256)
+    parser.add_argument("--paths", type=int)
     parser.add_argument("--respoil", action="store_true")
-    parser.add_argument("-o", "--output", type=Path, default=FOLDER)
+    parser.add_argument("--film", action="store_true")
+    parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
-    folder, cameras = given.output, true_cameras()
-    if given.respoil:
-        kept = {name: np.load(folder / "clean" / f"{name}.npy").astype(float) for name in cameras}
-        kept["density"] = np.load(folder / "density.npz")["density"]
+    if given.film:
+        make_film(given.output or FOLDER / "film", given.paths or 512)
     else:
-        density = np.round(simulate(CELLS[::-1], STEPS, SEED) * 256) / 256
-        scene = scene_of(torch.from_numpy(density), cameras)
-        tracer = open_tracer(scene, [])
-        kept = {"density": density} | {
-            name: trace(tracer, camera, given.paths, seed)
-            for seed, (name, camera) in enumerate(cameras.items())
-        }
-    (folder / "clean").mkdir(parents=True, exist_ok=True)
-    box = np.array(BOX)
-    np.savez_compressed(
-        folder / "density.npz", density=kept["density"].astype(np.float16), bounds=box
-    )
-    told, truth, wrong = told_cameras(cameras), [], []
-    for seed, (name, (exposure, black)) in enumerate(exposures().items()):
-        imageio.imwrite(folder / f"{name}.png", spoil(kept[name], exposure, black, seed))
-        np.save(folder / "clean" / f"{name}.npy", kept[name].astype(np.float16))
-        known = {"exposure": exposure.tolist(), "black": black}
-        truth.append(frame(cameras[name], file_path=f"clean/{name}.npy", **known))
-        wrong.append(frame(told[name], file_path=f"{name}.png"))
-    write_cameras(folder / "truth.json", truth, "clean")
-    write_cameras(folder / "transforms.json", wrong, "")
+        make_capture(given.output or FOLDER / "capture", given.paths or 256, given.respoil)
 
 
 if __name__ == "__main__":

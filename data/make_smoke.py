@@ -8,6 +8,8 @@ Fourier space. Lengths are in cells, times in steps.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,8 +24,8 @@ FADE = 0.997
 """What is left of smoke, and of its warmth, after a step."""
 
 
-def simulate(shape: tuple[int, int, int], steps: int, seed: int) -> Array:
-    """The density [z, y, x] of smoke, 1 at its source, after `steps`; y is up.
+def simulate(shape: tuple[int, int, int], steps: int, seed: int) -> Iterator[Array]:
+    """The density [z, y, x] of smoke, 1 at its source, after each of `steps`; y is up.
 
     The source is a disk near the bottom, fed unevenly.
     """
@@ -51,7 +53,7 @@ def simulate(shape: tuple[int, int, int], steps: int, seed: int) -> Array:
         # Air and smoke do not come round to the other side.
         calm = np.clip((shape[1] - 1 - y) / 6, 0, 1) * np.clip(y / 2, 0, 1)
         velocity, smoke = velocity * calm, smoke * calm
-    return smoke
+        yield smoke
 
 
 def _carry(fields: Array, velocity: Array) -> Array:

@@ -1,8 +1,8 @@
 """ddrecon: density volumes from pictures of smoke and clouds, by differential diffusion.
 
 `load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene,
-...) -> Result` and `VolumeRenderer`, the renderer as a layer. Names are imported when first used,
-so that `import ddrecon` costs nothing.
+...) -> Result`, of films `optimize_sequence(path, ...) -> Iterator[Result]`, and `VolumeRenderer`,
+the renderer as a layer. Names are imported when first used, so that `import ddrecon` costs nothing.
 """
 
 from importlib import import_module
@@ -16,6 +16,7 @@ _HOMES = {
     "render": "ddrecon.layer",
     "VolumeRenderer": "ddrecon.layer",
     "optimize": "ddrecon.reconstruct.loop",
+    "optimize_sequence": "ddrecon.film.drive",
     "Result": "ddrecon.reconstruct.loop",
     "Scene": "ddrecon.scene",
     "use_engine": "ddrecon.engine",

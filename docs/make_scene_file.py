@@ -303,6 +303,21 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "frames",
+        schema.FramesSection,
+        "A [film](films.md): pictures and masks have the number of a frame in their names, "
+        "`front_{frame:04d}.png`.\nOther commands than `optimize` take its first frame.",
+        {
+            "first": "Number of the first frame.",
+            "last": "Number of the last frame.",
+            "step": "From one frame to the next.",
+            "calibrate": (
+                "Frames, spread along the film, that find together what does not change: all but "
+                "fields. 0: each finds its own."
+            ),
+        },
+    ),
+    (
         "render",
         settings.RenderSettings,
         "How view rays are sampled.",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+from ddrecon.cameras import Camera
 from ddrecon.engine import name_engines
+from ddrecon.grid import Grid
 from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
-from ddrecon.reconstruct.support import describe_support, find_support, support_text
+from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import needs_of_scene
@@ -26,7 +29,16 @@ def memory_estimate(scene: Scene) -> int:
     return memory_of(needs_of_scene(volume.media or {"": volume}, *parts))
 
 
-def describe(scene: Scene, expert: dict[str, Any], has_slabs: bool = False) -> dict[str, Any]:
+def supports_of(frames: Iterable[Scene]) -> list[Support]:
+    """Where density may be in each of `frames`, of one scene or of a film, by their pictures."""
+    trained = ((select_views(scene, is_test=False), scene.optimize) for scene in frames)
+    found = [find_support(train, settings) for train, settings in trained if settings is not None]
+    return [support for support in found if support is not None]
+
+
+def describe(
+    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = (), has_slabs: bool = False
+) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
@@ -35,10 +47,9 @@ def describe(scene: Scene, expert: dict[str, Any], has_slabs: bool = False) -> d
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
     low, high = grid.bounds_xyz
-    loss = support = None
+    loss = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
-        support = describe_support(find_support(train, scene.optimize), grid)
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],
@@ -51,18 +62,27 @@ def describe(scene: Scene, expert: dict[str, Any], has_slabs: bool = False) -> d
                 "height": view.camera.size[0],
                 "split": "test" if view.is_test else "train",
                 "has_image": view.image is not None,
+                "cell": cell_in_pixels(view.camera, grid),
             }
             for view in scene.views
         ],
         "physics": needed_terms(scene),
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
-        "support": support,
+        "support": describe_support(supports, grid),
         "engine": engine_of_scene(scene, has_slabs),
         "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }
+
+
+def cell_in_pixels(camera: Camera, grid: Grid) -> float:
+    """How many pixels of `camera` a cell in the middle of `grid` is wide."""
+    pixel = 2 * float(camera.half_width) / camera.size[1]
+    if camera.is_perspective:
+        pixel *= float(camera.pose[:, 3].dist(camera.pose.new_tensor(grid.center_xyz)))
+    return min(grid.spacing) / pixel
 
 
 def lines(report: dict[str, Any]) -> list[str]:
@@ -78,11 +98,13 @@ def lines(report: dict[str, Any]) -> list[str]:
         f" {view['split']}{', with image' if view['has_image'] else ''}"
         for view in report["views"]
     ]
+    widths = [view["cell"] for view in report["views"]]
     expert = ", ".join(f"{key} {value}" for key, value in report["expert_keys"].items())
     return [
         f"grid: {sizes}, from {low} to {high}",
         f"views: {len(report['views'])}",
         *views,
+        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide",
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",

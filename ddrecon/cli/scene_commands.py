@@ -7,6 +7,8 @@ scene file, are shown at once.
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,11 +30,15 @@ if TYPE_CHECKING:
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
-    from ddrecon.cli.check import describe, lines
+    from ddrecon.cli.check import describe, lines, supports_of
+    from ddrecon.scene_file.frames import each_frame
     from ddrecon.scene_file.load import find_expert_keys
 
     expert = find_expert_keys(scene_file.tree)
-    report = describe(session.build(scene_file), expert, session.share == "cells")
+    scenes = map(session.build, each_frame(scene_file))
+    first = next(scenes)
+    supports = supports_of(chain([first], scenes))
+    report = describe(first, expert, supports, session.share == "cells")
     session.show(report, lines(report))
 
 
@@ -134,6 +140,19 @@ def render(
     help="Write pictures every K iterations.",
 )
 @click.option("--uncertainty", "has_uncertainty", is_flag=True, hidden=True)
+@click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
+@click.option(
+    "--shared",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Of a film, hold the calibration that FILE, another film's shared.json, says.",
+)
+@click.option(
+    "--export",
+    "exported",
+    type=click.Choice(["vdb", "vti", "npz"]),
+    help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
+)
 @SHARE
 @DTYPE
 @REPORT
@@ -147,13 +166,30 @@ def optimize(
     resume: bool,
     preview_every: int | None,
     has_uncertainty: bool,
+    part: str | None,
+    shared: Path | None,
+    exported: str | None,
 ) -> None:
-    """Reconstruct what SCENE asks for from its views' images."""
+    """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
     if has_uncertainty:
         raise click.UsageError(f"--uncertainty: say `ddrecon uncertainty {output} -o DIR` after it")
     if iterations is not None:
         session = session.with_override(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
+    if scene_file.tree.frames is not None:
+        from ddrecon.film.drive import drive_film
+        from ddrecon.film.folder import Film, open_film
+        from ddrecon.film.report import film_lines
+
+        film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
+        chosen, film.environment = film.choose(part), session.environment()
+        open_film(film, may_exist=overwrite, resume=resume, shared=shared)
+        record = drive_film(film, chosen, exported)
+        session.show(record, film_lines(record, output))
+        return
+    given = {"--frames": part, "--shared": shared, "--export": exported}
+    if of_films := [option for option, value in given.items() if value is not None]:
+        raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
@@ -258,13 +294,15 @@ def uncertainty(
 )
 @in_session
 def watch(session: Session, run: Path, port: int | None) -> None:
-    """Serve the page of RUN, the folder of a run, on this machine alone, while the run goes on.
+    """Serve the page of RUN, the folder of a run or a film, on this machine alone, as it goes on.
 
     Ctrl-C ends it.
     """
+    from ddrecon.film.report import film_page
     from ddrecon.run.live import LiveRun, listen, serve_page, url_of
 
-    live = LiveRun(run)
-    with listen(port) as listening, serve_page(live.page, listening) as server:
+    is_film = any((run / name).is_dir() for name in ("frames", "calibration"))
+    page = partial(film_page, run) if is_film else LiveRun(run).page
+    with listen(port) as listening, serve_page(page, listening) as server:
         click.echo(f"{url_of(listening)}  (Ctrl-C ends)")
         server.serve_forever()

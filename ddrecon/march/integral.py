@@ -105,8 +105,8 @@ def _find_rough(
         (scattered, opacity), brightest = values.chunk(2), behind.detach().max()
         seen = scattered + brightest * (1 - opacity)
         values = torch.cat([scattered, brightest * opacity])
-    bound = tolerance * seen.square().mean(dtype=torch.float64).sqrt()
-    return find_rough(values, bound.to(values.dtype), lattice)
+    size = float(seen.square().mean(dtype=torch.float64).sqrt())
+    return find_rough(values, tolerance * size, lattice)
 
 
 def _spread(along: Tensor, sight: Sight) -> Tensor:

@@ -11,16 +11,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch.nn.functional import normalize
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.slicing import across
-from ddrecon.numerics.third_order import ThirdOrder, second_difference
+from ddrecon.numerics.third_order import ThirdOrder
 
 MARGIN = 2
 """Lattice rays beyond the outermost pixels: as far as interpolation reaches."""
@@ -119,18 +120,22 @@ def interpolate(values: Tensor, places: Tensor) -> Tensor:
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def find_rough(values: Tensor, tolerance: Tensor, lattice: Lattice) -> Tensor:
+def find_rough(values: Tensor, tolerance: float, lattice: Lattice) -> Tensor:
     """Which pixels interpolation may have off by more than `tolerance`: numbers [*].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
     they are large at edges sharper than the lattice as well. They come in an order in which
     neighbors are neighbors in the volume: along stripes as high as a voxel.
     """
-    down, along = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
-    uneven = (down.abs() + along.abs()).sum(0)
+    # In numpy: the arrays are small. Between the outermost two rays lie no pixels.
+    v = values.cpu().numpy()
+    down, along = np.diff(v, 4, axis=1)[:, :, 2:-2], np.diff(v, 4, axis=2)[:, 2:-2]
+    uneven = np.pad((np.abs(down) + np.abs(along)).sum(0), 2)
     # Of each place, the largest of the four rays around.
-    is_rough = (DOUBT * max_pool2d(uneven[None], 2, 1) > tolerance).flatten()
-    rough = is_rough[lattice.cells].nonzero()[:, 0]
+    rows = np.maximum(uneven[1:], uneven[:-1])
+    is_rough = DOUBT * np.maximum(rows[:, 1:], rows[:, :-1]) > tolerance
+    numbers = is_rough.ravel()[lattice.cells.cpu().numpy()].nonzero()[0]
+    rough = torch.from_numpy(numbers).to(values.device)
     rows, columns = lattice.places.detach()[rough].unbind(-1)
     stripe = (rows / RAYS_PER_VOXEL).floor()
     return rough[(stripe * lattice.shape[1] + columns).argsort(stable=True)]

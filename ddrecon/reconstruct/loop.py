@@ -26,6 +26,7 @@ from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_t
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
@@ -230,9 +231,23 @@ class Reconstruction:
             if rates[p.name] and (p.is_field or p not in self.numbers.numbers):
                 p.step(gradients[p.name], rates[p.name], self.problem.power)
         due = [name for name, rate in rates.items() if rate]
+        point = self._point(values)
+        self.numbers.step(self.numbers.hear(point, gradients, compared, due, self.iteration))
+
+    def _point(self, values: Mapping[str, Tensor]) -> Point:
+        """Where the numbers stand: at the `values` of all parameters."""
         before = {name: value.detach() for name, value in values.items()}
-        point = Point(self.level.train, before, self.memory.last)
-        self.numbers.step(point, gradients, compared, due, self.iteration)
+        return Point(self.level.train, before, self.memory.last)
+
+    def changes_alone(self) -> dict[Parameter, Tensor]:
+        """The step, in units of rates, to what all pictures say of the numbers, undamped."""
+        values = {parameter.name: parameter.value for parameter in self.parameters}
+        compared = Comparison(self.level.train.views, self.level.targets)
+        gradients = self._differentiate(values, compared).gradients
+        self.numbers.curvatures = {}
+        point = self._point(values)
+        said = self.numbers.hear(point, gradients, compared, values, self.iteration)
+        return self.numbers.changes([said], damping=0.0)
 
     @property
     def _is_test_due(self) -> bool:

@@ -51,72 +51,108 @@ class Point:
     solutions: Mapping[tuple[str, int], Tensor]
 
 
+@dataclass(frozen=True)
+class Said:
+    """What the pictures of one volume say of those numbers that are `moved`, entry by entry.
+
+    That is `matrix`, J^T W J, and `right`, the derivative downhill, in units of the rates.
+    """
+
+    moved: Sequence[Parameter]
+    matrix: Tensor
+    right: Tensor
+
+
 class NumberSteps:
     """The steps of the single numbers among `parameters`, which the views of `train` show.
 
     Fields take part by their level, one number a color, where numbers of the medium are optimized,
     since pictures show their product. `curvatures` are J^T W J of each view that was looked at, by
-    name, and the iteration that it is of; `begun` is the first at this resolution.
+    name, and the iteration that it is of; `begun` is the first at this resolution. `sharing` are
+    several volumes that share numbers: a step is made when the pictures of all have been heard.
     """
 
-    def __init__(self, train: Scene, parameters: Sequence[Parameter]):
+    def __init__(self, train: Scene, parameters: Sequence[Parameter], sharing: int = 1):
         self.numbers = single_numbers(parameters)
         if any(is_of_volume(p.name) for p in self.numbers):
             self.numbers += [p for p in parameters if p.is_field]
         self.gauges = find_gauges(train, parameters)
         poses = [p for p in self.numbers if p.key == "camera"]
         # Where some cameras are optimized no calibration is to be mended: they may be far off.
-        self.calibrated = poses if len(poses) == len(train.views) > 1 else []
+        cameras = {view.name: view.camera for view in train.views}
+        calibrated = poses if len(poses) == len(cameras) > 1 else []
+        self.priors = {p: calibration_prior(cameras[str(p.view)], p.grid).cpu() for p in calibrated}
         self.curvatures: dict[str, tuple[int, Tensor]] = {}
-        self.begun = 0
+        self.begun, self.sharing, self.heard = 0, sharing, list[Said]()
 
-    def step(
+    def step(self, said: Said) -> None:
+        """Moves the numbers by what the views that were compared have `said`."""
+        self.heard.append(said)
+        if len(self.heard) < self.sharing:
+            return
+        heard, self.heard[:] = [*self.heard], []
+        if not any(said.moved for said in heard):
+            return
+        for p, part in self.changes(heard).items():
+            part = part / (part.abs().max() / tuning.LARGEST_STEP).clamp(min=1)
+            p.move(part * units_of(p))
+        for gauge in self.gauges:
+            gauge.hold()
+
+    def hear(
         self,
         point: Point,
         gradients: Mapping[str, Tensor],
         compared: Comparison,
         due: Collection[str],
         iteration: int,
-    ) -> None:
-        """Moves the numbers that are `due`, by name.
+    ) -> Said:
+        """What the views that were `compared` say of the numbers that are `due`, by name.
 
-        `gradients` are those of the views that were `compared`, at `point`.
+        `gradients` are theirs, at `point`.
         """
         shares = dict.fromkeys((view.name for view in compared.views), 0.0)
         for view in compared.views:
             shares[view.name] += compared.share(view)
         moved = [p for p in self.numbers if p.name in due and (p.view is None or p.view in shares)]
         if not moved:
-            return
+            return Said([], torch.zeros(0, 0).double(), torch.zeros(0).double())
         self._refresh(point, compared, iteration)
-        # All in units of their rates.
-        places, unit = _places(moved), torch.cat([_units(p) for p in moved])
+        unit = torch.cat([units_of(p) for p in moved])
         known = {name: share * self.curvatures[name][1] for name, share in shares.items()}
         matrix = _sum_between(moved, known, self.numbers) * unit * unit[:, None]
         slopes = [_gradient(p, point.values[p.name], gradients[p.name]) for p in moved]
-        right = -torch.cat(slopes) * unit
+        return Said(moved, matrix, -torch.cat(slopes) * unit)
+
+    def changes(
+        self, heard: Sequence[Said], damping: float = tuning.DAMPING
+    ) -> dict[Parameter, Tensor]:
+        """The damped step of each number that all who were `heard` ask for, in units of rates."""
+        moved = list(dict.fromkeys(p for said in heard for p in said.moved))
+        places, size = _places(moved), sum(_count(p) for p in moved)
+        matrix, right = torch.zeros(size, size).double(), torch.zeros(size).double()
+        for said in heard:
+            if said.moved:
+                at = torch.cat([places[p] for p in said.moved])
+                matrix[at[:, None], at] += said.matrix
+                right[at] += said.right
         for p in moved:
-            at = places[p.name]
+            at, unit = places[p], units_of(p)
             block = matrix[at[:, None], at]
-            if p in self.calibrated:
-                # As strong as what the picture says of a shift in the image by `TRUST`.
-                of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2
-                camera = next(v.camera for v in point.scene.views if v.name == p.view)
-                prior = calibration_prior(camera, p.grid).cpu() * of_shifts
-                prior = prior * unit[at] * unit[at][:, None]
-                right[at] -= prior @ (p.value.detach().double().cpu() / unit[at])
+            if p in self.priors:
+                # As strong as what one picture says of a shift in the image by `TRUST`.
+                count = sum(p in said.moved for said in heard)
+                of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2 / count
+                prior = self.priors[p] * of_shifts
+                prior = prior * unit * unit[:, None]
+                right[at] -= prior @ (p.value.detach().double().cpu() / unit)
                 block = block + prior
             least = tuning.LEAST * block.diagonal().max() + torch.finfo(torch.float32).tiny
-            damped = (1 + tuning.DAMPING) * block + least * torch.eye(len(at)).double()
+            damped = (1 + damping) * block + least * torch.eye(len(at)).double()
             matrix[at[:, None], at] = damped
         # As the first rank has it: another machine may round in another way.
         change = from_first(torch.linalg.solve(matrix, right))
-        for p in moved:
-            part = change[places[p.name]]
-            part = part / (part.abs().max() / tuning.LARGEST_STEP).clamp(min=1)
-            p.move(part * unit[places[p.name]])
-        for gauge in self.gauges:
-            gauge.hold()
+        return {p: change[at] for p, at in places.items()}
 
     def _refresh(self, point: Point, compared: Comparison, iteration: int) -> None:
         """Finds the curvatures anew of those views that were `compared` whose are too old."""
@@ -210,8 +246,8 @@ def _sum_between(
     total = torch.zeros(size, size, dtype=torch.float64)
     for name, matrix in matrices.items():
         seen = _places(_shown_by(name, numbers))
-        if keys := [key for key in seen if key in places]:
-            rows, columns = (torch.cat([at[key] for key in keys]) for at in (seen, places))
+        if known := [p for p in seen if p in places]:
+            rows, columns = (torch.cat([at[p] for p in known]) for at in (seen, places))
             total[columns[:, None], columns] += matrix[rows[:, None], rows]
     return total
 
@@ -220,11 +256,11 @@ def _shown_by(view: str, numbers: Sequence[Parameter]) -> list[Parameter]:
     return [p for p in numbers if p.view is None or p.view == view]
 
 
-def _places(numbers: Sequence[Parameter]) -> dict[str, Tensor]:
-    """Where the entries of each of `numbers` stand, one after another, by name."""
+def _places(numbers: Sequence[Parameter]) -> dict[Parameter, Tensor]:
+    """Where the entries of each of `numbers` stand, one after another."""
     counts = [_count(p) for p in numbers]
     places = torch.arange(sum(counts)).split(counts) if counts else ()
-    return dict(zip((p.name for p in numbers), places, strict=True))
+    return dict(zip(numbers, places, strict=True))
 
 
 def _count(p: Parameter) -> int:
@@ -232,7 +268,7 @@ def _count(p: Parameter) -> int:
     return p.value.numel() // p.grid.cells if p.is_field else p.value.numel()
 
 
-def _units(p: Parameter) -> Tensor:
+def units_of(p: Parameter) -> Tensor:
     """The rate of each entry of `p`, in float64; that of a level is relative."""
     rate = torch.as_tensor(tuning.LEVEL_RATE if p.is_field else p.rate)
     return rate.double().cpu().expand(_count(p))

@@ -134,23 +134,27 @@ def render_quality(
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
             if view.name in own:
                 target = targets[view.name]
-                fitted, _ = fit_held_out(image, view, target, parameters)
+                fitted, _ = fit_held_out(image, view, target, response_sizes(parameters))
                 found["psnr"].append(target.psnr_of(fitted))
                 found["ssim"].append(target.ssim_of(fitted))
     psnr, ssim = sum_numbers([float(sum(row)) for row in found.values()])
     return psnr / len(names), ssim / len(names)
 
 
+def response_sizes(parameters: Sequence[Parameter]) -> dict[str, int]:
+    """How many numbers exposure and offset of a view have, of those that are `parameters`."""
+    return {p.key: len(p.value) for p in parameters if p.view is not None and p.key in RESPONSE}
+
+
 def fit_held_out(
-    picture: Tensor, view: View, target: Target, parameters: Sequence[Parameter]
+    picture: Tensor, view: View, target: Target, sizes: Mapping[str, int]
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The `picture` [3, h, w] of a test `view` with the response that fits its own `target` best.
 
-    And what that is, by key: of exposure and offset those that are `parameters` of training views.
+    And what that is, by key: of exposure and offset those that `sizes` names, by `response_sizes`.
     Least squares count errors in the dark more than PSNR does where pictures are displayed, and may
     do harm to a picture that is far off: then the exposure alone is found, or none.
     """
-    sizes = {p.key: len(p.value) for p in parameters if p.view is not None and p.key in RESPONSE}
     known = {
         key: picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
         for key, default in RESPONSE.items()

@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
@@ -60,15 +62,28 @@ class Support:
         return hull
 
 
-def describe_support(support: Support | None, grid: Grid) -> dict[str, float] | None:
-    """What a report says of `support`: the part of the cells of `grid` that it keeps."""
-    return None if support is None else {"cells": float(support.on(grid).float().mean())}
+def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] | None:
+    """What a report says of `supports`, that of a scene or of each frame of a film; None without.
+
+    That is the part of the cells of `grid` that any keeps, and the corners (x, y, z) of their box.
+    """
+    if not supports:
+        return None
+    kept = torch.stack([support.on(grid) for support in supports]).any(0)
+    places = kept.nonzero().cpu()
+    lower, cell = (np.array(sides) for sides in (grid.lower, grid.spacing))
+    ends = (lower + cell * end.numpy() for end in (places.amin(0), places.amax(0) + 1))
+    return {"cells": float(kept.float().mean()), "box": [end[::-1].tolist() for end in ends]}
 
 
-def support_text(support: dict[str, float]) -> str:
+def support_text(support: dict[str, Any]) -> str:
     """What `describe_support` says, as a line."""
+    low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in support["box"])
     part = 100 * support["cells"]
-    return f"support: density in {part:.3g} % of the cells, where every view may show some"
+    return (
+        f"support: density in {part:.3g} % of the cells, where every view may show some, "
+        f"all within bounds: {{min: [{low}], max: [{high}]}}"
+    )
 
 
 def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:

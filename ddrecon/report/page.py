@@ -15,8 +15,10 @@ from typing import Any
 from ddrecon.io.files.atomic import replace_file
 
 ASSETS = resources.files("ddrecon.report") / "assets"
-SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "page.js", "live.js")
+SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "film.js", "page.js", "live.js")
 """What makes a page alive, in the order in which one needs the other."""
+ALIVE = "data-live"
+"""The attribute of the body of a page that asks for itself again and again."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\
@@ -103,13 +105,13 @@ def versions(environment: Mapping[str, Any]) -> str:
 
 def picture(png: bytes, caption: str) -> str:
     """The picture `png`, whose pixels are shown as squares, above `caption`."""
-    return _captioned(embed(png, caption, 'class="pixels" style="width: 600px"'), caption)
+    return captioned(embed(png, caption, 'class="pixels" style="width: 600px"'), caption)
 
 
 def pair(target: bytes, render: bytes, caption: str) -> str:
     """Two pictures of one view side by side, or one over the other where scripts run."""
     images = embed(target, f"{caption}, target") + embed(render, f"{caption}, render")
-    return _captioned(f'<div class="pair">{images}</div>', caption)
+    return captioned(f'<div class="pair">{images}</div>', caption)
 
 
 def embed(image: bytes, text: str, attributes: str = "") -> str:
@@ -130,7 +132,13 @@ def unfolded(summary: str, part: str, *, is_open: bool) -> str:
     return f"{start}<summary>{escape(summary)}</summary>{part}</details>"
 
 
-def _captioned(element: str, caption: str) -> str:
+def scrub(figures: Sequence[str]) -> str:
+    """The `figures` below each other, or one at a time with a slider where scripts run."""
+    return f'<div class="film">{"".join(figures)}</div>'
+
+
+def captioned(element: str, caption: str) -> str:
+    """The `element` above `caption`."""
     return f"<figure>{element}<figcaption>{escape(caption)}</figcaption></figure>"
 
 

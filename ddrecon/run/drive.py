@@ -21,10 +21,14 @@ from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.quality import describe_loss, find_results, loss_text
+from ddrecon.run.report import registered_text
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder, remove_run
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, dump_scene
 from ddrecon.terms import engine_of_scene
+
+OPTIMIZE = "optimize"
+"""What the progress bar of a run is called that is no frame of a film."""
 
 
 @contextmanager
@@ -100,26 +104,31 @@ def follow_run(
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
     if cells_are_shared():
-        find_results(run)
+        find_results(run, registers=True)
 
 
 def drive_run(
-    run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool
+    run: Reconstruction,
+    folder: RunFolder,
+    preview_every: int | None,
+    is_quiet: bool,
+    title: str = OPTIMIZE,
 ) -> dict[str, Any]:
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
-    `preview_every` counts iterations between pictures. An interrupt (SIGINT or SIGTERM) takes
-    effect between two iterations, and writes a checkpoint before it is passed on. So do a
-    divergence and the end of another rank; any other failure leaves the checkpoints written so far.
+    `preview_every` counts iterations between pictures; `title` is that of the progress bar, of a
+    frame that of a film. An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and
+    writes a checkpoint before it is passed on. So do a divergence and the end of another rank; any
+    other failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:
         try:
             with tqdm(
-                total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
+                total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet)
             ) as bar:
-                if not is_quiet:
+                if not is_quiet and title == OPTIMIZE:
                     loss = describe_loss(run.problem.settings, run.problem.train)
                     tqdm.write(loss_text(loss), file=sys.stderr)
                 while not run.is_done:
@@ -160,6 +169,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     )
     if summary["test_psnr"] is not None:
         line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    if registered := summary.get("registered"):
+        line += f" (registered {registered_text(registered)})"
     line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     ended = [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]

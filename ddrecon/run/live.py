@@ -16,7 +16,7 @@ from threading import Lock, Thread
 from time import monotonic
 
 from ddrecon.errors import DdreconError, UsageError
-from ddrecon.report.page import page_text, section, side_by_side
+from ddrecon.report.page import ALIVE, page_text, section, side_by_side
 from ddrecon.run.checkpoint import newest_checkpoint
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import find_results
@@ -64,7 +64,7 @@ class LiveRun:
         loss = section("Loss", side_by_side(*curves(rows))) if rows else ""
         sections = [volume, loss, views]
         title = f"ddrecon: {self.folder.absolute().name}"
-        return page_text(title, lead, sections, is_alive=True, state="data-live")
+        return page_text(title, lead, sections, is_alive=True, state=ALIVE)
 
     def _is_finished(self) -> bool:
         """Whether the report was written after the run last began, or saved its state."""

@@ -12,9 +12,10 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.pictures.scales import COMPARED, LINEAR
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.objective import fit_held_out
+from ddrecon.reconstruct.objective import fit_held_out, response_sizes
 from ddrecon.reconstruct.setup import choose_loss, targets_of
 from ddrecon.renderer import solve_light, view_picture
+from ddrecon.run.registration import register
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.kinds import is_of_volume
@@ -26,7 +27,8 @@ class Findings:
     """The `scene` as found, and of each view with a target its image and quality.
 
     That is, by name, its split, PSNR and SSIM, and of a test view the exposure it was given to
-    compare it. `given` are the fields of the scene file in whose place others were found, by name.
+    compare it, and what it is `registered`. `given` are the fields of the scene file in whose place
+    others were found, by name.
     """
 
     scene: Scene
@@ -35,8 +37,8 @@ class Findings:
     quality: Mapping[str, Mapping[str, Any]]
 
 
-def find_results(run: Reconstruction) -> Findings:
-    """What `run` has found so far, rendered."""
+def find_results(run: Reconstruction, registers: bool = False) -> Findings:
+    """What `run` has found so far, rendered; it `registers` views held out where that is said."""
     scene = run.current_scene()
     shown = [view for view in scene.views if view.image is not None]
     targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
@@ -44,16 +46,20 @@ def find_results(run: Reconstruction) -> Findings:
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
         for view in shown:
-            target, fitted = targets[view.name], dict[str, Tensor]()
+            target, sizes = targets[view.name], response_sizes(run.parameters)
+            fitted, registered = dict[str, Tensor](), dict[str, Any]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
-                picture, fitted = fit_held_out(picture, view, target, run.parameters)
+                picture, fitted = fit_held_out(picture, view, target, sizes)
+                if registers:
+                    registered["registered"] = register(light_field, scene, view, target, sizes)
             images[view.name] = picture
             quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
+                **registered,
             }
     return Findings(scene, _given_fields(run.problem.scene), images, quality)
 

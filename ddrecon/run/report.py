@@ -199,4 +199,12 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
         if f"fitted_{key}" in quality:
             values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
             text += f", {key} {values} fitted to it"
+    if registered := quality.get("registered"):
+        text += f"; registered {registered_text(registered)}"
     return text
+
+
+def registered_text(registered: Mapping[str, float]) -> str:
+    """How good a view held out is by a camera fitted to the volume, and how far that moved."""
+    psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
+    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, moved by {shift:.2f} pixels"

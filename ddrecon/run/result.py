@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ddrecon.scene_file.load import SceneFile, describe
@@ -11,6 +11,8 @@ from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, is_of_volume, split_name
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ddrecon.scene import Scene
 
 RESULT = "result.yaml"
@@ -56,6 +58,34 @@ def describe_result(
         "resolution": list(reversed(scene.volume.grid.shape)),
     }
     described["volume"] |= box
+    # The cameras: poses in place of twists.
+    for view, section in zip(scene.views, described["views"], strict=True):
+        height, width = view.camera.size
+        section["camera"]["resolution"] = [width, height]
+    put_values(described, {**values, **poses_of(scene, values)})
+    return described
+
+
+def poses_of(scene: Scene, names: Iterable[str]) -> dict[str, Any]:
+    """The poses of those cameras of `scene` whose twists are among the variables `names`."""
+    poses = {f"views.{view.name}.camera": view.camera.pose for view in scene.views}
+    return {
+        name: {"matrix": [*poses[name].tolist(), [0.0, 0.0, 0.0, 1.0]]}
+        for name in names
+        if name in poses
+    }
+
+
+def plain(value: Tensor) -> Any:
+    """The number, or list of numbers, that a scene file has for `value`."""
+    return value.item() if value.numel() == 1 else value.tolist()
+
+
+def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Puts `values`, by variable, into the scene `described` in plain values.
+
+    A field is `{file: ...}`, a map the name of its file, a camera `{matrix: ...}`.
+    """
     media = {"": described["volume"]} | {
         f"media.{name}.": section for name, section in described["volume"].get("media", {}).items()
     }
@@ -71,16 +101,13 @@ def describe_result(
         if name.startswith("lights."):
             _, index, attribute = name.split(".")
             described["lights"][int(index)]["file" if isinstance(value, str) else attribute] = value
-    # The cameras.
-    for view, section in zip(scene.views, described["views"], strict=True):
-        height, width = view.camera.size
-        camera = section["camera"] | {"resolution": [width, height]}
-        owner = f"views.{view.name}."
+    for section in described["views"]:
+        camera, owner = section["camera"], f"views.{section['name']}."
         found = {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
         if "camera" in found:
             for key in ("origin", "target", "up"):
                 camera.pop(key, None)
-            camera["matrix"] = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
+            camera |= found["camera"]
         if "focal" in found:
             camera["fov"] = 2 * math.degrees(math.atan(0.5 / found["focal"]))
         if "principal_point" in found:
@@ -89,9 +116,7 @@ def describe_result(
             model = camera["distortion"]["type"]
             coefficients = zip(LENSES[model], found["distortion"], strict=True)
             camera["distortion"] = {"type": model} | dict(coefficients)
-        section["camera"] = camera
         section.update({key: found[key] for key in RESPONSE if key in found})
-    return described
 
 
 def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:

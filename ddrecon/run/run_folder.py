@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from statistics import mean
 from time import monotonic
 from typing import Any
 
@@ -31,7 +32,7 @@ from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
-from ddrecon.run.result import RESULT, describe_result, result_names
+from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files, write_described
 from ddrecon.variables.kinds import (
@@ -138,7 +139,7 @@ class RunFolder:
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        found = find_results(run)
+        found = find_results(run, registers=True)
         scene = found.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
@@ -149,6 +150,9 @@ class RunFolder:
         rows = self.log.rows(run.iteration)
         diagnoses = diagnose(scene.views, found.images, found.quality, rows)
         summary = _summary(run) | {"views": found.quality, "diagnoses": diagnoses}
+        seen = [one["registered"] for one in found.quality.values() if "registered" in one]
+        if seen:
+            summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
         write_json(self.path / "summary.json", summary)
         write_run_report(self.path / "report.html", found, rows, summary, self.environment)
         return summary
@@ -157,13 +161,10 @@ class RunFolder:
         """The value of a variable as plain numbers, or where its file is, which is written here."""
         value = value_of(scene, name)
         if value.ndim < 3:
-            return value.item() if value.numel() == 1 else value.tolist()
+            return plain(value)
         if not kind_of(name).is_cellwise:
             return write_values(self.path / name, name, value, scene.volume.grid, is_map=True)
-        medium, last = split_name(name)
-        key = last.removeprefix(PHASE)
-        stem = self.path / "volumes" / (medium.removeprefix("media.") + key)
-        return {"file": f"volumes/{write_values(stem, key, value, scene.volume.grid)}"}
+        return {"file": write_volume(self.path, name, value, scene.volume.grid)}
 
     def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
         """Everything of `scene` that is not a field, as plain values.
@@ -198,6 +199,24 @@ class RunFolder:
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
+def field_key(name: str) -> str:
+    """What a volume file calls the field `name`."""
+    return split_name(name)[1].removeprefix(PHASE)
+
+
+def volume_file(folder: Path, name: str) -> Path:
+    """Where a run in `folder` keeps the field `name`."""
+    medium = split_name(name)[0].removeprefix("media.")
+    return folder / "volumes" / f"{medium}{field_key(name)}.npz"
+
+
+def write_volume(folder: Path, name: str, value: Tensor, grid: Grid) -> str:
+    """Where in the run's `folder` the field `name` is, which is written there."""
+    file = volume_file(folder, name)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return f"volumes/{write_values(file.with_suffix(''), field_key(name), value, grid)}"
+
+
 def write_values(stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool = False) -> str:
     """The name of the file at `stem`, to which a field on `grid` is written under its `key`.
 
@@ -219,8 +238,8 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     if problem.loss == "photon":
         summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
     summary["ended"] = run.schedule.ending(run.iteration)
-    if (support := describe_support(problem.support, problem.scene.volume.grid)) is not None:
-        summary["support"] = support
+    if problem.support is not None:
+        summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
     return summary
 
 
@@ -242,7 +261,7 @@ RUN_FILES = (
 
 def remove_samples(folder: Path) -> None:
     """Removes what `ddrecon uncertainty` has written to `folder`; raises FormatError."""
-    _remove(folder, SAMPLE_FILES, ())
+    remove_files(folder, SAMPLE_FILES, ())
 
 
 def remove_run(folder: Path, scene_file: SceneFile) -> None:
@@ -251,7 +270,7 @@ def remove_run(folder: Path, scene_file: SceneFile) -> None:
     Raises FormatError where the system refuses.
     """
     kept = {path.resolve() for path in (scene_file.path, *referenced_files(scene_file))}
-    _remove(folder, [*RUN_FILES, *_names_by_scene(folder)], kept)
+    remove_files(folder, [*RUN_FILES, *_names_by_scene(folder)], kept)
 
 
 def _names_by_scene(folder: Path) -> Iterator[str]:
@@ -265,7 +284,7 @@ def _names_by_scene(folder: Path) -> Iterator[str]:
     yield from (f"previews/{view.name}.png" for view in tree.views)
 
 
-def _remove(folder: Path, names: Iterable[str], kept: Iterable[Path]) -> None:
+def remove_files(folder: Path, names: Iterable[str], kept: Iterable[Path]) -> None:
     """Removes the files of these `names` in `folder`, and the folders within that this empties."""
     with refusals(folder):
         found = {path for name in names for path in folder.glob(name) if path.is_file()}

@@ -26,6 +26,7 @@ from ddrecon.memory import Needs, make_room, needs_of
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
+from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
 from ddrecon.scene_file.schema import (
     AmbientSection,
@@ -84,7 +85,12 @@ def load_scene(
 def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
-    """The scene of a file that was read, as tensors; `load_scene` says what is raised."""
+    """The scene of a file that was read, as tensors; `load_scene` says what is raised.
+
+    Of a film it is the first frame.
+    """
+    if scene_file.tree.frames is not None:
+        scene_file = at_frame(scene_file, scene_file.tree.frames.first)
     place, tree, problems = torch.device(device), scene_file.tree, Problems()
     media, grid = dict[str, Volume](), None
     with problems.collecting():

@@ -17,6 +17,7 @@ from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
+from ddrecon.scene_file.transforms import node_of
 from ddrecon.scene_file.view_sources import name_listed, views_of
 from ddrecon.settings import ParameterSettings, Violation
 from ddrecon.variables.kinds import (
@@ -64,7 +65,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     Raises SceneError with one line per problem.
     """
     path, problems = Path(path), Problems()
-    root = tree = None
+    found = None
     with problems.collecting():
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
         if root.value is None:
@@ -72,9 +73,22 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         for text in overrides:
             with problems.collecting():
                 override(root, text, problems)
-        tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
+        found = _scene_of(root, path)
     problems.raise_any()
-    assert root is not None and tree is not None
+    assert found is not None
+    return found
+
+
+def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
+    """The scene that `described` says in plain values, as `describe` returns them.
+
+    It counts as read from the file at `path`. Raises SceneError as `read_scene` does.
+    """
+    return _scene_of(node_of("", str(path), described), path)
+
+
+def _scene_of(root: Node, path: Path) -> SceneFile:
+    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 

@@ -41,6 +41,8 @@ Backdrop = Color | Path
 Paths = Path | tuple[Path, ...]
 
 MAX_CELLS = 2**30
+FRAME = re.compile(r"\{frame(:0?[1-9]?d)?\}")
+"""Where the number of a frame stands in the name of a picture: `{frame:04d}`."""
 TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
 """Names that output files of other views have: their components, and previews by iteration."""
 
@@ -395,6 +397,29 @@ class ViewSource:
 
 
 @dataclass(frozen=True)
+class FramesSection:
+    """A film: pictures and masks have `{frame:04d}` in their names, from `first` to `last`.
+
+    `calibrate`: how many frames, spread along it, find together what does not change; with 0 each
+    frame finds its own.
+    """
+
+    first: int = bounded(minimum=0)
+    last: int = bounded(minimum=0)
+    step: int = bounded(1, minimum=1)
+    calibrate: int = bounded(3, minimum=0)
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of the frames."""
+        return range(self.first, self.last + 1, self.step)
+
+    def violations(self) -> Iterator[Violation]:
+        if self.last < self.first:
+            yield "last", f"{self.last} comes before the first frame, {self.first}"
+
+
+@dataclass(frozen=True)
 class SceneTree:
     """A whole scene file.
 
@@ -407,6 +432,7 @@ class SceneTree:
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
+    frames: FramesSection | None = None
 
     @property
     def media(self) -> Mapping[str, VolumeSection | MediumSection]:
@@ -437,3 +463,9 @@ class SceneTree:
             has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
             if last == "phase.g" and has_one:
                 yield "optimize", f"parameters.{name} is called {medium}g here"
+        named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
+        counted = [name for name in named if FRAME.search(name)]
+        if counted and self.frames is None:
+            yield "views", f"{counted[0]} is of a film; say which frames: {{first: 0, last: 99}}"
+        if self.frames is not None and not counted:
+            yield "frames", "no picture changes: put {frame:04d} into the names of pictures"

@@ -20,6 +20,7 @@ from ddrecon.errors import FormatError, Problems
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.schema import (
+    FRAME,
     PerspectiveSection,
     RingSection,
     ViewSection,
@@ -94,7 +95,9 @@ def name_listed(
 def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     """`views` with names, all different, by their images where they have some."""
     paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
-    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", path.stem) for path in paths]
+    # A frame's number is no part of a name: the view of frames/{frame:04d}.png is that of a folder.
+    unnumbered = [FRAME.sub("", path.stem).strip("._-") or path.parent.name for path in paths]
+    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", stem) for stem in unnumbered]
     folders = [re.sub(r"[^A-Za-z0-9_-]", "_", path.parent.name) for path in paths]
     longer = [f"{folder}_{stem}" for folder, stem in zip(folders, stems, strict=True)]
     numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]

@@ -23,7 +23,7 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import faces
 from ddrecon.diffusion.fused.product import (
-    cotangents_kernel,
+    KERNELS,
     find_cotangents,
     product_kernel,
     subtract_product,
@@ -137,8 +137,7 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
-        product_kernel(32),
-        cotangents_kernel(32),
+        *(product_kernel(name, 32) for name in KERNELS),
     ]
     assert_compiles(kernels, tmp_path)
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from media import box_grid, make_camera
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.support import brightest_black, hull_of
+from ddrecon.reconstruct.support import brightest_black, describe_support, hull_of
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 
@@ -163,3 +165,22 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
 def test_what_is_no_support_is_refused() -> None:
     with pytest.raises(SceneError, match=r"g\.support: 'masks' is for density alone"):
         ball("optimize.parameters.g={support: masks}")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_box_of_several_frames_is_the_tightest_that_holds_them(seed: int) -> None:
+    """Of random cells, in the corner of a box of unequal sides."""
+    grid = Grid((7, 8, 9), (-1.0, 0.5, 2.0), (2.0, 1.5, 2.5))
+    generator = torch.Generator().manual_seed(seed)
+    frames = [torch.rand(grid.shape, generator=generator) > 0.99 for _ in range(3)]
+    supports = [SimpleNamespace(on=lambda _, cells=cells: cells) for cells in frames]
+    told = describe_support(supports, grid)  # type: ignore[arg-type]
+    kept = torch.stack(frames).any(0)
+    assert told is not None and told["cells"] == pytest.approx(float(kept.double().mean()))
+    lines = grid.centers(torch.zeros(()).double())
+    for line, cell, low, high in zip(
+        lines, grid.spacing, told["box"][0][::-1], told["box"][1][::-1], strict=True
+    ):
+        places = line.expand(grid.shape)[kept]
+        assert float(places.min()) - cell / 2 == pytest.approx(low)
+        assert float(places.max()) + cell / 2 == pytest.approx(high)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,6 +12,16 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.text import TextKernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
+KERNELS = {
+    "subtract_product": (
+        "found",
+        "is_each, matrix, light, begun, found",
+        "int is_each[4]; F *matrix[4], *light, *begun, *found",
+    ),
+    "find_cotangents": ("bars", "adjoint, light, bars", "F *adjoint, *light, *bars[4]"),
+}
+"""What the kernels write, what they are called with, and what that is."""
+
 
 def subtract_product(
     begun: Tensor, u: Tensor, loss: Tensor, z: Tensor, y: Tensor, x: Tensor
@@ -20,7 +29,7 @@ def subtract_product(
     """What is `begun` less A u [C, z, y, x], for the `loss` and the conductances along all axes."""
     found, matrix = u.new_empty(u.shape), (loss, z, y, x)
     given = {"matrix": matrix, "is_each": [len(part) == len(u) for part in matrix], "begun": begun}
-    _launch(product_kernel, given | {"light": u}, {"found": found})
+    _launch("subtract_product", given | {"light": u}, {"found": found})
     return found
 
 
@@ -28,20 +37,18 @@ def find_cotangents(operator: Operator, adjoint: Tensor, u: Tensor) -> tuple[Ten
     """What `operator.cotangents` returns."""
     like = operator.loss, *operator.conductances
     bars = [u.new_empty(len(u), *part.shape[1:]) for part in like]
-    _launch(cotangents_kernel, {"adjoint": adjoint, "light": u}, {"bars": bars})
+    _launch("find_cotangents", {"adjoint": adjoint, "light": u}, {"bars": bars})
     return tuple(bar.sum_to_size(part.shape) for bar, part in zip(bars, like, strict=True))
 
 
-def _launch(
-    kernel: Callable[[int], TextKernel], given: dict[str, Any], made: dict[str, Any]
-) -> None:
-    """Runs a `kernel` for all rows of cells of `light`."""
+def _launch(name: str, given: dict[str, Any], made: dict[str, Any]) -> None:
+    """Runs the kernel called `name` for all rows of cells of `light`."""
     light = given["light"]
     colors, nz, ny, nx = light.shape
     width = 1 if light.is_cuda else nx
     rows = nz * ny * nx // width
     given |= {"width": width, "rows": rows, "colors": colors, "nz": nz, "ny": ny, "nx": nx}
-    kernel(8 * light.element_size()).launch(colors * rows, given, made)
+    product_kernel(name, 8 * light.element_size()).launch(colors * rows, given, made)
 
 
 def find_imbalance(operator: Operator, right: Tensor, u: Tensor) -> Tensor:
@@ -84,25 +91,13 @@ class _Imbalance(torch.autograd.Function):
 
 
 @functools.cache
-def product_kernel(bits: int) -> TextKernel:
-    """The kernel of what is begun less A u; loss and conductances have all colors or one."""
-    call = "subtract_product(row, mesh, is_each, matrix, light, begun, found)"
-    given = "int is_each[4]; F *matrix[4], *light, *begun, *found"
-    return _kernel("subtract_product", bits, call, given, "found")
-
-
-@functools.cache
-def cotangents_kernel(bits: int) -> TextKernel:
-    """The kernel of the cotangents of loss and conductances, in all colors."""
-    call, given = "find_cotangents(row, mesh, adjoint, light, bars)", "F *adjoint, *light, *bars[4]"
-    return _kernel("find_cotangents", bits, call, given, "bars")
-
-
-def _kernel(name: str, bits: int, call: str, given: str, made: str) -> TextKernel:
+def product_kernel(name: str, bits: int) -> TextKernel:
+    """The kernel called `name` in `product.h`."""
+    made, call, given = KERNELS[name]
     text = f"""
     const Row row(item, width, rows, colors);
     const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
-    {call};
+    {name}(row, mesh, {call});
     """
     given = f"int width, rows, colors, nz, ny, nx; {given}"
     return TextKernel(name, bits, text, given, made, "diffusion/fused/product.h")

@@ -96,7 +96,7 @@ class ScaledSystem:
             return nothing, self.source.clone()
         y = guess / self.matrix.scale
         residual = self.matrix.residual(y, self.source)
-        helps = self.matrix.norm(residual) < self.source_norm
+        helps = self.matrix.norm(residual) <= self.source_norm
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> Tensor:

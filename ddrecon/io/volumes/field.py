@@ -18,7 +18,7 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
-SIGNED = ("g",)
+SIGNED = ("g", "velocity")
 """What fields are called that may be negative."""
 
 

@@ -51,6 +51,7 @@ FORMATS: dict[str, VolumeFormat] = {
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
+"""The suffixes of formats that are written."""
 
 
 def field_names(path: Path) -> list[str]:

@@ -135,7 +135,8 @@ def _see_beam(
     if not has_peak:
         return Along(angles, cosine.new_empty(0, len(cosine)), (seen.value(cosine),))
     # By color, then by power.
-    return Along(angles, seen.polynomials(cosine).movedim(1, 0).flatten(0, 1), (None,))
+    polynomials = seen.polynomials(cosine).movedim(1, 0).flatten(0, 1).contiguous()
+    return Along(angles, polynomials, (None,))
 
 
 def table_of(emission: Emission, layout: Layout) -> Tensor:

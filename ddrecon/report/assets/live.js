@@ -14,6 +14,7 @@ function takePart(next, id) {
   if (here) here.replaceWith(fresh);
   else document.body.append(fresh);
   for (const pair of fresh.querySelectorAll(".pair")) makeWiper(pair);
+  for (const film of fresh.querySelectorAll(".film")) makeFilm(film);
 }
 
 async function takeVolume(next) {
@@ -43,7 +44,7 @@ async function refresh() {
     const next = new DOMParser().parseFromString(await answer.text(), "text/html");
     if (!("live" in next.body.dataset)) return location.reload(); // the run is done
     if (!document.querySelector("#viewers") && next.querySelector("#viewers")) return location.reload();
-    for (const id of ["lead", "loss", "views"]) takePart(next, id);
+    for (const id of ["lead", "loss", "views", "quality", "frames"]) takePart(next, id);
     await takeVolume(next);
     answered = new Date();
     tellLost(false);

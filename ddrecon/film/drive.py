@@ -1,0 +1,190 @@
+"""A film driven to its end: its calibration, then frame after frame, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, SolveError
+from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
+from ddrecon.film.report import write_film_report
+from ddrecon.film.shared import SHARED, read_shared, write_shared
+from ddrecon.interrupts import defer_interrupt
+from ddrecon.io.files.folders import claim_folder
+from ddrecon.io.volumes.table import field_names, read_field, write_fields
+from ddrecon.progress import bar_settings
+from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.together import Together
+from ddrecon.run.checkpoint import (
+    PREVIOUS,
+    continue_from,
+    fingerprint,
+    load_checkpoint,
+    newest_checkpoint,
+    save_checkpoint,
+)
+from ddrecon.run.drive import drive_run, open_run
+from ddrecon.run.loss_log import LossLog
+from ddrecon.run.result import RESULT
+from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, volume_file, write_volume
+from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.frames import at_frame
+from ddrecon.scene_file.load import read_scene
+
+
+def optimize_sequence(
+    path: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    overrides: Iterable[str] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Iterator[Result]:
+    """The frames of the film in the scene file at `path`, one after another as they are done.
+
+    `folder` keeps it, and a film that was left there goes on; without one nothing is kept.
+    `overrides` (`key.path=value`) are put in first. Raises as `drive_film` does.
+    """
+    with nullcontext(folder) if folder else TemporaryDirectory() as place:
+        build = partial(build_scene, dtype=dtype, device=device)
+        film = Film(read_scene(path, overrides), Path(place), build)
+        if film.scene_file.tree.frames is None:
+            raise SceneError(f"{path}: frames: missing section; say which, {{first: 0, last: 99}}")
+        open_film(film, may_exist=False, resume=True, shared=None)
+        for number in drive_frames(film, film.frames.numbers):
+            scene = build(read_scene(film.of(number) / RESULT))
+            yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
+
+
+def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict[str, Any]:
+    """What `film.json` says of `film` after its frames `numbers`, those that are not yet done.
+
+    All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
+    """
+    before = film.done()
+    for number in drive_frames(film, numbers):
+        if number not in before:
+            write_film_report(film)
+    if exported is not None:
+        (film.path / SEQUENCE).mkdir(exist_ok=True)
+        for number in film.done():
+            files = sorted((film.of(number) / "volumes").glob("*.npz"))
+            fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
+            path = film.path / SEQUENCE / f"film_{number:04d}.{exported}"
+            write_fields(path, fields, np.array(film.grid.bounds_xyz))
+    return write_film_report(film)
+
+
+def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
+    """Those of the frames `numbers` of `film` that are done, each when it is.
+
+    A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
+    again, its error is raised when all others are done.
+    """
+    calibrate(film)
+    failed = dict[int, DdreconError]()
+    for is_second in (False, True):
+        for number in [*failed] if is_second else numbers:
+            try:
+                _drive_frame(film, number, is_second)
+                failed.pop(number, None)
+            except (SolveError, FormatError, SceneError) as error:
+                failed[number] = error
+                what = "left out" if is_second else "skipped for now"
+                first, *_ = str(error).splitlines()
+                warnings.warn(f"frame {number}, {what}: {first}", DataWarning, 2)
+                continue
+            yield number
+    if failed:
+        raise next(iter(failed.values()))
+
+
+def calibrate(film: Film) -> None:
+    """Has `film` know what its frames share, by its folder or from several frames together."""
+    path, count = film.path / SHARED, film.frames.calibrate
+    if path.is_file():
+        film.shared = read_shared(path)
+        return
+    if not count:
+        return
+    numbers = spread_out(film.frames.numbers, count)
+    files = [at_frame(film.scene_file, number) for number in numbers]
+    try:
+        scenes = [film.build(scene_file) for scene_file in files]
+        together, dtype = Together(scenes), scenes[0].volume.density.dtype
+    except FormatError as error:
+        advice = f"frames {', '.join(map(str, numbers))} calibrate the film: change frames.first"
+        raise FormatError(error.path, f"{error.reason}; {advice} or frames.last") from error
+    if not together.shared:
+        return
+    described = {
+        f"frame {number}": fingerprint(file, dtype)
+        for number, file in zip(numbers, files, strict=True)
+    }
+    folder = film.path / "calibration"
+    with claim_folder(folder, may_exist=True):
+        checkpoints, saved = folder / CHECKPOINTS, monotonic()
+        checkpoints.mkdir(exist_ok=True)
+        if newest_checkpoint(checkpoints) is not None:
+            state, loaded = load_checkpoint(checkpoints, described)
+            together.restore(state)
+            continue_from(loaded)
+        first = together.runs[0]
+        bar = tqdm(
+            total=first.schedule.planned,
+            initial=first.iteration,
+            desc=f"calibrate by {len(numbers)} frames",
+            **bar_settings(film.is_quiet),
+        )
+        with defer_interrupt() as asked, bar:
+            while not together.is_done:
+                rows = together.step()
+                psnr = sum(row.psnr for row in rows) / len(rows)
+                bar.set_postfix_str(f"PSNR {psnr:.1f} dB", refresh=False)
+                bar.update()
+                if asked or monotonic() > saved + CHECKPOINT_SECONDS:
+                    save_checkpoint(checkpoints, together.state(), described)
+                    saved = monotonic()
+                if asked:
+                    raise KeyboardInterrupt("in the calibration; go on with --resume")
+        for number, run in zip(numbers, together.runs, strict=True):
+            grid = run.problem.scene.volume.grid
+            for p in run.parameters:
+                if p.is_field:
+                    write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
+        write_shared(path, together, numbers)
+        for file in checkpoints.iterdir():
+            file.unlink()
+    film.shared = read_shared(path)
+
+
+def _drive_frame(film: Film, number: int, is_second: bool) -> None:
+    """Finishes the frame `number`, from where it was, or anew where it `is_second` time."""
+    folder = film.of(number)
+    if number not in film.done():
+        resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
+        known = folder / "scene.yaml"
+        scene_file = read_scene(known) if resume else film.scene_of(number, is_second)
+        parts = film.build(scene_file), scene_file, folder, film.environment
+        with open_run(*parts, may_exist=True, resume=resume) as (run, run_folder):
+            drive_run(run, run_folder, film.preview_every, film.is_quiet, f"frame {number}")
+        (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
+    if not volume_file(folder, VELOCITY).is_file():
+        film.write_velocity(number)
+
+
+def spread_out(numbers: Sequence[int], count: int) -> list[int]:
+    """As many as `count` of `numbers`, spread evenly from the first to the last."""
+    last = len(numbers) - 1
+    return [numbers[round(at)] for at in np.linspace(0, last, min(count, len(numbers)))]

@@ -1,0 +1,237 @@
+"""The folder of a film: a run's folder for each of its frames, and what they begin with."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.errors import SceneError, UsageError
+from ddrecon.film.shared import SHARED, hold, read_shared
+from ddrecon.grid import Grid
+from ddrecon.io.files.atomic import refusals, write_json
+from ddrecon.io.volumes.table import read_field
+from ddrecon.numerics.flow import carry, find_flow
+from ddrecon.ranks import rank_count
+from ddrecon.reconstruct import tuning
+from ddrecon.run.checkpoint import differences
+from ddrecon.run.run_folder import (
+    field_key,
+    remove_files,
+    remove_run,
+    volume_file,
+    write_volume,
+)
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build_volume import build_media
+from ddrecon.scene_file.frames import at_frame, require_frames
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
+from ddrecon.scene_file.schema import FramesSection
+from ddrecon.settings import AUTO
+from ddrecon.variables.kinds import kind_of
+
+SHARE = 6
+"""A frame that begins with another makes so many times fewer iterations."""
+VELOCITY = "velocity"
+"""The name of a frame's motion, and of its file."""
+SEQUENCE = "sequence"
+"""The folder of exported volumes, `film_0000.vdb` and so on."""
+FILM_FILES = (
+    *("scene.yaml", "film.json", "report.html", "movie.png"),
+    *(SHARED, "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
+    *("calibration/checkpoints/*.pt", "calibration/[0-9]*/volumes/*.npz"),
+    *("frames/[0-9]*/start/volumes/*.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
+)
+"""What files of a film are called, but for those of its frames' runs."""
+
+
+@dataclass
+class Film:
+    """The film that `scene_file` asks for, in the folder `path`.
+
+    `build` makes the scene of a frame as tensors; `environment` and `preview_every` are as of a
+    run. `shared` is what `shared.json` says.
+    """
+
+    scene_file: SceneFile
+    path: Path
+    build: Callable[[SceneFile], Scene]
+    environment: dict[str, Any] = field(default_factory=dict)
+    preview_every: int | None = None
+    is_quiet: bool = True
+    shared: dict[str, Any] = field(default_factory=dict)
+
+    def choose(self, part: str | None) -> list[int]:
+        """The frames that `part` names, `A:B`, both among them; None is all. Raises UsageError."""
+        ends = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
+        first, last = (ends[1] or 0, ends[2] or self.frames.last) if ends else (1, 0)
+        chosen = [number for number in self.frames.numbers if int(first) <= number <= int(last)]
+        if not chosen:
+            whole = f"{self.frames.first}:{self.frames.last}"
+            raise UsageError(f"--frames {part}: names no frame; expected a part of {whole}")
+        return chosen
+
+    @property
+    def frames(self) -> FramesSection:
+        """Which frames there are."""
+        assert self.scene_file.tree.frames is not None
+        return self.scene_file.tree.frames
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The grid of all frames."""
+        media = build_media(self.scene_file, torch.float32, torch.device("cpu"))
+        return next(iter(media.values())).grid
+
+    def of(self, number: int) -> Path:
+        """The folder of the run of the frame `number`."""
+        return self.path / "frames" / f"{number:04d}"
+
+    def done(self) -> list[int]:
+        """The frames that are finished: the report of each is written last."""
+        return [n for n in self.frames.numbers if (self.of(n) / "report.html").is_file()]
+
+    def calibrated(self, number: int) -> Path:
+        """The folder of the volumes that the frame `number` had in the calibration."""
+        return self.path / "calibration" / f"{number:04d}"
+
+    def scene_of(self, number: int, is_between: bool) -> SceneFile:
+        """The scene of the frame `number`, with what is shared held.
+
+        It begins with the frames before it, or with those on both sides where it `is_between` them.
+        What it begins with is written to its folder.
+        """
+        described = describe(at_frame(self.scene_file, number))
+        hold(described, self.shared.get("values", {}), self.path / SHARED)
+        optimize = described["optimize"]
+        fields = self._start(number, [*optimize["parameters"]], is_between)
+        start = self.of(number).absolute() / "start"
+        for name, value in fields.items():
+            file = start / write_volume(start, name, value, self.grid)
+            optimize["parameters"][name]["init"] = {"file": str(file)}
+        if fields:
+            planned = optimize["iterations"]
+            planned = tuning.PLANNED if planned == AUTO else planned
+            optimize |= {"iterations": math.ceil(planned / SHARE), "refine_at": []}
+        return read_described(described, self.scene_file.path)
+
+    def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
+        """What the frame `number` begins with: those of the variables `names` that are fields.
+
+        They are those that it had in the calibration where no frame before it is done, nor one
+        after it where it `is_between` them; none where it had none.
+        """
+        before = [n for n in self.done() if n < number]
+        after = [n for n in self.done() if n > number and is_between]
+        if not before and not after:
+            return _fields_in(self.calibrated(number), names)
+        if not before or not after:
+            nearest = before[-1] if before else after[0]
+            fields, motion = _fields_in(self.of(nearest), names), self._velocity(nearest)
+            if motion is None:
+                return fields
+            # The air goes on as it went, and its motion with it.
+            way = motion * (number - nearest)
+            way = carry(way, way)
+            return {name: carry(value, way) for name, value in fields.items()}
+        last, following = before[-1], after[0]
+        motion = self._flow(last, following)
+        ours, theirs = (_fields_in(self.of(each), names) for each in (last, following))
+        forth, back = ((number - each) * motion for each in (last, following))
+        return {name: (carry(ours[name], forth) + carry(theirs[name], back)) / 2 for name in ours}
+
+    def _flow(self, number: int, other: int) -> Tensor:
+        """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
+        sums = []
+        for each in (number, other):
+            fields = _fields_in(self.of(each), self.sought)
+            moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
+            # Of what has colors their mean.
+            values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
+            sums.append(torch.stack(values).sum(0))
+        return find_flow(*sums) / (other - number)
+
+    @property
+    def sought(self) -> list[str]:
+        """The variables that the film optimizes."""
+        optimize = self.scene_file.tree.optimize
+        return [*optimize.parameters] if optimize else []
+
+    def write_velocity(self, number: int) -> None:
+        """Writes the motion of the frame `number` from the one before, [u] a frame, for blur.
+
+        The first frame has that of the second.
+        """
+        before = [n for n in self.done() if n < number]
+        if not before:
+            return
+        motion = self._flow(before[-1], number) * self._cell
+        for each in [number, *([before[0]] if len(before) == 1 else [])]:
+            write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
+
+    def _velocity(self, number: int) -> Tensor | None:
+        """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
+        field = _fields_in(self.of(number), [VELOCITY]).get(VELOCITY)
+        return None if field is None else field.flip(0) / self._cell
+
+    @property
+    def _cell(self) -> Tensor:
+        """The sides of a cell [u] along z, y and x: [3, 1, 1, 1]."""
+        return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
+
+
+def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
+    """Makes the folder of `film` ready, whose calibration may be `shared` from a file.
+
+    What an earlier one has left there is removed, unless this one is to `resume` it. Raises
+    UsageError for a folder that is not empty, unless it may be, or that holds another film;
+    SceneError where pictures are missing, or nothing is optimized.
+    """
+    if rank_count() > 1:
+        what = "torchrun does not share out a film: start jobs for parts of it, --frames A:B"
+        raise UsageError(f"{what}, with --resume and the same -o")
+    scene_file, path = film.scene_file, film.path
+    if not any(kind_of(name).is_cellwise for name in film.sought):
+        what = "optimize.parameters: none changes from frame to frame; name one, such as density"
+        raise SceneError(f"{scene_file.path}: {what}")
+    require_frames(scene_file)
+    known = path / "scene.yaml"
+    given = None if shared is None else read_shared(shared)
+    with refusals(path):
+        path.mkdir(parents=True, exist_ok=True)
+    if resume and known.is_file():
+        there, now = describe(read_scene(known)), describe(scene_file)
+        for scene in (there, now):
+            scene.pop("frames", None)  # a film may grow
+            scene.get("optimize", {}).pop("iterations", None)
+        if changes := differences(there, now):
+            what = f"{path}: holds another film; use another output folder"
+            raise UsageError([f"{what}: {change}" for change in changes])
+    elif not resume:
+        if any(path.iterdir()) and not may_exist:
+            raise UsageError(
+                f"{path}: the folder is not empty; choose another, or say --overwrite or --resume"
+            )
+        for frame in path.glob("frames/[0-9]*"):
+            remove_run(frame, scene_file)
+        remove_files(path, FILM_FILES, [scene_file.path, *([shared] if shared else [])])
+    if given is not None:
+        if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given["values"]:
+            raise UsageError(f"{path / SHARED}: holds another calibration; leave --shared out")
+        write_json(path / SHARED, given)
+    dump_scene(scene_file, known)
+
+
+def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
+    """Those of the variables `names` that are fields [..., z, y, x], as the run in `folder` has."""
+    files = {name: volume_file(folder, name) for name in names}
+    read = {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}
+    values = {name: torch.from_numpy(field.values) for name, field in read.items()}
+    return {n: v if v.ndim == 3 else v.permute(3, 0, 1, 2).contiguous() for n, v in values.items()}

@@ -1,0 +1,149 @@
+"""What a film has come to, of all frames that are done, whoever did them: its record and page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+import torch
+
+from ddrecon.film.folder import Film
+from ddrecon.film.shared import SHARED
+from ddrecon.io.files.atomic import write_json
+from ddrecon.io.images.table import read_image, webp_of, write_animation
+from ddrecon.pictures import srgb
+from ddrecon.report.curve import draw_curve
+from ddrecon.report.page import (
+    ALIVE,
+    captioned,
+    embed,
+    page_text,
+    paragraph,
+    scrub,
+    section,
+    side_by_side,
+    table,
+    write_page,
+)
+from ddrecon.report.pictures import pixels, shrink
+from ddrecon.run.report import registered_text
+
+RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
+KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
+"""What of a run's summary is told of each frame."""
+SHOWN = 48
+"""Frames whose pictures are on the page; all are in their folders."""
+WIDEST = 768
+"""Pixels across target, render and difference, at most."""
+
+
+def write_film_report(film: Film) -> dict[str, Any]:
+    """What `film.json` says of the frames that are done; writes it, a page and a movie."""
+    rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
+    for number in film.done():
+        summaries[number] = json.loads((film.of(number) / "summary.json").read_text())
+        told = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
+        registered = summaries[number].get("registered", {})
+        told |= {f"registered_{key}": value for key, value in registered.items()}
+        rows.append({"frame": number, **told})
+    found = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | found
+    write_json(film.path / RECORD, record)
+    if rows:
+        sections = [section("Quality", side_by_side(*_curves(rows)))]
+        sections += [section("Frames", *_figures(film, summaries))]
+        if found.get("values"):
+            sections += [section("Calibration", *_calibration(film.shared))]
+        title = f"ddrecon: {film.path.absolute().name}"
+        write_page(film.path / REPORT, title, _lead(record), sections, is_alive=True)
+    return record
+
+
+def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
+    """The `record` of a film in `folder`, as lines."""
+    return [_lead(record), f"volumes and all else written to {folder}"]
+
+
+def film_page(folder: Path) -> str:
+    """The page of the film in `folder`, alive as long as frames are missing."""
+    if not (folder / REPORT).is_file():
+        return page_text(f"ddrecon: {folder.name}", "just begun", [], is_alive=True, state=ALIVE)
+    record = json.loads((folder / RECORD).read_text())
+    text = (folder / REPORT).read_text(encoding="utf-8")
+    is_done = len(record["frames"]) == record["asked"]
+    return text if is_done else text.replace("<body", f"<body {ALIVE}", 1)
+
+
+def _lead(record: Mapping[str, Any]) -> str:
+    rows = record["frames"]
+    means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
+    told = f"PSNR {means['psnr']:.2f} dB"
+    if "test_psnr" in means:
+        registered = {key: means[f"registered_{key}"] for key in ("psnr", "ssim", "shift")}
+        told += (
+            f", test PSNR {means['test_psnr']:.2f} dB (registered {registered_text(registered)})"
+        )
+    return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {told}"
+
+
+def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """PSNR and SSIM by frame."""
+    drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
+    for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
+        series = {
+            name: [(float(row["frame"]), row[kind + key]) for row in rows if kind + key in row]
+            for name, kind in kinds.items()
+        }
+        drawn.append(draw_curve(title, {n: s for n, s in series.items() if s}, "frame"))
+    return drawn
+
+
+def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
+    """Pictures of the views held out, or of the first one, frame after frame; writes the movie."""
+    views = next(iter(summaries.values()))["views"]
+    shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
+    numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
+    parts = [paragraph("Target, render and what differs in them, four times enlarged.")]
+    for index, name in enumerate(shown):
+        strips = [_strip(of.of(number) / "previews" / f"{name}.png") for number in numbers]
+        figures = [
+            captioned(
+                embed(webp_of(srgb.encode_bytes(strip)), f"{name}, frame {number}"),
+                f"{name}, frame {number}: {summaries[number]['views'][name]['psnr']:.2f} dB",
+            )
+            for number, strip in zip(numbers, strips, strict=True)
+        ]
+        parts.append(scrub(figures))
+        if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
+            write_animation(of.path / MOVIE, strips, 1.0)
+    return parts
+
+
+def _strip(path: Path) -> np.ndarray:
+    image = torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
+    return pixels(shrink(image, WIDEST))
+
+
+def _calibration(shared: Mapping[str, Any]) -> list[str]:
+    """What all frames share, and by how much those that found it disagree."""
+
+    def told(value: Any) -> str:
+        if not isinstance(value, float | list):
+            return f"in {SHARED}"
+        return ", ".join(f"{number:.4g}" for number in np.ravel(value))
+
+    values, spread = shared["values"], shared.get("spread", {})
+    rows = [(name, told(value), told(spread.get(name, []))) for name, value in values.items()]
+    frames = ", ".join(map(str, shared.get("frames", [])))
+    return [
+        paragraph(
+            f"Found from frames {frames} together. The last column is the standard deviation, from "
+            "frame to frame, of what each alone would change with its volume as it is; of a camera "
+            "three turns [rad] and three shifts."
+        ),
+        table(["number", "value", "spread"], rows),
+    ]

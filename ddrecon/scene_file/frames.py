@@ -1,0 +1,39 @@
+"""Scene files of films: the scene of each frame, in which pictures have their own names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from ddrecon.errors import Problems
+from ddrecon.scene_file.load import SceneFile, require
+from ddrecon.scene_file.schema import FRAME
+
+
+def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
+    """The scene of the frame `number` of a film."""
+
+    def name(path: Path | None) -> Path | None:
+        return path and Path(FRAME.sub(lambda field: field[0].format(frame=number), str(path)))
+
+    tree = scene_file.tree
+    views = tuple(replace(v, image=name(v.image), mask=name(v.mask)) for v in tree.views)
+    return replace(scene_file, tree=replace(tree, views=views, frames=None))
+
+
+def each_frame(scene_file: SceneFile) -> list[SceneFile]:
+    """The scenes of all frames of a film, or the scene itself."""
+    frames = scene_file.tree.frames
+    return [at_frame(scene_file, number) for number in frames.numbers] if frames else [scene_file]
+
+
+def require_frames(scene_file: SceneFile) -> None:
+    """Raises SceneError unless all pictures of the film are there."""
+    problems = Problems()
+    for one in each_frame(scene_file):
+        for index, view in enumerate(one.tree.views):
+            for key, path in (("image", view.image), ("mask", view.mask)):
+                if path is not None and not problems.are_many:
+                    with problems.collecting():
+                        require(one, f"views.{index}.{key}", path)
+    problems.raise_any()

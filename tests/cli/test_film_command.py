@@ -1,0 +1,254 @@
+"""A film from the command line: each frame is a run, and nothing depends on when it was done."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+
+import ddrecon
+from ddrecon import load_scene, render
+from ddrecon.film.drive import spread_out
+from ddrecon.io.volumes.table import field_names, read_field, write_field
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.run.run_folder import load_run
+
+Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
+FRAMES = 4
+VIEWS = {"front": [0, 0, 2.5], "left": [-2.2, 0.2, 1.0], "side": [2.5, 0, 0]}
+SCENE = """\
+frames: {first: 0, last: 3, calibrate: 2}
+volume: {bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}, resolution: [8, 8, 8],
+  density: 0, sigma_t: 8, albedo: 0.9}
+lights:
+  - {type: directional, direction: [-1, -2, -1], irradiance: 2.5}
+views:
+"""
+REST = """\
+diffusion: {transport_rounds: 0}
+optimize:
+  iterations: 12
+  parameters: {density: {init: 0}, lights.0.irradiance: {}, "views.*.exposure": {}}
+"""
+
+
+@pytest.fixture
+def film(folder: Path) -> Path:
+    """The current folder, with film.yaml and the pictures of a ball that moves."""
+    lines = [
+        f"  - {{name: {name}, image: '{name}_{{frame:02d}}.npy', camera: {{type: perspective, "
+        f"fov: 30, origin: {place}, target: [0, 0, 0], resolution: [12, 12]}}"
+        + (", split: test}" if name == "side" else "}")
+        for name, place in VIEWS.items()
+    ]
+    (folder / "film.yaml").write_text(SCENE + "\n".join(lines) + "\n" + REST)
+    z, y, x = np.mgrid[-0.44:0.44:8j, -0.44:0.44:8j, -0.44:0.44:8j]
+    for name in VIEWS:
+        np.save(f"{name}_00.npy", np.ones((12, 12, 3), np.float32))
+    for number in reversed(range(FRAMES)):
+        ball = np.exp(-(z**2 + (y + 0.1 - 0.05 * number) ** 2 + x**2) / 0.05)
+        write_field(Path("ball.npz"), "density", ball, np.array([[-0.5] * 3, [0.5] * 3]))
+        scene = load_scene(
+            "film.yaml", overrides=["volume.density={file: ball.npz}", "lights.0.irradiance=3"]
+        )
+        for view, picture in zip(scene.views, render(scene), strict=True):
+            np.save(f"{view.name}_{number:02d}.npy", picture.permute(1, 2, 0).numpy())
+    return folder
+
+
+def volumes(folder: str) -> dict[str, bytes]:
+    """The arrays of all volumes in the folder of a film, by file."""
+    return {
+        str(path.relative_to(folder)): b"".join(
+            np.load(path)[name].tobytes() for name in sorted(np.load(path).files)
+        )
+        for path in sorted(Path(folder).rglob("*.npz"))
+    }
+
+
+def optimize(*arguments: str) -> tuple[str, ...]:
+    return ("optimize", "film.yaml", *arguments, "-q", "--dtype", "float64")
+
+
+def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
+    told = succeed(*optimize("-o", "out", "--json", "--export", "vdb")).stdout
+    record = json.loads(told)
+    assert [row["frame"] for row in record["frames"]] == list(range(FRAMES)) == list(range(4))
+    assert [row["iterations"] for row in record["frames"]] == [2] * FRAMES
+    assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
+    assert {"report.html", "film.json", "shared.json", "movie.png"} <= {
+        path.name for path in Path("out").iterdir()
+    }
+    # What is shared is the same in all frames, and known for what it is.
+    shared = json.loads(Path("out/shared.json").read_text())
+    assert shared["frames"] == [0, 3]
+    for number in range(FRAMES):
+        found = json.loads(Path(f"out/frames/{number:04d}/parameters.json").read_text())
+        assert found["lights.0.irradiance"] == [shared["values"]["lights.0.irradiance"]]
+    # The ball rises by 0.05 u a frame: so says its velocity, where there is something.
+    velocity = read_field(Path("out/frames/0003/volumes/velocity.npz"), "velocity").values
+    density = read_field(Path("out/frames/0003/volumes/density.npz"), "density").values
+    mean = (velocity * density[..., None]).sum((0, 1, 2)) / density.sum()
+    assert 0.03 < mean[1] < 0.07 and abs(mean[0]) < 0.02 and abs(mean[2]) < 0.02
+    for number in range(FRAMES):
+        exported = Path(f"out/sequence/film_{number:04d}.vdb")
+        assert field_names(exported) == ["density", "velocity"]
+        run = Path(f"out/frames/{number:04d}")
+        for name in field_names(exported):
+            values = read_field(run / "volumes" / f"{name}.npz", name).values
+            np.testing.assert_array_equal(read_field(exported, name).values, values)
+    # Each is a run as any other.
+    load_run(Path("out/frames/0002"), lambda dtype: load_scene("out/frames/0002/scene.yaml"))
+    # Its calibration goes to another film.
+    succeed(*optimize("-o", "other", "--shared", "out/shared.json", "--frames", "2:"))
+    assert not Path("other/calibration").exists()
+    assert sorted(path.name for path in Path("other/frames").iterdir()) == ["0002", "0003"]
+
+
+def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed: Run) -> None:
+    for name in VIEWS:
+        np.save(f"{name}_01.npy", np.load(f"{name}_00.npy"))
+    succeed(*optimize("-o", "out", "--frames", "0:1", "-D", "frames.calibrate=0"))
+    text = Path("film.yaml").read_text().replace("{frame:02d}", "00")
+    Path("single.yaml").write_text(re.sub("frames: .*\n", "", text))
+    succeed("optimize", "single.yaml", "-o", "single", "-q", "--dtype", "float64")
+    assert (
+        volumes("single")["volumes/density.npz"]
+        == volumes("out/frames/0000")["volumes/density.npz"]
+    )
+    start, first = volumes("out/frames/0001"), volumes("out/frames/0000")
+    assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
+
+
+@pytest.fixture
+def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
+    monkeypatch.setattr("ddrecon.film.drive.CHECKPOINT_SECONDS", 0)
+    step, count = Reconstruction.step, iter(range(10**6))
+
+    def arm(last: int) -> None:
+        nonlocal count
+        count = iter(range(last))
+
+    def counted(run: Reconstruction) -> Any:
+        if next(count, None) is None:
+            raise SystemExit(9)
+        return step(run)
+
+    monkeypatch.setattr(Reconstruction, "step", counted)
+    return arm
+
+
+def test_killed_anywhere_and_resumed_to_the_same_bits(
+    film: Path, succeed: Run, run: Run, killed_at: Callable[[int], None]
+) -> None:
+    """In the calibration, amid a frame, and again."""
+    succeed(*optimize("-o", "whole"))
+    for last in (3, 14, 5, 3):
+        killed_at(last)
+        assert run(*optimize("-o", "parts", "--resume")).exit_code == 9
+    killed_at(10**6)
+    succeed(*optimize("-o", "parts", "--resume"))
+    assert volumes("parts") == volumes("whole")
+    shared = [json.loads(Path(f"{name}/shared.json").read_text()) for name in ("parts", "whole")]
+    assert shared[0] == shared[1]
+
+
+def test_parts_joined_are_the_whole(film: Path, succeed: Run) -> None:
+    succeed(*optimize("-o", "whole"))
+    for part in ("0:1", "2:2", "3:"):
+        succeed(*optimize("-o", "parts", "--resume", "--frames", part))
+    assert volumes("parts") == volumes("whole")
+    frames = [json.loads(Path(f"{name}/film.json").read_text()) for name in ("parts", "whole")]
+    psnrs = [[row["psnr"] for row in record["frames"]] for record in frames]
+    assert psnrs[0] == psnrs[1]
+
+
+def test_from_python(film: Path, succeed: Run) -> None:
+    succeed(*optimize("-o", "out"))
+    sizes = ["frames.last=1", "frames.calibrate=0"]
+    found = list(ddrecon.optimize_sequence("film.yaml", overrides=sizes, dtype=torch.float64))
+    assert [len(result.rows) for result in found] == [12, 2]
+    kept = list(ddrecon.optimize_sequence("film.yaml", "out"))
+    for number, result in enumerate(kept):
+        there = read_field(Path(f"out/frames/{number:04d}/volumes/density.npz"), "density").values
+        np.testing.assert_array_equal(result.scene.volume.density, there)
+    with pytest.raises(ddrecon.SceneError, match="frames: missing section"):
+        next(ddrecon.optimize_sequence("scene.yaml"))
+
+
+def test_a_frame_that_fails_is_named_and_begun_from_both_sides(film: Path, run: Run) -> None:
+    Path("front_01.npy").write_bytes(b"broken")
+    first = run(*optimize("-o", "out"))
+    assert first.exit_code == 3
+    told = first.stderr.splitlines()
+    assert [line.partition(":")[2].strip()[:32] for line in told[:2]] == [
+        "frame 1, skipped for now: ",
+        "frame 1, left out: ",
+    ] or all("frame 1" in line and "front_01.npy" in line for line in told[:2])
+    assert len(json.loads(Path("out/film.json").read_text())["frames"]) == FRAMES - 1
+    np.save("front_01.npy", np.load("front_00.npy"))
+    assert run(*optimize("-o", "out", "--resume")).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("-D", "frames.last=-1"), "-D frames.last=-1: frames.last: must be at least 0, found -1"),
+        (
+            ("-D", "frames.first=9"),
+            "film.yaml:1:26: frames.last: 3 comes before the first frame, 9",
+        ),
+        (("-D", "frames.last=4"), "does not exist"),
+        (("--frames", "7:9"), "--frames 7:9: names no frame; expected a part of 0:3"),
+        (("--frames", "1-2"), "--frames 1-2: names no frame; expected a part of 0:3"),
+        (("--shared", "no.json"), "--shared no.json: there is no such file; a film's folder has"),
+        (("--shared", "scene.yaml"), "scene.yaml: not JSON"),
+        (("-D", "frames="), "is of a film; say which frames: {first: 0, last: 99}"),
+        (("-D", "optimize="), "none changes from frame to frame; name one, such as density"),
+        (("-D", "optimize.parameters={lights.0.irradiance: {}}"), "none changes from frame to"),
+    ],
+)
+def test_misuse_is_one_line(
+    film: Path, refuse: Refuse, arguments: tuple[str, ...], line: str
+) -> None:
+    code = 3 if "scene.yaml" in arguments else 2
+    (told, *_) = refuse(code, *optimize("-o", "out", *arguments))
+    assert line in told
+
+
+def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
+    succeed(*optimize("-o", "out", "--frames", "0:0"))
+    again = run(*optimize("-o", "out"))
+    assert again.exit_code == 2 and "not empty" in again.stderr
+    other = run(*optimize("-o", "out", "--resume", "-D", "volume.albedo=0.5"))
+    assert (
+        other.exit_code == 2
+        and "another output folder: volume.albedo is 0.9 there, 0.5 now" in other.stderr
+    )
+    shared = json.loads(Path("out/shared.json").read_text())
+    shared["values"]["views.top.exposure"] = 1.0
+    Path("strange.json").write_text(json.dumps(shared))
+    strange = run(*optimize("-o", "new", "--shared", "strange.json"))
+    assert strange.exit_code == 2 and "views.top.exposure: the scene has none" in strange.stderr
+    single = run("optimize", "scene.yaml", "-o", "single", "--frames", "0:1")
+    assert single.exit_code == 2 and "--frames is for films" in single.stderr
+
+
+def test_frames_are_spread_over_all() -> None:
+    for count in range(2, 9):
+        found = spread_out(range(3, 40, 2), count)
+        assert len(set(found)) == count and (found[0], found[-1]) == (3, 39)
+        gaps = np.diff(found)
+        assert gaps.max() - gaps.min() <= 2
+    assert spread_out([5, 6], 3) == [5, 6]

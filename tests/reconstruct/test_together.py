@@ -1,0 +1,60 @@
+"""Reconstructions that share their numbers: copies of one agree with it, and all move as one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon import Scene, load_scene
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.together import Together
+
+NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
+
+
+@pytest.fixture
+def still() -> Scene:
+    """The ball, with numbers to find beside its density, in float64.
+
+    Cameras are left out: what is known of them beforehand counts less where more pictures are.
+    """
+    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=6", "optimize.refine_at=[]"]
+    sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
+    return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
+
+
+def values(run: Reconstruction) -> dict[str, Tensor]:
+    return {p.name: p.value.detach() for p in run.parameters}
+
+
+def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
+    single, together = Reconstruction(still), Together([still, still, still])
+    while not single.is_done:
+        row, rows = single.step(), together.step()
+        assert [other.loss for other in rows] == pytest.approx([row.loss] * 3, rel=1e-6)
+    assert together.is_done
+    for run in together.runs:
+        torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
+    # Copies have nothing to disagree on.
+    assert all(float(spread.max()) < 1e-4 for spread in together.spread().values())
+
+
+def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
+    other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
+    together = Together([still, other])
+    together.step()
+    state = together.state()
+    rows = together.step()
+    one, two = map(values, together.runs)
+    for name in one:
+        assert torch.equal(one[name], two[name]) == (name != "density")
+    assert any(float(spread.max()) > 0 for spread in together.spread().values())
+    # It goes on from its state to the same bits.
+    again = Together([still, other])
+    again.restore(state)
+    assert [row.loss for row in again.step()] == [row.loss for row in rows]
+    for run, resumed in zip(together.runs, again.runs, strict=True):
+        torch.testing.assert_close(values(resumed), values(run), rtol=0, atol=0)
