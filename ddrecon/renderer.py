@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays
+from ddrecon.diffusion.cells import average_cells, sharpen
 from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import LIMITERS, solve_flux_limited
@@ -32,7 +33,8 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
     ambient_radiance,
     ambient_sky,
-    reduced_light,
+    follow_lights,
+    receive_light,
     scatter_sky,
     sum_unscattered_sky,
 )
@@ -41,7 +43,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Medium, cut_volume, keep_medium, scale_medium
-from ddrecon.medium.remaining import has_backward_peak, remaining_moments
+from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
@@ -106,19 +108,19 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     medium = scale_medium(volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(volume), scene.lights)
+    cells = average_cells(medium)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
     lights = decompose_lights(scene.lights)
-    reduced = reduced_light(medium, lights, medium.degree, has_backward_peak(medium))
-    sky = sum_unscattered_sky(medium, lights, medium.degree)
-    source = reduced.source
+    source, turned = receive_light(cells, lights, cells.degree)
+    sky = sum_unscattered_sky(cells, lights, cells.degree)
     if sky is not None:
-        source = source.plus(sky.weighted(remaining_moments(medium)))
-    outside = ambient_radiance(lights, medium.g)
+        source = source.plus(sky.weighted(remaining_moments(cells)))
+    outside = ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
-    diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
+    diffuse = solve_diffuse(cells, source, outside, scene.diffusion, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, reduced.beams, light, turned=reduced.turned)
+    return LightField(medium, follow_lights(medium, lights), light, turned=turned)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -127,7 +129,7 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     Beams, and by quadrature over directions ambient light and skies.
     """
     parts = decompose_lights(lights)
-    beams = reduced_light(medium, parts, 0).beams
+    beams = follow_lights(medium, parts)
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
@@ -173,7 +175,9 @@ def solve_diffuse(
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(problem, light, solve, settings.rounds, settings.angles)
+    if settings.rounds == 0:
+        return light
+    return sharpen(medium, run_rounds(problem, light, solve, settings.rounds, settings.angles))
 
 
 def view_picture(

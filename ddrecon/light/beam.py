@@ -53,35 +53,43 @@ class Beam:
         return nodes.integral(scattering * phase)
 
 
-def follow_beams(
-    medium: Medium, lights: Sequence[DirectionalLight], degree: int
-) -> tuple[list[Beam], Moments]:
-    """The beams of `lights`, and the moments up to `degree` of what they scatter (E2.2, E2.8).
+def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Beam]:
+    """The beams of `lights` in `medium`."""
+    directions, *each = unit_directions(*(light.direction for light in lights))
+    extinction = medium.extinction
+    crossing = extinction.field, medium.grid, directions, extinction.mass_bound
+
+    def find_masses() -> list[Tensor]:
+        pairs = zip(*sum_masses(*crossing), strict=True)
+        return [torch.addcmul(entered, extinction.field, 0.5 * step) for entered, step in pairs]
+
+    # Of lights, which are few, kernels keep what their adjoint needs.
+    is_fused = is_fused_whole(medium.grid, directions)
+    masses = find_masses() if is_fused else recompute(find_masses)
+    return [
+        Beam(mass, direction, along_colors(light.irradiance))
+        for mass, direction, light in zip(masses, each, lights, strict=True)
+    ]
+
+
+def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Moments:
+    """The moments up to `degree` of what `cells` scatter of the beams of `lights` (E2.2, E2.8).
 
     These are the sum of p_l Y_k(w) E tau / (4 pi).
     """
     directions, *each = unit_directions(*(light.direction for light in lights))
-    is_even = degree <= 1 and not medium.is_cellwise
-    cosine = medium.mean_cosine if is_even and degree else None
+    is_even = degree <= 1 and not cells.is_cellwise
+    cosine = cells.mean_cosine if is_even and degree else None
     weights = _beam_weights(directions, cosine, *(light.irradiance for light in lights))
     if is_even:
-        source, masses = attenuate(medium, directions, weights, has_mass=True)
-    else:
-        found = [
-            attenuate(medium, way, weight, has_mass=True)
-            for way, weight in zip(directions.split(1), weights.split(1), strict=True)
-        ]
-        masses = [mass for _, (mass,) in found]
-        received = (
-            beam_moments(light.mean, direction, degree).weighted(remaining_moments(medium))
-            for (light, _), direction in zip(found, each, strict=True)
+        return attenuate(cells, directions, weights)
+    received = (
+        beam_moments(attenuate(cells, one, weight).mean, direction, degree).weighted(
+            remaining_moments(cells)
         )
-        source = reduce(Moments.plus, received)
-    beams = [
-        Beam(mass, direction, along_colors(light.irradiance))
-        for mass, direction, light in zip(masses, each, lights, strict=True)
-    ]
-    return beams, source
+        for one, weight, direction in zip(directions.split(1), weights.split(1), each, strict=True)
+    )
+    return reduce(Moments.plus, received)
 
 
 @remember
@@ -101,60 +109,44 @@ def _beam_weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: 
     return torch.cat([weights.expand(-1, -1, flux.shape[2]), flux], 1)
 
 
-def attenuate(
-    medium: Medium, directions: Tensor, weights: Tensor, *, has_mass: bool = False
-) -> tuple[Moments, list[Tensor]]:
-    """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over cells.
+def attenuate(cells: Medium, directions: Tensor, weights: Tensor) -> Moments:
+    """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over `cells`.
 
     So the energy taken from a beam is what cells receive, however thick they are. `weights`
-    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Also the
-    mass up to cells' centers [K, z, y, x] of each beam where it `has_mass`.
+    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments.
     """
-    field, (_, moments, colors) = medium.extinction.field, weights.shape
+    field, (_, moments, colors) = cells.extinction.field, weights.shape
     quarter = moments * colors // (4 * len(field))
-    if is_fused_whole(medium.grid, directions):
+    if is_fused_whole(cells.grid, directions):
         from ddrecon.light.fused.receive import MOST_BEAMS
 
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
     else:
         count = max(1, quarter // 8)
-    sums: Tensor | None = None
-    masses: list[Tensor] = []
-    for some in zip(directions.split(count), weights.split(count), strict=True):
-        parts, more = attenuate_few(medium, *some, has_mass)
-        sums = parts if sums is None else sums + parts
-        masses += more
-    assert sums is not None
+    parts = zip(directions.split(count), weights.split(count), strict=True)
+    sums = reduce(torch.add, (attenuate_few(cells, *some) for some in parts))
     if len(sums) == 1:
-        return Moments(sums[0]), masses
+        return Moments(sums[0])
     # Cut, not indexed: on the way back this is put together once.
     first, higher = sums.split([4, len(sums) - 4])
     mean, z, y, x = first.unbind()
-    return Moments(mean, (z, y, x), higher if len(higher) else None), masses
+    return Moments(mean, (z, y, x), higher if len(higher) else None)
 
 
-def attenuate_few(
-    medium: Medium, directions: Tensor, weights: Tensor, has_mass: bool = False
-) -> tuple[Tensor, list[Tensor]]:
-    """What is received of a few beams, [moments, C, z, y, x], and their masses."""
-    extinction, is_fused = medium.extinction, is_fused_whole(medium.grid, directions)
+def attenuate_few(cells: Medium, directions: Tensor, weights: Tensor) -> Tensor:
+    """What is received of a few beams, [moments, C, z, y, x]."""
+    extinction, is_fused = cells.extinction, is_fused_whole(cells.grid, directions)
     field, scale = extinction.field, extinction.scale
 
-    def use(entered: Tensor, steps: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def receive() -> Tensor:
+        entered, steps = sum_masses(field, cells.grid, directions, extinction.mass_bound)
         if is_fused:
             from ddrecon.light.fused.receive import receive
 
             colors = max(weights.shape[2], len(scale))
             given = entered, steps, weights.expand(-1, -1, colors)
-            received = receive(field, scale.flatten().expand(colors), *given)
-        else:
-            tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
-            received = torch.einsum("lmc,lczyx->mczyx", weights, tau)
-        masses = zip(entered, steps, strict=True) if has_mass else ()
-        return received, [torch.addcmul(one, field, 0.5 * step) for one, step in masses]
+            return receive(field, scale.flatten().expand(colors), *given)
+        tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
+        return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 
-    crossing = field, medium.grid, directions, extinction.mass_bound
-    if is_fused and has_mass:
-        # Of lights, which are few, kernels keep what their adjoint needs.
-        return use(*sum_masses(*crossing))
-    return recompute(lambda: use(*sum_masses(*crossing)))
+    return recompute(receive)

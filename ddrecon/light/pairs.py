@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.beam import Beam, unit_directions
+from ddrecon.light.beam import unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import Shear, cross_grid, sum_masses
@@ -87,8 +87,8 @@ class Pair:
         )
 
 
-def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
-    """The beam of `light` in `medium`, and the pair that it becomes."""
+def follow_pair(medium: Medium, light: DirectionalLight) -> Pair:
+    """The pair that the beam of `light` becomes in `medium`."""
     extinction = medium.extinction
     _, direction = unit_directions(light.direction)
     irradiance = light.irradiance.view(-1, 1, 1, 1)
@@ -96,7 +96,6 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     ways = torch.stack([direction, -direction] if is_uniform else [direction])
     crossing = extinction.field, medium.grid, ways, extinction.mass_bound
     (entered, *behind), (step, *_) = recompute(sum_masses, *crossing)
-    beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     turned = backward_fraction(medium)
 
     def find_shares() -> tuple[Tensor, Tensor, Tensor]:
@@ -110,7 +109,7 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     received, along, against = (
         irradiance / (4 * math.pi) * share for share in recompute(find_shares)
     )
-    return beam, Pair(direction, received, along, against)
+    return Pair(direction, received, along, against)
 
 
 def _pair(

@@ -23,7 +23,7 @@ from torch import Tensor
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -84,20 +84,40 @@ class PointBeam:
         return foot, _bounded_square(offset - foot[:, None] * direction, self.least_square)
 
 
-def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[PointBeam, Moments]:
-    """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2.2).
+def follow_point_light(medium: Medium, light: PointLight) -> PointBeam:
+    """The beam of `light` in `medium`."""
+    irradiance, position = along_colors(light.intensity), array_order(light.position)
+    entered, step, _, _ = _go_to_cells(medium, position)
+    mass = entered + 0.5 * step * medium.extinction.field
+    return PointBeam(mass, position, irradiance, _least_square(medium.grid))
 
-    They go up to `degree`, and are those of radiance that all travels away from the light.
 
-    tau is averaged over each cell along the light's ray.
+def receive_point_light(cells: Medium, light: PointLight, degree: int) -> Moments:
+    """The moments of I tau / (4 pi r^2) at `cells` (E2.2).
+
+    They go up to `degree`, and are those of radiance that all travels away from the light. tau is
+    averaged over each cell along the light's ray.
+    """
+    entered, step, square, direction = _go_to_cells(cells, array_order(light.position))
+    tau = cells.extinction.mean_transmittance(entered, step)
+    received = along_colors(light.intensity) / (4 * math.pi) / square * tau
+    return beam_moments(received, direction.movedim(-1, 0), degree)
+
+
+def _least_square(grid: Grid) -> float:
+    return float((0.75 / math.pi * math.prod(grid.spacing)) ** (2 / 3) / 3)
+
+
+def _go_to_cells(medium: Medium, position: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The mass from `position` to where its light enters each cell, and the path through that [u].
+
+    And the square of the distance to the center [u^2], and the direction there [z, y, x, 3].
     """
     grid, extinction = medium.grid, medium.extinction
-    position, irradiance = array_order(light.position), light.intensity.view(-1, 1, 1, 1)
 
     # s, sqrt(s) and the direction of travel, as in the module's docstring.
     centers = torch.stack(torch.broadcast_tensors(*grid.centers(extinction.field)), -1)
-    least_square = float((0.75 / math.pi * math.prod(grid.spacing)) ** (2 / 3) / 3)
-    square = _bounded_square(centers - position, least_square)
+    square = _bounded_square(centers - position, _least_square(grid))
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
 
@@ -118,11 +138,7 @@ def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[
         entries.flatten(0, 2),
         (distance - 0.5 * step).flatten(),
     ).unflatten(1, grid.shape)
-    mass = entered + 0.5 * step * extinction.field
-
-    received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
-    beam = PointBeam(mass, position, irradiance, least_square)
-    return beam, beam_moments(received, direction.movedim(-1, 0), degree)
+    return entered, step, square, direction
 
 
 def _bounded_square(offset: Tensor, least: float) -> Tensor:

@@ -7,70 +7,58 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams
+from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams, receive_beams
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam, follow_pair
-from ddrecon.light.point_light import PointBeam, follow_point_light
+from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.remaining import remaining_moments
+from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
 
 
-@dataclass(frozen=True)
-class ReducedLight:
-    """Light of directional and point lights not yet scattered.
+def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
+    """The beams of directional and point `lights` in `medium`."""
+    directional = [light for light in lights if isinstance(light, DirectionalLight)]
+    beams = follow_beams(medium, directional) if directional else []
+    points = (light for light in lights if isinstance(light, PointLight))
+    return (*beams, *(follow_point_light(medium, light) for light in points))
 
-    `source`: Q0, Q1 and what follows, of all `beams` together, averaged over cells, to the degree
-    that was wanted. `turned`: light that backward peaks have turned back and forth (E8.11).
+
+def receive_light(
+    cells: Medium, lights: Sequence[Source], degree: int
+) -> tuple[Moments, tuple[TurnedBeam, ...]]:
+    """What each of `cells` receives unscattered of directional and point `lights`, as its mean.
+
+    Of lights that go along w it is the sum of p_l Y_k(w) E tau / (4 pi), p_l being the moments of
+    the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What backward
+    peaks turn back belongs to the beams of directional lights, and is the second (E8.11).
     """
-
-    beams: tuple[Beam | PointBeam, ...]
-    source: Moments
-    turned: tuple[TurnedBeam, ...] = ()
-
-
-def reduced_light(
-    medium: Medium, lights: Sequence[Source], degree: int, has_pairs: bool = False
-) -> ReducedLight:
-    """The light of directional and point `lights` that reaches each cell unscattered.
-
-    Of lights that go along w the source holds the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
-    moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. With
-    `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E8.11).
-    """
-    beams: list[Beam | PointBeam] = []
     sources: list[Moments] = []
     turned: list[TurnedBeam] = []
     directional = [light for light in lights if isinstance(light, DirectionalLight)]
-    if has_pairs:
+    if directional and has_backward_peak(cells):
         for parallel in directional:
-            beam, pair = follow_pair(medium, parallel)
-            beams.append(beam)
-            sources.append(pair.source(medium))
+            pair = follow_pair(cells, parallel)
+            sources.append(pair.source(cells))
             turned += pair.turned
     elif directional:
-        found, source = follow_beams(medium, directional, degree)
-        beams += found
-        sources.append(source)
+        sources.append(receive_beams(cells, directional, degree))
     for light in lights:
         if isinstance(light, PointLight):
-            point_beam, received = follow_point_light(medium, light, degree)
-            beams.append(point_beam)
-            sources.append(received.weighted(remaining_moments(medium)))
-    nothing = Moments(torch.zeros_like(medium.extinction.value))
-    source = reduce(Moments.plus, sources) if sources else nothing
-    return ReducedLight(tuple(beams), source, tuple(turned))
+            received = receive_point_light(cells, light, degree)
+            sources.append(received.weighted(remaining_moments(cells)))
+    nothing = Moments(torch.zeros_like(cells.extinction.value))
+    return reduce(Moments.plus, sources) if sources else nothing, tuple(turned)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
@@ -103,7 +91,7 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     if not skies:
         return None
     weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
-    return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)[0]
+    return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
 
 def _moment_weights(sky: Sky, degree: int) -> Tensor:
@@ -125,7 +113,7 @@ def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor
 
     def scatter(travel: Tensor, irradiance: Tensor) -> Tensor:
         """p E tau of the light that goes along `travel`."""
-        (visible,), _ = attenuate_few(medium, travel[None], irradiance[None, None])
+        (visible,) = attenuate_few(medium, travel[None], irradiance[None, None])
         z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
         return visible * medium.seen.value(torch.atleast_3d(z + y + x))
 

@@ -249,9 +249,10 @@ def choose_rounds(
         left = max(left, OPTIMIZED)
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     has_density = not any(name.endswith("density") for name in optimized)
-    depth = greatest_depth(volume) if volume is not None and has_density else 0.0
-    thick_rounds = sum(depth > bound for bound in THICK)
-    if thick_rounds or (is_flat and has_density) or _turns_back(phase):
+    is_flat &= has_density
+    depth = greatest_depth(volume) if is_flat and volume is not None else 0.0
+    if is_flat or _turns_back(phase):
+        thick_rounds = sum(depth > bound for bound in THICK)
         rounds, degree = rounds + max(left > MORE_ROUNDS[1], thick_rounds), 5
     return replace(
         settings,

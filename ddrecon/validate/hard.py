@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory
@@ -23,10 +24,9 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxe
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
-from ddrecon.medium.remaining import has_backward_peak
 from ddrecon.progress import Progress
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
@@ -305,12 +305,12 @@ class Balance:
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
     grid, settings = scene.volume.grid, scene.diffusion
-    medium = scale_medium(scene.volume, settings.angles)
+    medium = average_cells(scale_medium(scene.volume, settings.angles))
     lights = decompose_lights(scene.lights)
     problem = DiffusionProblem(
         medium,
         Closure(settings.closure, grid, settings.floor),
-        reduced_light(medium, lights, medium.degree, has_backward_peak(medium)).source,
+        receive_light(medium, lights, medium.degree)[0],
         ambient_radiance(lights, solution),
         medium.degree > 0,
     )

@@ -27,7 +27,6 @@ from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
@@ -51,35 +50,13 @@ def run_rounds(
     """
     if rounds == 0:
         return light
-    medium, grid = average_cells(problem.medium), problem.medium.grid
+    medium, grid = problem.medium, problem.medium.grid
     light = _renewed(light, grid)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
-        made = _round(problem, medium, light, solve, degree, round_index, cosine, factor)
+        made = _round(problem, light, solve, degree, round_index, cosine, factor)
         light = _renewed(made, grid)
     return light
-
-
-def average_cells(medium: Medium) -> Medium:
-    """`medium` with cells' means of fields that are linear between their centers, for sweeps."""
-    means = {
-        id(one.field): recompute(_cell_means, one.field)
-        for one in (medium.extinction, medium.remaining)
-    }
-    extinction, remaining = (
-        replace(one, field=means[id(one.field)]) for one in (medium.extinction, medium.remaining)
-    )
-    return replace(medium, extinction=extinction, remaining=remaining)
-
-
-def _cell_means(field: Tensor) -> Tensor:
-    if is_fused():
-        from ddrecon.diffusion.rounds.fused.around import means_fused
-
-        return means_fused(field)
-    for axis in AXES:
-        field = field + second_difference(field, axis) / 8
-    return field
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -92,7 +69,6 @@ def _renewed(light: Moments, grid: Grid) -> Moments:
 
 def _round(
     problem: DiffusionProblem,
-    medium: Medium,
     light: Moments,
     solve: SolverWithMemory,
     degree: int,
@@ -102,9 +78,10 @@ def _round(
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `medium` is the problem's as sweeps have it; `cosine`: as of `_flux_factor`.
+    `cosine`: as of `_flux_factor`.
     """
-    (operator, right), outside = problem.system, problem.outside
+    operator, right = problem.system
+    medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
