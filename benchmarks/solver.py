@@ -29,7 +29,7 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.reduced import receive_light
 from ddrecon.medium.coefficients import Volume, scale_medium
 
 PLUME = Path(__file__).parents[1] / "data/plume/density.npz"
@@ -54,7 +54,7 @@ def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tens
     light = DirectionalLight(
         torch.tensor([-2.0, -2.0, -1.0], device=device), torch.full((3,), 3.14, device=device)
     )
-    source = reduced_light(medium, [light], True).source
+    source = receive_light(medium, [light], 1)[0]
     outside = torch.zeros(1, 1, 1, 1, device=device)
     problem = DiffusionProblem(
         medium,

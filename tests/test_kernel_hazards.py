@@ -18,7 +18,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SolveError
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.light.reduced import reduced_light, sum_unscattered_sky
+from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render_each
@@ -141,14 +141,14 @@ def test_light_through_what_is_no_number_is_none(engine: str):
     scene = every_light()
     scene.volume.density[1, 2, 3] = torch.nan
     medium, lights = scale_medium(scene.volume), decompose_lights(scene.lights)
-    reduced = reduced_light(medium, lights, degree=1)
+    source, _ = receive_light(medium, lights, degree=1)
     sky = sum_unscattered_sky(medium, lights, degree=1)
-    assert sky is not None and reduced.source.flux is not None
+    assert sky is not None and source.flux is not None
     assert bool(sky.mean.isnan()[:, 1, 2, 3].all())
-    for beam in reduced.beams:
+    for beam in follow_lights(medium, lights):
         is_unknown = beam.mass.isnan()
         assert 1 < is_unknown.sum() < is_unknown.numel()
-        for moment in (reduced.source.mean, *reduced.source.flux):
+        for moment in (source.mean, *source.flux):
             assert bool((moment.isnan() | ~is_unknown).all())
 
 

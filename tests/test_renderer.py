@@ -12,6 +12,7 @@ from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
@@ -146,9 +147,8 @@ def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float):
         travel=(0.0, 0.0, 1.0),
     )
     flux = solve_light(scene, SolveMemory()).diffuse.flux[0].flatten()
-    depth = (
-        (1 - max(g, 0.0) ** 2) * sigma * grid.spacing[0] * scene.volume.density.flatten().cumsum(0)
-    )
+    cells = average_cells(scale_medium(scene.volume))
+    depth = grid.spacing[0] * cells.extinction.value.flatten().cumsum(0)
     beam = 2.0 * torch.exp(-torch.cat([torch.zeros(1, dtype=torch.float64), depth]))
     power = (beam[1:] + beam[:-1]) / 2 + 4 * math.pi / 3 * flux
     torch.testing.assert_close(power, power.mean().expand_as(power), rtol=1e-8, atol=0)

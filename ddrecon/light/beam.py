@@ -82,9 +82,9 @@ def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int
     cosine = cells.mean_cosine if is_even and degree else None
     weights = _beam_weights(directions, cosine, *(light.irradiance for light in lights))
     if is_even:
-        return attenuate(cells, directions, weights)
+        return attenuate(cells, directions, weights, is_kept=True)
     received = (
-        beam_moments(attenuate(cells, one, weight).mean, direction, degree).weighted(
+        beam_moments(attenuate(cells, one, weight, is_kept=True).mean, direction, degree).weighted(
             remaining_moments(cells)
         )
         for one, weight, direction in zip(directions.split(1), weights.split(1), each, strict=True)
@@ -109,11 +109,12 @@ def _beam_weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: 
     return torch.cat([weights.expand(-1, -1, flux.shape[2]), flux], 1)
 
 
-def attenuate(cells: Medium, directions: Tensor, weights: Tensor) -> Moments:
+def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False) -> Moments:
     """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over `cells`.
 
     So the energy taken from a beam is what cells receive, however thick they are. `weights`
-    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments.
+    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Where it
+    `is_kept`, as of lights, which are few, kernels keep what their adjoint needs.
     """
     field, (_, moments, colors) = cells.extinction.field, weights.shape
     quarter = moments * colors // (4 * len(field))
@@ -124,7 +125,7 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor) -> Moments:
     else:
         count = max(1, quarter // 8)
     parts = zip(directions.split(count), weights.split(count), strict=True)
-    sums = reduce(torch.add, (attenuate_few(cells, *some) for some in parts))
+    sums = reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
     if len(sums) == 1:
         return Moments(sums[0])
     # Cut, not indexed: on the way back this is put together once.
@@ -133,7 +134,9 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor) -> Moments:
     return Moments(mean, (z, y, x), higher if len(higher) else None)
 
 
-def attenuate_few(cells: Medium, directions: Tensor, weights: Tensor) -> Tensor:
+def attenuate_few(
+    cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False
+) -> Tensor:
     """What is received of a few beams, [moments, C, z, y, x]."""
     extinction, is_fused = cells.extinction, is_fused_whole(cells.grid, directions)
     field, scale = extinction.field, extinction.scale
@@ -149,4 +152,4 @@ def attenuate_few(cells: Medium, directions: Tensor, weights: Tensor) -> Tensor:
         tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
         return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 
-    return recompute(receive)
+    return receive() if is_fused and is_kept else recompute(receive)

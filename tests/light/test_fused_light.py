@@ -20,7 +20,7 @@ from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import reduced_light, sum_unscattered_sky
+from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_masses
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
@@ -120,7 +120,7 @@ def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int)
     use_engine(engine)
     changed = with_values(scene, values)
     medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
-    reduced = reduced_light(medium, lights, degree)
+    source, _ = receive_light(medium, lights, degree)
     sky = sum_unscattered_sky(medium, lights, degree)
     assert sky is not None
 
@@ -128,7 +128,8 @@ def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int)
         higher = moments.spelled().higher
         return [moments.mean, *(moments.flux or ()), *(() if higher is None else (higher,))]
 
-    return [*(beam.mass for beam in reduced.beams), *parts(reduced.source), *parts(sky)]
+    beams = follow_lights(medium, lights)
+    return [*(beam.mass for beam in beams), *parts(source), *parts(sky)]
 
 
 def gradients(scene: Scene, names: list[str], engine: str, degree: int) -> list[Tensor]:

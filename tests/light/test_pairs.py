@@ -34,7 +34,7 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
     )
     scene.volume.g = 0.6 - 1.5 * g
     medium = scale_medium(scene.volume, 3)
-    _, pair = follow_pair(medium, scene.lights[0])
+    pair = follow_pair(medium, scene.lights[0])
     # what a cell takes, kappa_t of both less what it turns, and what it hands on to its neighbors
     turned = backward_fraction(medium) * medium.scattering.value
     beams = 4 * math.pi / 9 * (pair.along + pair.against)
@@ -71,7 +71,7 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
         degree=3,
     )
     medium = scale_medium(scene.volume, 3)
-    _, pair = follow_pair(medium, scene.lights[0])
+    pair = follow_pair(medium, scene.lights[0])
     beams = 4 * math.pi * (pair.along + pair.against)
     volume = medium.grid.extent[0] / 9
     received = (medium.absorption.value * beams).sum() * volume
@@ -111,7 +111,7 @@ def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
 
     def pair_at(least: float) -> tuple[torch.Tensor, torch.Tensor]:
         volume.density = density.clamp(min=least).requires_grad_()
-        _, pair = follow_pair(scale_medium(volume, 3), scene.lights[0])
+        pair = follow_pair(scale_medium(volume, 3), scene.lights[0])
         both = torch.stack([pair.along, pair.against])
         weights = torch.arange(1.0, both.numel() + 1, dtype=torch.float64).view_as(both).cos()
         return both.detach(), torch.autograd.grad((weights * both).sum(), volume.density)[0]

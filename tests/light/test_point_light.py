@@ -15,8 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import DirectionalLight, PointLight
-from ddrecon.light.point_light import follow_point_light
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import render
@@ -70,9 +69,9 @@ def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float
 def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
     """Everywhere but in the light's own cell."""
     grid = box_grid((10, 12, 9))
-    received = follow_point_light(
-        medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), True
-    )[1]
+    received = receive_point_light(
+        medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), 1
+    )
     offset = offsets(grid, position)
     distance = offset.norm(dim=-1)
     is_apart = distance > max(grid.spacing)
@@ -91,8 +90,8 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: 
 def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
     grid = box_grid((7, 6, 5))
     beam = follow_point_light(
-        medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position), False
-    )[0]
+        medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position)
+    )
     for z, y, x in ((0, 0, 0), (6, 5, 4), (3, 1, 2), (6, 0, 1)):
         end = cell_center(grid, z, y, x)[::-1]
         start, entered = position[::-1], 0.0
@@ -111,7 +110,7 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order():
         grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
         axes = grid.centers(torch.zeros(1, dtype=torch.float64))
         density = torch.exp(-sum(axis**2 for axis in axes) / (2 * width**2))
-        beam = follow_point_light(medium_of(grid, density), light_at(INSIDE), False)[0]
+        beam = follow_point_light(medium_of(grid, density), light_at(INSIDE))
         start, offset = torch.tensor(INSIDE[::-1], dtype=torch.float64), offsets(grid, INSIDE)
         distance = offset.norm(dim=-1)
         along = (start * offset).sum(-1) / distance
@@ -137,7 +136,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
     medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
     bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
-    beams = reduced_light(medium, [light_at(position)], False).beams
+    beams = (follow_point_light(medium, light_at(position)),)
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
     emission = Emission(
         grid, medium.extinction, medium.scattering, beams, dark, medium.seen, medium.peak
@@ -212,11 +211,11 @@ def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
     flux: light leaves on all sides.
     """
     grid = box_grid((5, 4, 6))
-    received = follow_point_light(
+    received = receive_point_light(
         medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)),
         light_at(cell_center(grid, 2, 1, 3)),
-        True,
-    )[1]
+        1,
+    )
     radius = (0.75 / math.pi * math.prod(grid.spacing)) ** (1 / 3)
     assert received.mean[0, 2, 1, 3].item() == pytest.approx(
         2.0 / (4 * math.pi) * 3 / radius**2, rel=1e-12

@@ -21,7 +21,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays, cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -63,7 +63,7 @@ def emission_of(
         grid,
         medium.extinction,
         medium.scattering,
-        reduced_light(medium, [light], False).beams,
+        follow_lights(medium, [light]),
         diffuse,
         medium.seen,
         medium.peak,

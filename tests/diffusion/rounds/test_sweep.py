@@ -15,13 +15,13 @@ from plain_rays import (
     sweep_by_loops,
 )
 
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
 from ddrecon.diffusion.rounds.transport import (
     _mean_step,
     _transport_share,
-    average_cells,
     run_rounds,
 )
 from ddrecon.diffusion.solvers import SOLVERS

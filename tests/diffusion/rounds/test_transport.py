@@ -13,15 +13,16 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 from torch.nn.functional import interpolate
 
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep
-from ddrecon.diffusion.rounds.transport import average_cells, run_rounds
+from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import reduced_light
+from ddrecon.light.reduced import receive_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
@@ -53,11 +54,11 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
         directional=(3.0,),
         tolerance=1e-10,
     )
-    medium = scale_medium(scene.volume)
-    source = reduced_light(medium, scene.lights, 0).source
+    medium = average_cells(scale_medium(scene.volume))
+    source, _ = receive_light(medium, scene.lights, 0)
     last = light_after(scene, 12)
     light = last + source.mean
-    swept = sweep(average_cells(medium), light[None], cell_gradient(light), None, 3)[0]
+    swept = sweep(medium, light[None], cell_gradient(light), None, 3)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
