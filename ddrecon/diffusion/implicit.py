@@ -28,10 +28,7 @@ from ddrecon.numerics.autodiff import keep, run_plainly
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """One solve: `kind` is forward, adjoint or tangent.
-
-    `iterations` used, relative `residual` reached, `seconds` taken.
-    """
+    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative."""
 
     kind: str
     iterations: int

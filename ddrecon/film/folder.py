@@ -22,13 +22,7 @@ from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.run.checkpoint import differences
-from ddrecon.run.run_folder import (
-    field_key,
-    remove_files,
-    remove_run,
-    volume_file,
-    write_volume,
-)
+from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file, write_volume
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames

@@ -207,10 +207,7 @@ class Bound:
 
 
 def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
-    """Of each name declared: the word for its type, whether it is an array, of how many in a list.
-
-    0 is no list.
-    """
+    """Of each name: its type's word, whether it is an array, of how many in a list (0: none)."""
     for declaration in filter(str.strip, given.split(";")):
         word, names = declaration.split(maxsplit=1)
         for name in names.split(","):

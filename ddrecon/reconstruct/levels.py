@@ -31,10 +31,7 @@ def stage_of(iteration: int, iterations: int, refine_at: tuple[float, ...]) -> i
 
 
 def scene_at_level(scene: Scene, factor: int) -> Scene:
-    """`scene` with about `factor` times fewer cells and pixels along each side.
-
-    Targets are averaged over the larger pixels.
-    """
+    """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged."""
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)

@@ -37,10 +37,7 @@ class Comparison:
     """
 
     def __init__(
-        self,
-        views: Sequence[View],
-        targets: Mapping[str, Target],
-        has_similarity: bool = False,
+        self, views: Sequence[View], targets: Mapping[str, Target], has_similarity: bool = False
     ):
         self.views, self.targets = views, targets
         kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]

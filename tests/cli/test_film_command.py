@@ -133,7 +133,6 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
     monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
-    monkeypatch.setattr("ddrecon.film.drive.CHECKPOINT_SECONDS", 0)
     step, count = Reconstruction.step, iter(range(10**6))
 
     def arm(last: int) -> None:

@@ -62,10 +62,7 @@ class Image:
 
 
 def read_image(path: Path) -> Image:
-    """The image at `path`.
-
-    Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
-    """
+    """The image at `path`; raises FormatError where it is unknown, damaged, or not finite."""
     reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
         known = ", ".join(READERS)
