@@ -220,7 +220,7 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
         if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given["values"]:
             raise UsageError(f"{path / SHARED}: holds another calibration; leave --shared out")
         write_json(path / SHARED, given)
-    dump_scene(scene_file, known)
+    dump_scene(describe(scene_file), known)
 
 
 def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:

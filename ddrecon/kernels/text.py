@@ -147,7 +147,6 @@ class TextKernel:
         return Bound(self, record, [held, made], like)
 
     def _ready(self, name: str, array: Tensor | None) -> Tensor | None:
-        """`array` as the text reads it."""
         return None if array is None else array.to(self.arrays.get(name)).contiguous()
 
     def write(self, record: Any, name: str, value: Any) -> None:

@@ -45,7 +45,6 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
 
 
 def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
-    """`volume` on a coarser `grid`, each medium by itself."""
     if volume.media is not None:
         return mix_media(
             {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}

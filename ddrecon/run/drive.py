@@ -25,7 +25,7 @@ from ddrecon.run.quality import describe_loss, find_results, loss_text
 from ddrecon.run.report import registered_text
 from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, RunFolder, remove_run
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, dump_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene
 from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
@@ -61,7 +61,7 @@ def open_run(
             folder.start(run)
         else:
             folder.resume(run, loaded)
-        dump_scene(scene_file, path / "scene.yaml")
+        dump_scene(describe(scene_file), path / "scene.yaml")
         write_json(path / "environment.json", folder.environment)
         yield run, folder
 

@@ -35,7 +35,7 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files, write_described
+from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     FIELDS,
@@ -154,7 +154,7 @@ class RunFolder(Checkpoints):
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
         values = {name: self._store(scene, name) for name in stored}
-        write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
+        dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)

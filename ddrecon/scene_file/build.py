@@ -278,7 +278,6 @@ def _is_flat(media: Iterable[Volume]) -> bool:
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
-    """The value from which the parameter `name` of `scene` starts."""
     key = f"optimize.parameters.{name}"
     try:
         value = value_of(scene, name).clone()

@@ -163,10 +163,7 @@ class Coarsest:
 
     @staticmethod
     def of(operator: Operator) -> Coarsest:
-        """The direct solve of `operator`, computed in double precision.
-
-        Differences of its entries are exact enough only then.
-        """
+        """The direct solve of `operator`, in double: else differences are not exact enough."""
         shape = operator.loss.shape[1:]
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
         given = operator.loss, *operator.conductances

@@ -124,10 +124,7 @@ def webp_of(image: np.ndarray) -> bytes:
 
 
 def write_animation(path: Path, frames: Sequence[np.ndarray], white: float) -> None:
-    """Writes `frames` [h, w, 3], linear, as an animated PNG that goes on for ever to `path`.
-
-    Radiance `white` > 0 is white.
-    """
+    """Writes linear `frames` [h, w, 3] to `path` as an endless PNG movie; `white` > 0 is white."""
     encoded = np.stack([srgb.encode_bytes(frame / white) for frame in frames])
     with replace_file(path) as temporary:
         timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}
