@@ -4,9 +4,9 @@
 
 Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
 radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`); `once`, of that
-part of `up` that is scattered once. `half-space` and `step cloud` are one cell across, a million
-times as wide: their default is that of so thick a cell. All others have cubes. `box`: by how much,
-in percent, the image of a plain box changes from 8 to 16 rounds.
+part of `up` that is scattered once. `half-space` and `step cloud` are one cell across, far wider
+than deep; a step cloud's default is left out, which would be chosen for so thick a cell. All others
+have cubes. `box`: by how much, in percent, the image of a plain box changes from 8 to 16 rounds.
 
 NAME is part of a row's name, `-D` overrides keys of all scenes, `seconds` are those of the default.
 Slabs need PythonicDISORT.
@@ -123,29 +123,26 @@ def print_layers(
     """A row for each number of each layer; yields them."""
     print_header("case", "truth", "once", *MODELS, "seconds")
     for name, layer in layers.items():
-        truth, errors, seconds = layer.truth(), dict[str, list[float]](), list[float]()
-        for model in (MODELS["default"], *MODELS.values()):
+        truth, seconds = layer.truth(), dict[str, float]()
+        errors: dict[str, dict[str, float]] = {key: {} for key in truth}
+        models = [name for name in MODELS if name != "default" or isinstance(layer, Layer)]
+        for model in (models[0], *models):  # the first is measured when kernels are there
             start = time.perf_counter()
-            found = layer.seen([*overrides, *model])
-            seconds.append(time.perf_counter() - start)
+            found = layer.seen([*overrides, *MODELS[model]])
+            seconds[model] = time.perf_counter() - start
             for key, wanted in truth.items():
-                errors.setdefault(key, []).append(percent_off(found[key], wanted))
+                errors[key][model] = percent_off(found[key], wanted)
         once = ""
         if isinstance(layer, Layer):
             found = layer.seen([*overrides, "diffusion.model=none"])
             once = f"{percent_off(found['up'], layer.once()):.2f}"
-        for key, (_, *row) in errors.items():
+        took = f"{seconds['default']:.2f}" if "default" in seconds else ""
+        for key, row in errors.items():
             value = f"{truth[key]:.5f}" if np.ndim(truth[key]) == 0 else ""
-            shown = (f"{error:+.2f}" if value else f"{error:.2f}" for error in row)
-            print_row(
-                f"{name}: {key}", value, once if key == "up" else "", *shown, f"{seconds[1]:.2f}"
-            )
-            yield {
-                "case": name,
-                "of": key,
-                "errors": dict(zip(MODELS, row, strict=True)),
-                "seconds": dict(zip(MODELS, seconds[1:], strict=True)),
-            }
+            form = "+.2f" if value else ".2f"
+            shown = (f"{row[model]:{form}}" if model in row else "" for model in MODELS)
+            print_row(f"{name}: {key}", value, once if key == "up" else "", *shown, took)
+            yield {"case": name, "of": key, "errors": row, "seconds": seconds}
 
 
 def print_boxes(

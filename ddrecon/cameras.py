@@ -124,10 +124,7 @@ def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
-    """Centers (row, column), in pixels, of `samples` equal parts of a pixel.
-
-    The parts are laid out as squarely as `samples` divides.
-    """
+    """Centers (row, column) of `samples` equal parts of a pixel, as squarely as that divides."""
     rows = max(n for n in range(1, math.isqrt(samples) + 1) if samples % n == 0)
     columns = samples // rows
     return [((i + 0.5) / rows, (j + 0.5) / columns) for i in range(rows) for j in range(columns)]

@@ -34,10 +34,7 @@ def is_there(package: str) -> bool:
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package`.
-
-    Raises MissingExtraError where it is not installed: `purpose` needs it.
-    """
+    """The module `package` for a `purpose`; raises MissingExtraError if it is not installed."""
     try:
         return import_module(package)
     except ImportError as error:
@@ -45,10 +42,7 @@ def load_extra(package: str, purpose: str) -> ModuleType:
 
 
 def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package`, to read or write the file at `path`.
-
-    Raises FormatError where it is not installed.
-    """
+    """The module `package`, for the file at `path`; raises FormatError if it is not installed."""
     try:
         return import_module(package)
     except ImportError as error:

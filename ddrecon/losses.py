@@ -165,14 +165,6 @@ class Target:
         return (values if self.seen is None else values * self.seen).sum() / self.count
 
 
-def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    """The peak signal-to-noise ratio [dB] of `image` against `target`, both [3, h, w].
-
-    The peak is the largest value of the target. Pixels where `mask` [h, w] is 0 do not count.
-    """
-    return float(Target.of(target, mask).psnr_of(image.detach()))
-
-
 def total_variation(field: Tensor, grid: Grid) -> Tensor:
     """The mean length of the gradient of `field` [..., z, y, x] over the cells of `grid`.
 

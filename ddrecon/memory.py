@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.directions import piece_numbers
 from ddrecon.engine import current_engine
-from ddrecon.grid import Grid
 from ddrecon.kernels import spare
 from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
-from ddrecon.medium.phase import PhaseFunction
-from ddrecon.numerics.harmonics import count_harmonics
-from ddrecon.settings import DiffusionSettings
 
 SMALL = 2**24
 """Bytes of arrays that are small beside what else the process holds."""
@@ -59,38 +54,6 @@ class Needs:
     def cells(self) -> int:
         """Number of cells."""
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
-
-
-def needs_of(
-    grid: Grid,
-    phase: PhaseFunction,
-    colors: int,
-    like: Tensor,
-    diffusion: DiffusionSettings,
-    *,
-    pixels: int,
-    lights: int,
-    optimized: Collection[str],
-    varied: float,
-) -> Needs:
-    """What the memory of a scene depends on whose tensors are as `like`, by its parts.
-
-    `optimized`: the names of parameters, `varied` numbers a cell.
-    """
-    is_directed = "g" in optimized or bool((phase.moments(3)[:, 1:] != 0).any())
-    return Needs(
-        (grid.shape[2], grid.shape[1], grid.shape[0]),
-        colors,
-        torch.finfo(like.dtype).bits // 8,
-        pixels,
-        has_flux=is_directed,
-        has_rounds=diffusion.rounds > 0,
-        moments=count_harmonics(diffusion.angles) if is_directed else 1,
-        is_limited=diffusion.model == "flux_limited",
-        varied=varied if optimized else None,
-        lights=lights,
-        threads=count_threads(like.device),
-    )
 
 
 def memory_of(needs: Needs, is_short: bool = False) -> int:

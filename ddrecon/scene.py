@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -18,10 +17,7 @@ from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
-from ddrecon.settings import DiffusionSettings, RenderSettings
-
-if TYPE_CHECKING:
-    from ddrecon.settings import OptimizeSettings
+from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
 
 @dataclass(eq=False)

@@ -19,10 +19,7 @@ def upright_axis(cameras: Sequence[Camera]) -> int:
 
 
 def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
-    """`camera` turned by `angle` [rad] about a line along `axis` (0, 1, 2: x, y, z).
-
-    The line runs through `center` (x, y, z).
-    """
+    """`camera` turned by `angle` [rad] about the `axis` (0, 1, 2: x, y, z) through `center`."""
     middle = camera.pose.new_tensor(center)
     turn = rotation(angle * torch.eye(3, dtype=torch.float64)[axis]).to(camera.pose)
     origin = middle + turn @ (camera.pose[:, 3] - middle)

@@ -11,7 +11,6 @@ from ddrecon.losses import (
     Target,
     compress,
     compressed_slope,
-    psnr,
     total_variation,
 )
 from ddrecon.pictures import srgb
@@ -82,9 +81,9 @@ def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
 
 def test_psnr_has_white_for_its_peak() -> None:
     """Of values, and of those that are displayed."""
-    assert psnr(torch.ones(3, 8, 8) + 0.01, torch.ones(3, 8, 8), None) == pytest.approx(
-        40, abs=1e-3
-    )
+    assert Target.of(torch.ones(3, 8, 8), None).psnr_of(
+        torch.ones(3, 8, 8) + 0.01
+    ) == pytest.approx(40, abs=1e-3)
     target = torch.full((3, 8, 8), 0.2)
     shown = float(srgb.encode(np.array(0.2))) + 0.01
     brighter = torch.full((3, 8, 8), float(srgb.decode(np.array(shown))))

@@ -24,7 +24,6 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.extras import load_extra
-from ddrecon.io.files.atomic import write_json
 from ddrecon.progress import Progress
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
@@ -128,19 +127,11 @@ def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> 
     }
 
 
-def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> None:
-    """Writes `report`, which `describe` gives of the `rows`, to bench.json, and draws bench.png.
-
-    Raises MissingExtraError where matplotlib is not installed.
-    """
-    write_json(folder / "bench.json", report)
-    draw(rows, folder / "bench.png")
-
-
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Writes a PNG of times against errors: of the image, and of image and gradient.
 
-    Dots have the numbers of their rows, and a color for each kind of variant.
+    Dots have the numbers of their rows, and a color for each kind of variant. Raises
+    MissingExtraError where matplotlib is not installed.
     """
     load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt

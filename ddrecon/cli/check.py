@@ -8,6 +8,7 @@ from typing import Any
 from ddrecon.cameras import Camera
 from ddrecon.engine import name_engines
 from ddrecon.grid import Grid
+from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
@@ -88,7 +89,7 @@ def cell_in_pixels(camera: Camera, grid: Grid) -> float:
 def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     low, high = report["bounds"]
-    sizes = f"{_by(report['resolution'])} cells of {_by(report['voxel'])} u"
+    sizes = f"{sizes_text(report['resolution'])} cells of {sizes_text(report['voxel'])} u"
     parameters = [
         f"{name} ({count:,} number{'s' if count > 1 else ''})"
         for name, count in report["optimizes"].items()
@@ -114,7 +115,3 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
-
-
-def _by(sizes: list[float]) -> str:
-    return " x ".join(f"{size:.4g}" for size in sizes)

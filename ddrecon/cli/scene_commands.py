@@ -299,10 +299,10 @@ def watch(session: Session, run: Path, port: int | None) -> None:
     Ctrl-C ends it.
     """
     from ddrecon.film.report import film_page
-    from ddrecon.run.live import LiveRun, listen, serve_page, url_of
+    from ddrecon.run.live import HOST, LiveRun, serve_page
 
     is_film = any((run / name).is_dir() for name in ("frames", "calibration"))
     page = partial(film_page, run) if is_film else LiveRun(run).page
-    with listen(port) as listening, serve_page(page, listening) as server:
-        click.echo(f"{url_of(listening)}  (Ctrl-C ends)")
+    with serve_page(page, port) as server:
+        click.echo(f"http://{HOST}:{server.server_port}/  (Ctrl-C ends)")
         server.serve_forever()

@@ -152,10 +152,10 @@ def bench(
 def _bench_speed(
     session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
 ) -> None:
-    """Measures the scene, or the plume, and writes what was asked for."""
-    from ddrecon.bench.measure import bench_lines, describe, run_bench, write_bench
+    from ddrecon.bench.measure import bench_lines, describe, draw, run_bench
     from ddrecon.bench.plume import load_pair
     from ddrecon.errors import MissingExtraError, SceneError
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.reference.trace import open_tracer
 
     load = None if scene_file is None else partial(session.build, scene_file)
@@ -173,7 +173,8 @@ def _bench_speed(
     if output is not None:
         written = [f"written to {output}"]
         try:
-            write_bench(output, rows, measured)
+            write_json(output / "bench.json", measured)
+            draw(rows, output / "bench.png")
         except MissingExtraError as error:
             written = [f"{written[0]}, without a plot: {error}"]
     session.show(measured, [*bench_lines(rows), *written])

@@ -74,11 +74,7 @@ class DiffusionProblem:
         return Operator((z, y, x), loss), right
 
     def flux(
-        self,
-        mean: Tensor,
-        more: Vector | None = None,
-        begun: Vector | None = None,
-        sign: int = 1,
+        self, mean: Tensor, more: Vector | None = None, begun: Vector | None = None, sign: int = 1
     ) -> Vector | None:
         """L1 of L0 = `mean`, with `more` flux in the source; None without directions.
 
@@ -90,14 +86,7 @@ class DiffusionProblem:
             from ddrecon.diffusion.fused.faces import find_flux
 
             return find_flux(
-                self.medium,
-                self.diffusion,
-                self.source.flux,
-                self.outside,
-                mean,
-                more,
-                begun,
-                sign,
+                self.medium, self.diffusion, self.source.flux, self.outside, mean, more, begun, sign
             )
         source = add_vectors(self.source.flux, more)
         z, y, x = (

@@ -119,10 +119,7 @@ class Balance:
 
 
 def steepness_square(u: Tensor, grid: Grid) -> Tensor:
-    """q^2 = |grad u|^2 / u^2 [1/u^2] of `u` [C, z, y, x].
-
-    By central differences, one-sided at the faces of the box.
-    """
+    """q^2 = |grad u|^2 / u^2 [1/u^2] of `u`: central differences, one-sided at faces of the box."""
     total = torch.zeros_like(u)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         if u.shape[axis] > 1:

@@ -28,10 +28,7 @@ from ddrecon.numerics.autodiff import keep, run_plainly
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """One solve: `kind` is forward, adjoint or tangent.
-
-    `iterations` used, relative `residual` reached, `seconds` taken.
-    """
+    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative."""
 
     kind: str
     iterations: int
@@ -76,8 +73,8 @@ class SolverWithMemory:
         if guess is None and kind == "forward":
             guess = self.start
         if guess is None and kind == "adjoint":
-            later = self.last_solution(kind, self.round_index + 1)
-            guess = None if later is None else -later
+            next_one = self.last_solution(kind, later=1)
+            guess = None if next_one is None else -next_one
         solution = self.solver(operator, source, guess, self.tolerance_of(kind))
         self.remember(kind, solution, began)
         return solution.value
@@ -86,16 +83,14 @@ class SolverWithMemory:
         """How exactly to solve."""
         return max(self.tolerance, self.memory.tolerance_floor.get(kind, 0.0))
 
-    def last_solution(self, kind: str, round_index: int | None = None) -> Tensor | None:
-        """What was found in this round; None for tangents, whose directions have nothing in common.
+    def last_solution(self, kind: str, later: int = 0) -> Tensor | None:
+        """What was found, in this round or one `later`.
 
-        `round_index`: of another round.
+        None for tangents, whose directions have nothing in common.
         """
         if not self.memory.is_warm or kind == "tangent":
             return None
-        return self.memory.last.get(
-            (kind, self.round_index if round_index is None else round_index)
-        )
+        return self.memory.last.get((kind, self.round_index + later))
 
     def remember(self, kind: str, solution: Solution, began: float) -> None:
         """Keeps `solution` and the record of the solve that `began` at that time."""

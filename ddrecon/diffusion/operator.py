@@ -131,10 +131,7 @@ def difference(u: Tensor, axis: int) -> Tensor:
 def subtract_neighbors(
     result: Tensor, u: Tensor, conductances: tuple[Tensor, ...], times: float = 1.0
 ) -> Tensor:
-    """`result` minus `times` conductance times neighbor, over all interior faces.
-
-    `result` is changed in place and returned.
-    """
+    """`result`, changed in place, minus `times` conductance times neighbor at interior faces."""
     for axis, conductance in zip(AXES, conductances, strict=True):
         lower_cells(result, axis).addcmul_(conductance, upper_cells(u, axis), value=-times)
         upper_cells(result, axis).addcmul_(conductance, lower_cells(u, axis), value=-times)

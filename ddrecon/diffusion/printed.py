@@ -331,10 +331,7 @@ class PrintedOperator:
             yield -replace(self, echo=d_echo).from_neighbors(u)
 
     def steepest(self) -> tuple[float, tuple[int, int, int]]:
-        """The largest |kappa_{i+1} - kappa_{i-1}| / kappa_i, and its cell as (x, y, z).
-
-        Over all colors, cells and axes.
-        """
+        """The largest |kappa_{i+1} - kappa_{i-1}| / kappa_i anywhere, and its cell (x, y, z)."""
         kappa, gradient = self.coefficients[:, :1], self.coefficients[:, 1:]
         steps = gradient.new_tensor(self.stencils.grid.spacing).view(1, 3, 1, 1, 1)
         ratio = (2 * steps * gradient.abs() / kappa).amax((0, 1))

@@ -8,22 +8,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from statistics import mean
 from tempfile import TemporaryDirectory
-from time import monotonic
 from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, SolveError
 from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
 from ddrecon.film.report import write_film_report
 from ddrecon.film.shared import SHARED, read_shared, write_shared
-from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
-from ddrecon.progress import bar_settings
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import (
@@ -32,12 +29,11 @@ from ddrecon.run.checkpoint import (
     fingerprint,
     load_checkpoint,
     newest_checkpoint,
-    save_checkpoint,
 )
-from ddrecon.run.drive import drive_run, open_run
+from ddrecon.run.drive import advance, drive_run, open_run
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, volume_file, write_volume
+from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, volume_file, write_volume
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
@@ -134,30 +130,19 @@ def calibrate(film: Film) -> None:
     }
     folder = film.path / "calibration"
     with claim_folder(folder, may_exist=True):
-        checkpoints, saved = folder / CHECKPOINTS, monotonic()
+        checkpoints = folder / CHECKPOINTS
         checkpoints.mkdir(exist_ok=True)
         if newest_checkpoint(checkpoints) is not None:
             state, loaded = load_checkpoint(checkpoints, described)
             together.restore(state)
             continue_from(loaded)
-        first = together.runs[0]
-        bar = tqdm(
-            total=first.schedule.planned,
-            initial=first.iteration,
-            desc=f"calibrate by {len(numbers)} frames",
-            **bar_settings(film.is_quiet),
-        )
-        with defer_interrupt() as asked, bar:
-            while not together.is_done:
-                rows = together.step()
-                psnr = sum(row.psnr for row in rows) / len(rows)
-                bar.set_postfix_str(f"PSNR {psnr:.1f} dB", refresh=False)
-                bar.update()
-                if asked or monotonic() > saved + CHECKPOINT_SECONDS:
-                    save_checkpoint(checkpoints, together.state(), described)
-                    saved = monotonic()
-                if asked:
-                    raise KeyboardInterrupt("in the calibration; go on with --resume")
+
+        def make_iteration() -> str:
+            return f"PSNR {mean(row.psnr for row in together.step()):.1f} dB"
+
+        title = f"calibrate by {len(numbers)} frames"
+        saved = Checkpoints(folder, described)
+        advance(together, make_iteration, saved, film.is_quiet, title)
         for number, run in zip(numbers, together.runs, strict=True):
             grid = run.problem.scene.volume.grid
             for p in run.parameters:

@@ -22,13 +22,7 @@ from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.run.checkpoint import differences
-from ddrecon.run.run_folder import (
-    field_key,
-    remove_files,
-    remove_run,
-    volume_file,
-    write_volume,
-)
+from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file, write_volume
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
@@ -226,7 +220,7 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
         if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given["values"]:
             raise UsageError(f"{path / SHARED}: holds another calibration; leave --shared out")
         write_json(path / SHARED, given)
-    dump_scene(scene_file, known)
+    dump_scene(describe(scene_file), known)
 
 
 def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:

@@ -91,7 +91,6 @@ def _lead(record: Mapping[str, Any]) -> str:
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """PSNR and SSIM by frame."""
     drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
     for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
         series = {

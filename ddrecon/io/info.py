@@ -68,16 +68,16 @@ def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     if "pixels" in report:
         about = "with alpha, " * report["has_alpha"] + "linear radiance "
-        return [f"image: {_sizes(report['pixels'])} pixels, {_values(report, about)}"]
+        return [f"image: {sizes_text(report['pixels'])} pixels, {_values(report, about)}"]
     if not report["fields"]:
         return ["no fields"]
     box = ", no box: the scene's volume.bounds will be taken"
     if report["bounds"] is not None:
         low, high = report["bounds"]
         sides = (np.subtract(high, low) / report["resolution"]).tolist()
-        box = f" of {_sizes(sides)} u, from {low} to {high}"
+        box = f" of {sizes_text(sides)} u, from {low} to {high}"
     return [
-        f"cells: {_sizes(report['resolution'])} (x, y, z){box}",
+        f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
         *(f"{name}: {_values(each)}" for name, each in report["fields"].items()),
         *(
             f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
@@ -94,6 +94,6 @@ def _values(report: dict[str, Any], about: str = "") -> str:
     )
 
 
-def _sizes(sizes: Sequence[float]) -> str:
+def sizes_text(sizes: Sequence[float]) -> str:
     """`sizes` as in 6 x 5 x 0.25."""
     return " x ".join(str(size) if isinstance(size, int) else f"{size:.4g}" for size in sizes)

@@ -161,7 +161,6 @@ def _one_by_one(fields: Sequence[Tensor]) -> list[Tensor]:
 def _kernel(
     kind: str, ins: int, bits: int, header: str, name: str, place: str, declared: str, outs: int
 ) -> TextKernel:
-    """The kernel an item of which does a row."""
     title = f"{name.split('<')[0].lower()}_{kind}"
     at, made = f"row, {place}channels, fields", "made"
     if kind == "values":

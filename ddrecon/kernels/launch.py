@@ -139,7 +139,6 @@ def _device(device: torch.device) -> Any:
 
 
 def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
-    """Runs `kernel` for `items` in this thread, with all it is `given`."""
     if not items:
         return
     calls = _calls(kernel, device.alias)

@@ -127,14 +127,9 @@ class TextKernel:
         if wrong := (self.made & given.keys()) | (made.keys() - self.made):
             raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
         for name, value in given.items():
-            ready = value
             if name in self.lists:
-                entries = zip(self.lists[name], value, strict=True)
-                ready = [
-                    self._ready(entry, each) if isinstance(each, Tensor) else each
-                    for entry, each in entries
-                ]
-            elif isinstance(value, Tensor):
+                ready = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
+            else:
                 ready = self._ready(name, value)
             self.write(record, name, ready)
             held.append(ready)
@@ -146,9 +141,9 @@ class TextKernel:
         like = arrays[0]
         return Bound(self, record, [held, made], like)
 
-    def _ready(self, name: str, array: Tensor | None) -> Tensor | None:
-        """`array` as the text reads it."""
-        return None if array is None else array.to(self.arrays.get(name)).contiguous()
+    def _ready(self, name: str, value: Any) -> Any:
+        is_array = isinstance(value, Tensor)
+        return value.to(self.arrays.get(name)).contiguous() if is_array else value
 
     def write(self, record: Any, name: str, value: Any) -> None:
         """Writes a number into `record`, or the address of an array; 0 of one that is None."""
@@ -207,10 +202,7 @@ class Bound:
 
 
 def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
-    """Of each name declared: the word for its type, whether it is an array, of how many in a list.
-
-    0 is no list.
-    """
+    """Of each name: its type's word, whether it is an array, of how many in a list (0: none)."""
     for declaration in filter(str.strip, given.split(";")):
         word, names = declaration.split(maxsplit=1)
         for name in names.split(","):

@@ -7,7 +7,7 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -166,17 +166,20 @@ class Medium:
 def cut_volume(volume: Volume) -> Volume:
     """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
     slab = own_slab(volume.grid)
-    if not isinstance(slab, Slab):
-        return volume
+    return put_volume(volume, slab, slab.cut) if isinstance(slab, Slab) else volume
+
+
+def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> Volume:
+    """`volume` on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
     density, sigma_a, sigma_s = (
-        slab.cut(field) if field.shape[-3:] == volume.grid.shape else field
-        for field in (volume.density, volume.sigma_a, volume.sigma_s)
+        values if values.ndim == 1 else put(values)
+        for values in (volume.density, volume.sigma_a, volume.sigma_s)
     )
     phase = volume.phase
     if phase.cells is not None:
-        phase = phase.with_cells(slab.cut(phase.cells))
-    support = None if volume.support is None else slab.cut(volume.support)
-    return Volume(slab, density, sigma_a, sigma_s, phase, support=support)
+        phase = phase.with_cells(put(phase.cells))
+    support = None if volume.support is None else put(volume.support)
+    return Volume(grid, density, sigma_a, sigma_s, phase, support=support)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:

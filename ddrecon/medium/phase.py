@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -88,10 +88,6 @@ class PhaseFunction(ABC):
     def variables(self) -> dict[str, Tensor]:
         """Those of its numbers that can be optimized, by name."""
         return {name: getattr(self, name) for name in self.VARIABLES}
-
-    def with_variables(self, values: Mapping[str, Tensor]) -> Self:
-        """The same with other `values` of variables."""
-        return replace(self, **values)
 
     @functools.cached_property
     def colors(self) -> int:

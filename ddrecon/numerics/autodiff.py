@@ -70,10 +70,7 @@ def leave_uncompiled(function: Any) -> Any:
 
 
 def version_of(tensor: Tensor) -> int:
-    """How often the numbers of `tensor` were changed in place; -1 where nobody counts.
-
-    That is in inference mode.
-    """
+    """How often `tensor` was changed in place; -1 in inference mode, where nobody counts."""
     return -1 if tensor.is_inference() else tensor._version
 
 

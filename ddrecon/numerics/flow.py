@@ -76,10 +76,7 @@ def _relax(before: Tensor, after: Tensor, flow: Tensor) -> Tensor:
 
 
 def _neighbors(field: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Those of the cells of `field` [..., z, y, x] along each axis, below and above.
-
-    Beyond the faces it is as there.
-    """
+    """The neighbors of `field` below and above along each axis; beyond the faces it is as there."""
     pairs = []
     for axis in (-3, -2, -1):
         count = field.shape[axis] - 1

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.coefficients import Volume, put_volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
@@ -31,10 +32,7 @@ def stage_of(iteration: int, iterations: int, refine_at: tuple[float, ...]) -> i
 
 
 def scene_at_level(scene: Scene, factor: int) -> Scene:
-    """`scene` with about `factor` times fewer cells and pixels along each side.
-
-    Targets are averaged over the larger pixels.
-    """
+    """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged."""
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
@@ -48,19 +46,11 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
 
 
 def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
-    """`volume` on a coarser `grid`, each medium by itself."""
     if volume.media is not None:
         return mix_media(
             {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
         )
-    sigma_a, sigma_s = (
-        sigma if sigma.ndim == 1 else resample(sigma, grid)
-        for sigma in (volume.sigma_a, volume.sigma_s)
-    )
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(resample(phase.cells, grid))
-    return Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
+    return put_volume(volume, grid, partial(resample, grid=grid))
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

@@ -220,10 +220,7 @@ class Reconstruction:
             self.memory.tolerance_floor = {}
 
     def _step(
-        self,
-        values: Mapping[str, Tensor],
-        gradients: Mapping[str, Tensor],
-        compared: Comparison,
+        self, values: Mapping[str, Tensor], gradients: Mapping[str, Tensor], compared: Comparison
     ) -> None:
         """Moves what is due: fields and maps by Adam, and single numbers all at once (E10.2)."""
         rates = {p.name: self.schedule.rate(self.iteration, p.release) for p in self.parameters}

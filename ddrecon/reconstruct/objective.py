@@ -37,10 +37,7 @@ class Comparison:
     """
 
     def __init__(
-        self,
-        views: Sequence[View],
-        targets: Mapping[str, Target],
-        has_similarity: bool = False,
+        self, views: Sequence[View], targets: Mapping[str, Target], has_similarity: bool = False
     ):
         self.views, self.targets = views, targets
         kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]
@@ -48,10 +45,7 @@ class Comparison:
         self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
-        """What `view` and its rendered `image` add to the objective.
-
-        That is its share, by weight, of the views' mean loss.
-        """
+        """What `view` and its `image` add to the objective: its share, by weight, of the mean."""
         target, seen = self.targets[view.name], image.detach()
         self.pictures[view.name] = seen
         value = self.share(view) * target.loss_of(image)

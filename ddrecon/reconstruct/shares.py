@@ -54,10 +54,7 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
 
 
 def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[str, Tensor]:
-    """The pictures [3, h, w] of the views of `scene`, by name, on all ranks.
-
-    Each is what `picture_of` gives one of them.
-    """
+    """Pictures [3, h, w] of all views, by name, on all ranks, each by `picture_of` on one."""
     names = [view.name for view in scene.views]
     rendered = own_views(scene, names)
     pictures = [

@@ -41,10 +41,7 @@ class Support:
     margin: float
 
     def on(self, grid: Grid) -> Tensor:
-        """Whether medium may be in each cell of `grid`: bool [z, y, x].
-
-        Raises SceneError where it may be in none.
-        """
+        """Whether medium may be in each cell of `grid`, bool [z, y, x]; SceneError if in none."""
         pairs = [
             hull_of(view.camera, shown, grid, self.margin)
             for view, shown in zip(self.views, self.shown, strict=True)

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.errors import DivergenceError
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
@@ -31,6 +32,8 @@ class Together:
         planned = tuning.PLANNED if asked[0] == AUTO else None
         self.runs = [Reconstruction(scene, planned) for scene in scenes]
         first = self.runs[0]
+        self.schedule = first.schedule
+        self.before_step: dict[str, Any] | None = None
         self.shared = [parameter for parameter in first.parameters if not parameter.is_field]
         names = {parameter.name: parameter for parameter in self.shared}
         for run in self.runs:
@@ -43,9 +46,24 @@ class Together:
         """Whether all iterations have been made."""
         return self.runs[-1].is_done
 
+    @property
+    def iteration(self) -> int:
+        """How many iterations have been made."""
+        return self.runs[0].iteration
+
     def step(self) -> list[Row]:
-        """One more iteration of each; the log's rows. Raises DivergenceError."""
-        return [run.step() for run in self.runs]
+        """One more iteration of each; the log's rows.
+
+        Raises DivergenceError when one fails. The state of all is then that before the last step.
+        """
+        before = self.state()
+        try:
+            rows = [run.step() for run in self.runs]
+        except DivergenceError:
+            self.restore(self.before_step or before)
+            raise
+        self.before_step = before
+        return rows
 
     def spread(self) -> dict[str, Tensor]:
         """By how much those who share a number disagree on it, entry by entry, by name.

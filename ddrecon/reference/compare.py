@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.images.table import write_picture, write_preview
-from ddrecon.losses import psnr
+from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer, error_text
@@ -91,7 +91,7 @@ def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
     return {
         "error": traced.error(image),
         "distance": traced.distance(image),
-        "psnr": psnr(ours, theirs, None),
+        "psnr": float(Target.of(theirs, None).psnr_of(ours)),
         "brightness": float(image.mean()) / mean if mean > 0 else None,
     }
 

@@ -65,10 +65,7 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
 
 
 def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> ElementTree.Element:
-    """`value` as XML, called `name` in the attribute `naming`.
-
-    What belongs in a file of its own is added to `arrays`.
-    """
+    """`value` as XML, its `name` in the attribute `naming`; what needs a file goes to `arrays`."""
     make = ElementTree.Element
     if isinstance(value, np.ndarray):
         transform = make("transform", name=name)

@@ -118,10 +118,7 @@ def _fields(sigma: Tensor) -> Tensor:
 
 
 def _albedo(volume: Volume) -> Any:
-    """The part of extinction that scatters: a number, a color or a volume.
-
-    0 where nothing is extinguished.
-    """
+    """What part of extinction scatters, 0 of none: a number, a color or a volume."""
     absorbing, scattering = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
     if absorbing[0].numel() > 1:
         # Finer cells: Mitsuba interpolates the albedo, we the scattering coefficient.

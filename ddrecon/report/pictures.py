@@ -83,10 +83,7 @@ def _cells_of(field: Tensor) -> np.ndarray:
 
 
 def _three_sides(sides: list[np.ndarray]) -> np.ndarray:
-    """Sides [y, x], [z, y] and [z, x], each with colors, as pictures in a row.
-
-    y is up, or z where there is no y.
-    """
+    """Sides [y, x], [z, y] and [z, x] with colors, in a row; y is up, or z where there is no y."""
     across_z, across_x, across_y = sides
     return place_beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
 

@@ -91,10 +91,7 @@ def restore_run(run: Reconstruction, state: dict[str, Any], loaded: Path) -> Non
 
 
 def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The state in the file at `path`.
-
-    Raises FormatError where it cannot be used, UsageError where it is not of `scene`.
-    """
+    """The state at `path`; raises FormatError if unusable, UsageError if it is not of `scene`."""
     if not path.is_file():
         raise FormatError(path, f"is missing; {ANEW}")
     try:

@@ -131,10 +131,7 @@ def find_falling(rows: Sequence[Row]) -> str | None:
 
 
 def _promised_share(rows: Sequence[Row], sure: float) -> float | None:
-    """What `promised` says of as many iterations again, as part of the loss.
-
-    None where a run is too short to tell.
-    """
+    """`promised` for as many iterations again, as part of the loss; None in too short a run."""
     last = [row.loss for row in rows if row.cells == rows[-1].cells]
     count = min(len(rows) // 6, len(last) // 3)
     if count < 3 or not min(last) > 0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,13 @@ from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
+from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.quality import describe_loss, find_results, loss_text
 from ddrecon.run.report import registered_text
-from ddrecon.run.run_folder import CHECKPOINTS, RunFolder, remove_run
+from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, RunFolder, remove_run
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, dump_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene
 from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
@@ -60,7 +61,7 @@ def open_run(
             folder.start(run)
         else:
             folder.resume(run, loaded)
-        dump_scene(scene_file, path / "scene.yaml")
+        dump_scene(describe(scene_file), path / "scene.yaml")
         write_json(path / "environment.json", folder.environment)
         yield run, folder
 
@@ -117,48 +118,63 @@ def drive_run(
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
     `preview_every` counts iterations between pictures; `title` is that of the progress bar, of a
-    frame that of a film. An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and
-    writes a checkpoint before it is passed on. So do a divergence and the end of another rank; any
-    other failure leaves the checkpoints written so far.
+    frame that of a film.
+    """
+    if not is_quiet and title == OPTIMIZE:
+        loss = describe_loss(run.problem.settings, run.problem.train)
+        tqdm.write(loss_text(loss), file=sys.stderr)
+
+    def make_iteration() -> str:
+        row = run.step()
+        folder.log.add(row)
+        if preview_every and row.iteration % preview_every == 0:
+            folder.preview(run)
+        known = run.total.test_psnr
+        test = "" if known is None else f"/{known:.1f}"
+        solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
+        return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
+
+    advance(run, make_iteration, folder, is_quiet, title)
+    if cells_are_shared():
+        return folder.finish(run)
+    # What is left the first rank does by itself.
+    leave_ranks()
+    return folder.finish(run)
+
+
+def advance(
+    run: Reconstruction | Together,
+    make_iteration: Callable[[], str],
+    folder: Checkpoints,
+    is_quiet: bool,
+    title: str,
+) -> None:
+    """Has `run` make iterations until it is done; a bar shows what `make_iteration` says of each.
+
+    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint to
+    `folder` before it is passed on. So do a divergence and the end of another rank; any other
+    failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
+    bar = tqdm(total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet))
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:
         try:
-            with tqdm(
-                total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet)
-            ) as bar:
-                if not is_quiet and title == OPTIMIZE:
-                    loss = describe_loss(run.problem.settings, run.problem.train)
-                    tqdm.write(loss_text(loss), file=sys.stderr)
+            with bar:
                 while not run.is_done:
                     folder.save_in_time(run)
-                    row = run.step()
-                    folder.log.add(row)
-                    known = run.total.test_psnr
-                    test = "" if known is None else f"/{known:.1f}"
-                    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
-                    told = f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
-                    bar.set_postfix_str(told, refresh=False)
+                    bar.set_postfix_str(make_iteration(), refresh=False)
                     bar.update()
-                    if preview_every and row.iteration % preview_every == 0:
-                        folder.preview(run)
                     if is_any(bool(asked)):
                         folder.save(run)
-                        raise KeyboardInterrupt(
-                            f"after {run.iteration} iterations; go on with --resume"
-                        )
+                        made = f"after {run.iteration} iterations"
+                        raise KeyboardInterrupt(f"{made}; go on with --resume")
         except (DivergenceError, RanksError) as error:
             folder.save(run)
             raise error.with_advice(
                 f"the state after {run.iteration} iterations is kept in "
                 f"{folder.checkpoints / LAST}: go on from it with --resume"
             ) from error
-    if cells_are_shared():
-        return folder.finish(run)
-    # What is left the first rank does by itself.
-    leave_ranks()
-    return folder.finish(run)
 
 
 def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:

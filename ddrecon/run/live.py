@@ -7,11 +7,10 @@ only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from socket import create_server, socket
 from threading import Lock, Thread
 from time import monotonic
 
@@ -34,10 +33,7 @@ SHARE = 0.25
 
 
 class LiveRun:
-    """A run in `folder`, which another process may be writing to.
-
-    Raises UsageError where the folder holds no run.
-    """
+    """A run in `folder`, which another process may write to; UsageError where there is none."""
 
     def __init__(self, folder: Path):
         self.folder, self.checkpoints = folder, require_run(folder)
@@ -100,30 +96,15 @@ def _written(file: Path | None) -> int:
     return file.stat().st_mtime_ns if file is not None and file.is_file() else 0
 
 
-def listen(port: int | None) -> socket:
-    """A socket that listens at `port` of localhost; None: at PORT, or a free one if it is taken.
+class _Server(ThreadingHTTPServer):
+    allow_reuse_port = False  # some Pythons would give away one that is taken
 
-    Browsers that ask before a page is served there wait for it. Raises UsageError where `port` is
-    taken.
+
+def serve_page(page: Callable[[], str], port: int | None) -> ThreadingHTTPServer:
+    """A server of `page()`, made anew for each request, at `port` of localhost.
+
+    None: at PORT, or a free one if it is taken. Raises UsageError where `port` is taken.
     """
-    if port is None:
-        with suppress(OSError):
-            return create_server((HOST, PORT))
-    try:
-        return create_server((HOST, port or 0))
-    except OSError as error:
-        reason = error.strerror or error
-        raise UsageError(f"--port {port}: {reason}; leave it out for a free one") from error
-
-
-def url_of(listening: socket) -> str:
-    """What a browser is given to see what is served at the socket."""
-    return f"http://{HOST}:{listening.getsockname()[1]}/"
-
-
-@contextmanager
-def serve_page(page: Callable[[], str], listening: socket) -> Iterator[ThreadingHTTPServer]:
-    """A server of `page()`, made anew for each request, at the socket `listening`."""
     lock = Lock()
 
     class Handler(BaseHTTPRequestHandler):
@@ -145,8 +126,11 @@ def serve_page(page: Callable[[], str], listening: socket) -> Iterator[Threading
         def log_message(self, *_: object) -> None:
             """Requests are not told."""
 
-    server = ThreadingHTTPServer(listening.getsockname(), Handler, bind_and_activate=False)
-    server.socket.close()
-    server.socket = listening
-    with server:
-        yield server
+    if port is None:
+        with suppress(OSError):
+            return _Server((HOST, PORT), Handler)
+    try:
+        return _Server((HOST, port or 0), Handler)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"--port {port}: {reason}; leave it out for a free one") from error

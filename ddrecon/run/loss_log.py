@@ -16,10 +16,7 @@ COLUMNS = [field.name for field in fields(Row)]
 
 
 class LossLog:
-    """The log in the file at `path`.
-
-    Whatever writes raises FormatError where the system refuses.
-    """
+    """The log in the file at `path`; what writes raises FormatError where the system refuses."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -36,10 +33,7 @@ class LossLog:
             csv.writer(stream).writerow(_cells(row))
 
     def rows(self, made: int | None = None) -> list[Row]:
-        """What was written, but for what cannot be read; with `made` up to that iteration.
-
-        Warns then where some are missing.
-        """
+        """What can be read; with `made` up to that iteration, and a warning if some are missing."""
         try:
             _, *lines = self.path.read_text(errors="replace").splitlines() or [""]
         except OSError:

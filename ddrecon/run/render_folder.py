@@ -50,7 +50,9 @@ def render_to_folder(
     with torch.no_grad(), varied(scene, parameter) as world:
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
-        names = _names(has_components, parameter is not None)
+        names = ["", *(PARTS if has_components else ())]
+        if parameter is not None:
+            names = [kind + name for name in names for kind in ("", GRADIENT)]
         for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
@@ -130,12 +132,6 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
     return [*lines, f"written to {folder}"]
 
 
-def _names(has_components: bool, has_derivatives: bool) -> list[str]:
-    """What the names of a view's images have after that of the view, in their order."""
-    names = ["", *(PARTS if has_components else ())]
-    return [part for n in names for part in ([n, GRADIENT + n] if has_derivatives else [n])]
-
-
 def _images(
     light_field: LightField, scene: Scene, view: View, names: Sequence[str]
 ) -> dict[str, Tensor]:
@@ -165,7 +161,7 @@ def _render_in_turns(
     names: Sequence[str],
     progress: Progress,
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
-    """Each of `views`, its images by these `names`, and the seconds that they took.
+    """Each of `views`, its images by `names`, the ends of their files, and the seconds they took.
 
     With several ranks these are of a turn, in which each renders one view; where they share out
     cells, all render each view together.

@@ -20,10 +20,7 @@ RESULT = "result.yaml"
 
 
 def result_names(parameters: list[str]) -> list[str]:
-    """The variables that a result holds where `parameters` were optimized.
-
-    These, and what is left of a pair of them.
-    """
+    """The variables that a result holds: `parameters`, and what is left of a pair of them."""
     partners = [
         medium + name
         for medium, last in map(split_name, parameters)

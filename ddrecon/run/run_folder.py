@@ -20,6 +20,7 @@ from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
+from ddrecon.reconstruct.together import Together
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import (
     continue_from,
@@ -34,7 +35,7 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files, write_described
+from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     FIELDS,
@@ -75,11 +76,36 @@ def require_run(folder: Path) -> Path:
     return checkpoints
 
 
-class RunFolder:
-    """The output folder `path` of one run of `scene_file` in an `environment`.
+class Checkpoints:
+    """Those in the folder `path` of a run, or of several together, written now and then.
 
-    `result_of` describes what the run's result depends on.
+    `result_of` describes what the result depends on.
     """
+
+    def __init__(self, path: Path, result_of: Mapping[str, Any]):
+        self.checkpoints, self.result_of = path / CHECKPOINTS, result_of
+        self.saved, self.next_save = -1, 0.0
+
+    def save(self, run: Reconstruction | Together) -> None:
+        """Writes a checkpoint, unless the last is of this very iteration."""
+        if self.saved != run.iteration:
+            start = monotonic()
+            save_checkpoint(self.checkpoints, run.state(), self.result_of)
+            self.note_saved(run, monotonic() - start)
+
+    def save_in_time(self, run: Reconstruction | Together) -> None:
+        """Writes a checkpoint if the last is old."""
+        if monotonic() >= self.next_save:
+            self.save(run)
+
+    def note_saved(self, run: Reconstruction | Together, seconds: float) -> None:
+        """Notes that the last checkpoint is of `run` as it is, and took so many `seconds`."""
+        self.saved = run.iteration
+        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+
+
+class RunFolder(Checkpoints):
+    """The output folder `path` of one run of `scene_file` in an `environment`."""
 
     def __init__(
         self,
@@ -88,15 +114,14 @@ class RunFolder:
         result_of: Mapping[str, Any],
         environment: Mapping[str, Any],
     ):
-        self.path, self.scene_file = path, scene_file
-        self.result_of, self.environment = result_of, environment
+        super().__init__(path, result_of)
+        self.path, self.scene_file, self.environment = path, scene_file, environment
         with refusals(path):
             for name in ("volumes", "previews", CHECKPOINTS):
                 (path / name).mkdir(exist_ok=True)
                 remove_temporaries(path / name)
             remove_temporaries(path)
-        self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
-        self.saved, self.next_save = -1, 0.0
+        self.log = LossLog(path / "loss.csv")
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run."""
@@ -110,27 +135,12 @@ class RunFolder:
         """
         continue_from(loaded)
         self.log.cut(run.iteration)
-        self._note_saved(run, 0.0)
+        self.note_saved(run, 0.0)
 
-    def save(self, run: Reconstruction) -> None:
-        """Writes a checkpoint, unless the last is of this very iteration.
-
-        The log goes to the disk first, so that it never lacks rows that a checkpoint counts.
-        """
-        if self.saved != run.iteration:
-            start = monotonic()
-            flush(self.log.path)
-            save_checkpoint(self.checkpoints, run.state(), self.result_of)
-            self._note_saved(run, monotonic() - start)
-
-    def save_in_time(self, run: Reconstruction) -> None:
-        """Writes a checkpoint if the last is old."""
-        if monotonic() >= self.next_save:
-            self.save(run)
-
-    def _note_saved(self, run: Reconstruction, seconds: float) -> None:
-        self.saved = run.iteration
-        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+    def save(self, run: Reconstruction | Together) -> None:
+        """Writes a checkpoint, after the log, which so never lacks rows that it counts."""
+        flush(self.log.path)
+        super().save(run)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -144,7 +154,7 @@ class RunFolder:
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
         values = {name: self._store(scene, name) for name in stored}
-        write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
+        dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)

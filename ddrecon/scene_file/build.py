@@ -22,7 +22,8 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
-from ddrecon.memory import Needs, make_room, needs_of
+from ddrecon.memory import Needs, count_threads, make_room
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
@@ -85,10 +86,7 @@ def load_scene(
 def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
-    """The scene of a file that was read, as tensors; `load_scene` says what is raised.
-
-    Of a film it is the first frame.
-    """
+    """The scene of a file, of a film the first frame, as tensors; raises what `load_scene` does."""
     if scene_file.tree.frames is not None:
         scene_file = at_frame(scene_file, scene_file.tree.frames.first)
     place, tree, problems = torch.device(device), scene_file.tree, Problems()
@@ -199,16 +197,21 @@ def needs_of_scene(
     phase, parameters = _phase_of(media), optimize.parameters if optimize else {}
     first = next(iter(media.values()))
     colors = max(phase.colors, *(len(medium.sigma_a) for medium in media.values()))
-    return needs_of(
-        first.grid,
-        phase,
+    is_directed = "g" in parameters or bool((phase.moments(3)[:, 1:] != 0).any())
+    varied = [_varied(name, one, media, colors) for name, one in parameters.items()]
+    z, y, x = first.grid.shape
+    return Needs(
+        (x, y, z),
         colors,
-        first.density,
-        diffusion,
+        first.density.element_size(),
         pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
+        has_flux=is_directed,
+        has_rounds=diffusion.rounds > 0,
+        moments=count_harmonics(diffusion.angles) if is_directed else 1,
+        is_limited=diffusion.model == "flux_limited",
+        varied=sum(varied) if varied else None,
         lights=len(lights),
-        optimized=parameters,
-        varied=sum(_varied(name, one, media, colors) for name, one in parameters.items()),
+        threads=count_threads(first.density.device),
     )
 
 
@@ -277,7 +280,6 @@ def _is_flat(media: Iterable[Volume]) -> bool:
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
-    """The value from which the parameter `name` of `scene` starts."""
     key = f"optimize.parameters.{name}"
     try:
         value = value_of(scene, name).clone()

@@ -262,13 +262,8 @@ def describe(scene_file: SceneFile) -> dict[str, Any]:
     return dict(_plain(scene_file.tree))
 
 
-def dump_scene(scene_file: SceneFile, path: Path) -> None:
-    """Writes the resolved scene to `path` as YAML that `read_scene` reads back as the same tree."""
-    write_described(describe(scene_file), path)
-
-
-def write_described(described: dict[str, Any], path: Path) -> None:
-    """Writes a scene in plain values, as `describe` returns it, to `path`."""
+def dump_scene(described: dict[str, Any], path: Path) -> None:
+    """Writes what `describe` returns to `path` as YAML that `read_scene` reads as the same tree."""
     text = yaml.dump(
         described,
         Dumper=_Dumper,

@@ -215,10 +215,7 @@ def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
 
 
 def read_record(node: Node, kind: type[R], rule: Rule) -> R:
-    """The record of type `kind` that the mapping `node` describes.
-
-    Raises SceneError with everything wrong in it.
-    """
+    """The record of type `kind` that `node` describes; raises SceneError with all that is wrong."""
     entries, hints = node.entries(), type_hints(kind)
     declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]

@@ -421,10 +421,7 @@ class FramesSection:
 
 @dataclass(frozen=True)
 class SceneTree:
-    """A whole scene file.
-
-    A ring of views is already the views it stands for, and paths are absolute.
-    """
+    """A whole scene file: rings and such are the views they stand for, and paths are absolute."""
 
     volume: VolumeSection | MixtureSection
     lights: tuple[LightSection, ...]

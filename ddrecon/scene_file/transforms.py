@@ -171,10 +171,7 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
 
 
 def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
-    """The camera that `entries` describe, those of `frame` and of its file.
-
-    Raises SceneError for what is wrong.
-    """
+    """The camera by `entries`, of `frame` and its file; raises SceneError for what is wrong."""
     if "transform_matrix" not in entries:
         raise frame.refused("missing key 'transform_matrix'")
     matrix = read_as(entries["transform_matrix"], Matrix, folder)

@@ -77,10 +77,7 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
 def name_listed(
     node: Node, views: tuple[ViewSection, ...], folder: Path
 ) -> tuple[ViewSection, ...]:
-    """The `views` listed in `node`, those without a name called by their place.
-
-    Raises SceneError where two have the same.
-    """
+    """The `views` of `node`, nameless ones called by their place; SceneError for equal names."""
     problems, first = Problems(), dict[str, int]()
     names = [view.name or f"view_{index:02d}" for index, view in enumerate(views)]
     for index, name in enumerate(names):

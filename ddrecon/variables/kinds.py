@@ -234,10 +234,7 @@ def kind_of(name: str) -> Kind:
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """The medium that the variable `name` is of, as `media.cloud.`, and the rest of its name.
-
-    The first is empty where it is of no medium.
-    """
+    """The medium that `name` is of, as `media.cloud.`, empty for none, and the rest of the name."""
     match = re.fullmatch(r"(media\.[^.]+\.)?(.*)", name)
     assert match is not None
     return match[1] or "", match[2]

@@ -57,10 +57,7 @@ def density_names(scene: Scene) -> list[str]:
 
 
 def fields_of(scene: Scene) -> dict[str, Tensor]:
-    """The variables of `scene` that differ from cell to cell, by name.
-
-    Each is [z, y, x], or [C, z, y, x] where colors may differ.
-    """
+    """The variables that differ from cell to cell, [z, y, x] or of colors [C, z, y, x], by name."""
     names = [name for name in _volume_names(scene.volume) if kind_of(name).is_cellwise]
     values = {name: _volume_value(scene.volume, name) for name in names}
     return {name: value for name, value in values.items() if value.ndim >= 3}
@@ -303,11 +300,9 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     phase = volume.phase
     if "g" in stored:
         phase = HenyeyGreenstein(stored.pop("g"))
-    numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
-    if numbers:
-        phase = phase.with_variables(
-            {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        )
+    if numbers := _within(PHASE, stored):
+        phase = replace(phase, **numbers)
+    stored = {name: value for name, value in stored.items() if not name.startswith(PHASE)}
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 

@@ -17,6 +17,7 @@ import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.film.drive import spread_out
 from ddrecon.io.volumes.table import field_names, read_field, write_field
+from ddrecon.reconstruct.divergence import NotFiniteError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
 
@@ -133,7 +134,6 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
     monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
-    monkeypatch.setattr("ddrecon.film.drive.CHECKPOINT_SECONDS", 0)
     step, count = Reconstruction.step, iter(range(10**6))
 
     def arm(last: int) -> None:
@@ -162,6 +162,27 @@ def test_killed_anywhere_and_resumed_to_the_same_bits(
     assert volumes("parts") == volumes("whole")
     shared = [json.loads(Path(f"{name}/shared.json").read_text()) for name in ("parts", "whole")]
     assert shared[0] == shared[1]
+
+
+def test_a_calibration_that_diverges_goes_on_before_its_last_step(
+    film: Path, succeed: Run, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of all its frames, of which one has gone ahead."""
+    succeed(*optimize("-o", "whole"))
+    iterate, count = Reconstruction._iterate, iter(range(5))
+
+    def fail(run: Reconstruction, start: float) -> Any:
+        if next(count, None) is None:
+            raise NotFiniteError("the loss is not finite")
+        return iterate(run, start)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Reconstruction, "_iterate", fail)
+        failed = run(*optimize("-o", "parts"))
+    kept = "the state after 1 iterations is kept in parts/calibration/checkpoints/last.pt"
+    assert failed.exit_code == 4 and f"{kept}: go on from it with --resume" in failed.stderr
+    succeed(*optimize("-o", "parts", "--resume"))
+    assert volumes("parts") == volumes("whole")
 
 
 def test_parts_joined_are_the_whole(film: Path, succeed: Run) -> None:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ddrecon.errors import UsageError
 from ddrecon.progress import bar_settings
-from ddrecon.run.live import HOST, LiveRun, listen, serve_page, url_of
+from ddrecon.run.live import LiveRun, serve_page
 
 Run = Callable[..., Result]
 
@@ -45,7 +45,7 @@ def test_a_run_is_shown_before_its_end(succeed: Run, stopped: Path) -> None:
 
 def test_only_this_machine_sees_it() -> None:
     """Not under another's name for this address, and nothing but the page."""
-    with listen(0) as listening, serve_page(lambda: "<p>hello</p>", listening) as server:
+    with serve_page(lambda: "<p>hello</p>", 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         port = server.server_address[1]
         assert server.server_address[0] == "127.0.0.1"
@@ -67,11 +67,11 @@ def test_only_this_machine_sees_it() -> None:
 
 def test_a_port_that_is_taken() -> None:
     """Another is found where none was asked for; one that was is refused."""
-    with listen(None) as first, listen(None) as second:
-        port = first.getsockname()[1]
-        assert url_of(second) != url_of(first) == f"http://{HOST}:{port}/"
+    with serve_page(str, None) as first, serve_page(str, None) as second:
+        port = first.server_port
+        assert second.server_port != port
         with pytest.raises(UsageError, match=f"--port {port}: .* leave it out"):
-            listen(port)
+            serve_page(str, port)
 
 
 def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ddrecon.cameras import twist
-from ddrecon.losses import psnr
+from ddrecon.losses import Target
 from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render
@@ -65,7 +65,7 @@ def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
         with torch.no_grad():
             images = {view.name: render(found, view.name)[0] for view in scene.views}
         quality = {
-            view.name: {"psnr": psnr(images[view.name], view.image, view.mask)}
+            view.name: {"psnr": float(Target.of(view.image, view.mask).psnr_of(images[view.name]))}
             for view in scene.views
         }
         diagnoses = diagnose(scene.views, images, quality, rows)

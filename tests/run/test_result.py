@@ -19,7 +19,7 @@ from ddrecon.renderer import render
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import RunFolder
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import dump_scene, read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 CROSS_SECTIONS = {
     "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",
@@ -84,7 +84,7 @@ def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g
         state = parameter.state()
         parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
     (folder / "out").mkdir()
-    dump_scene(scene_file, folder / "out" / "scene.yaml")
+    dump_scene(describe(scene_file), folder / "out" / "scene.yaml")
     run_folder = RunFolder(folder / "out", scene_file, {}, {})
     run_folder.start(run)
     run_folder.log.add(row)

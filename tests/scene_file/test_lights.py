@@ -13,7 +13,7 @@ from example_scene import changed
 from ddrecon.errors import DataWarning
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.load import dump_scene, read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 TURNED = {"scale": 2.5, "rotation": -370.0, "directions": 12, "up": "z"}
 
@@ -44,5 +44,5 @@ def test_lights_are_built_and_written_back(
     assert isinstance(gray, PointLight) and isinstance(colored, PointLight)
     assert gray.position.tolist() == [0, 2, -1] and gray.intensity.tolist() == [5]
     assert colored.intensity.tolist() == [1, 2, 3]
-    dump_scene(scene_file, tmp_path / "again.yaml")
+    dump_scene(describe(scene_file), tmp_path / "again.yaml")
     assert read_scene(tmp_path / "again.yaml").tree.lights == scene_file.tree.lights

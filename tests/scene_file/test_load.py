@@ -10,7 +10,7 @@ import pytest
 import yaml
 from example_scene import CAMERA, SCENE, changed
 
-from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
 
@@ -162,5 +162,5 @@ def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_p
     ]
     scene_file = read(text, *overrides)
     (tmp_path / "elsewhere").mkdir()
-    dump_scene(scene_file, tmp_path / "elsewhere" / "scene.yaml")
+    dump_scene(describe(scene_file), tmp_path / "elsewhere" / "scene.yaml")
     assert read_scene(tmp_path / "elsewhere" / "scene.yaml").tree == scene_file.tree

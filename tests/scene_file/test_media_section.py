@@ -16,7 +16,7 @@ from ddrecon.medium.phase import Rayleigh
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.run.result import describe_result, result_names
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import dump_scene, read_scene, write_described
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 from ddrecon.variables.values import value_of
 
 CLOUD = {"density": {"file": "cloud.npz"}, "sigma_t": 20, "albedo": 0.9, "g": 0.8}
@@ -42,7 +42,7 @@ def test_two_media_are_their_mixture_and_are_written_back(
     assert isinstance(volume.phase.second, Rayleigh) and volume.media is not None
     assert volume.media["cloud"].g == torch.tensor(0.8)
     expected = mix_media(volume.media)
-    dump_scene(scene_file, tmp_path / "again.yaml")
+    dump_scene(describe(scene_file), tmp_path / "again.yaml")
     for found in (volume, load_scene(tmp_path / "again.yaml").volume):
         assert torch.equal(found.sigma_a, expected.sigma_a)
         assert torch.equal(found.sigma_s, expected.sigma_s)
@@ -62,7 +62,7 @@ def test_what_is_found_of_a_medium_is_put_into_it(
     values = {name: value_of(scene, name).squeeze().tolist() for name in names}
     values |= {"media.cloud.g": 0.4, "media.air.sigma_s": [0.3, 0.2, 0.1]}
     described = describe_result(scene_file, scene, values)
-    write_described(described, tmp_path / "result.yaml")
+    dump_scene(described, tmp_path / "result.yaml")
     media = load_scene(tmp_path / "result.yaml").volume.media
     assert media is not None and media["cloud"].g == torch.tensor(0.4)
     assert media["air"].sigma_s.tolist() == pytest.approx([0.3, 0.2, 0.1])

@@ -17,7 +17,7 @@ from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import dump_scene, read_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 VOLUME = {name: value for name, value in yaml.safe_load(SCENE)["volume"].items() if name != "g"}
 SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {
@@ -51,7 +51,7 @@ def test_each_kind_is_built_and_written_back(
     assert isinstance(phase, kind) and name == phase.NAME
     assert phase.colors == (3 if name == "henyey_greenstein" else 1)
     assert scene.volume.sigma_s.shape[0] == 3
-    dump_scene(scene_file, tmp_path / "again.yaml")
+    dump_scene(describe(scene_file), tmp_path / "again.yaml")
     again = load_scene(tmp_path / "again.yaml").volume.phase
     assert all(map(torch.equal, again.numbers, phase.numbers))
 
@@ -134,7 +134,7 @@ def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
     assert cells is not None and cells.shape == (1, *CELLS[::-1])
     assert float(cells[0, 0, 0, 0]) == pytest.approx(0.3)
     assert bool((cells.flatten()[1:] - 0.6).abs().max() < 1e-6)
-    dump_scene(scene_file, tmp_path / "again.yaml")
+    dump_scene(describe(scene_file), tmp_path / "again.yaml")
     again = load_scene(tmp_path / "again.yaml").volume.phase.cells
     assert again is not None and torch.equal(again, cells)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from example_scene import changed
 
-from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
 from ddrecon.scene_file.schema import PerspectiveSection, RingSection
 from ddrecon.scene_file.view_sources import ring_cameras
 
@@ -37,7 +37,7 @@ def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None
     assert [view.name for view in views] == ["ring_00", "ring_01", "ring_02"]
     assert [view.split for view in views] == ["test", "train", "test"]
     assert all(view.image is None for view in views)
-    dump_scene(scene_file, tmp_path / "dump.yaml")
+    dump_scene(describe(scene_file), tmp_path / "dump.yaml")
     assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
 
 

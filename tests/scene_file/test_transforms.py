@@ -19,7 +19,7 @@ from example_scene import SCENE, changed
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
 from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
 from ddrecon.scene_file.transforms import export_transforms
 
@@ -271,7 +271,7 @@ def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> 
     rays = []
     for numbers in (own | lens, listed):
         scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **(bare | numbers)))
-        dump_scene(scene_file, tmp_path / "dump.yaml")
+        dump_scene(describe(scene_file), tmp_path / "dump.yaml")
         assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
         scene = build_scene(scene_file, dtype=torch.float64)
         export_transforms(scene, scene_file, tmp_path / "again.json", may_exist=True)

@@ -22,13 +22,12 @@ from ddrecon.validate.hard import (
     HardResult,
     balance_of,
     describe,
-    full,
     run_case,
     table,
 )
 
 CPU = torch.device("cpu")
-SMALL = HardCase(full, shape=(4, 5, 6), g=0.4)
+SMALL = HardCase(torch.ones, shape=(4, 5, 6), g=0.4)
 KEPT = HardResult("kept", "", 3, 1e-6, 0.0, 1e-5, 1e-5, 0.0, 1e-7, 1e-15)
 BROKEN = {
     "residual": {"residual": 2e-6},

@@ -37,10 +37,7 @@ def find_flux(
     begun: Vector | None = None,
     sign: int = 1,
 ) -> Vector:
-    """L1 of L0 = `mean` (E2.5, E2.6) for Q1 = `flux` + `more`.
-
-    Times the `sign`, and added to a flux that is `begun`.
-    """
+    """`begun` + `sign` times L1 of L0 = `mean` (E2.5, E2.6) for Q1 = `flux` + `more`."""
     fluxes, start = [*(flux or ()), *(more or ())], begun or ()
     flow = f"Flow<FLUX, {len(fluxes) // 3}, {len(start)}, 0>"
     fields = [diffusion, mean, *fluxes, *start]

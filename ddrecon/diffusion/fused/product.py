@@ -42,7 +42,6 @@ def find_cotangents(operator: Operator, adjoint: Tensor, u: Tensor) -> tuple[Ten
 
 
 def _launch(name: str, given: dict[str, Any], made: dict[str, Any]) -> None:
-    """Runs the kernel called `name` for all rows of cells of `light`."""
     light = given["light"]
     colors, nz, ny, nx = light.shape
     width = 1 if light.is_cuda else nx

@@ -73,10 +73,7 @@ class Coarsening:
         return total
 
     def prolong(self, u: Tensor) -> Tensor:
-        """`u` of the coarse cells, interpolated.
-
-        Where `u` is the same everywhere, so is the result.
-        """
+        """`u` of the coarse cells, interpolated; what is the same everywhere stays so."""
         rise = difference(u, self.axis)
         result = u.new_empty(
             [self.cells if axis == self.axis else size for axis, size in enumerate(u.shape)]
@@ -166,10 +163,7 @@ class Coarsest:
 
     @staticmethod
     def of(operator: Operator) -> Coarsest:
-        """The direct solve of `operator`, computed in double precision.
-
-        Differences of its entries are exact enough only then.
-        """
+        """The direct solve of `operator`, in double: else differences are not exact enough."""
         shape = operator.loss.shape[1:]
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
         given = operator.loss, *operator.conductances
@@ -218,10 +212,7 @@ class Level:
         return Level(matrix, taken, tuple(ways), _coarser(operator))
 
     def cycle(self, source: Tensor) -> Tensor:
-        """Roughly y with S A S y = `source` [C, z, y, x].
-
-        Linear in `source`, symmetric and positive definite.
-        """
+        """Roughly y of S A S y = `source` [C, z, y, x]: linear, symmetric, positive definite."""
         y = STEPS[0] * source
         for step in STEPS[1:]:
             y = self.matrix.relaxed(y, source, step)

@@ -28,10 +28,7 @@ CHECK_EVERY = 16
 def multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x], from `guess`.
-
-    Raises SolveError when it is not reached.
-    """
+    """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
     # Fused, a thread does slices. On a GPU, where one does a cell, and in slabs it is all torch's.
     is_fused = current_engine() == "warp" and has_kernels("diffusion", source.is_cuda)
     if is_fused and operator.ghosts is None:

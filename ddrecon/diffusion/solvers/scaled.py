@@ -100,10 +100,7 @@ class ScaledSystem:
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> Tensor:
-        """The norm of `residual` over that of the right side, `[C, 1, 1, 1]`.
-
-        0 for a color without source.
-        """
+        """The norm of `residual` over the right side's, `[C, 1, 1, 1]`; 0 without source."""
         tiny = torch.finfo(residual.dtype).tiny
         return self.matrix.norm(residual) / self.source_norm.clamp(min=tiny)
 

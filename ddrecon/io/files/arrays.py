@@ -46,9 +46,6 @@ def check_size(size: int, path: Path, name: str) -> None:
 
 
 def as_float32(values: np.ndarray) -> np.ndarray:
-    """`values` as contiguous float32.
-
-    Numbers beyond its range become infinite, which callers refuse.
-    """
+    """`values` as contiguous float32; those beyond its range are infinite, which callers refuse."""
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(values, dtype=np.float32)

@@ -65,10 +65,7 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Has the system put the file or folder at `path` on its disk.
-
-    Raises FormatError where it cannot.
-    """
+    """Puts the file or folder at `path` on its disk; raises FormatError where the system cannot."""
     with refusals(path):
         handle = os.open(path, os.O_RDONLY)
         try:

@@ -121,10 +121,7 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
-    """Writes `pixels` [h, w, 3] as float32 RGB.
-
-    Raises FormatError where OpenImageIO is not installed.
-    """
+    """Writes `pixels` [h, w, 3] as float32 RGB; raises FormatError without OpenImageIO."""
     module = load_for_file(PACKAGE, path)
     spec = module.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
     spec.attribute("compression", "zip")

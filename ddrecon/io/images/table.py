@@ -62,10 +62,7 @@ class Image:
 
 
 def read_image(path: Path) -> Image:
-    """The image at `path`.
-
-    Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
-    """
+    """The image at `path`; raises FormatError where it is unknown, damaged, or not finite."""
     reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
         known = ", ".join(READERS)
@@ -127,10 +124,7 @@ def webp_of(image: np.ndarray) -> bytes:
 
 
 def write_animation(path: Path, frames: Sequence[np.ndarray], white: float) -> None:
-    """Writes `frames` [h, w, 3], linear, as an animated PNG that goes on for ever to `path`.
-
-    Radiance `white` > 0 is white.
-    """
+    """Writes linear `frames` [h, w, 3] to `path` as an endless PNG movie; `white` > 0 is white."""
     encoded = np.stack([srgb.encode_bytes(frame / white) for frame in frames])
     with replace_file(path) as temporary:
         timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}

@@ -50,10 +50,7 @@ def require_only_field(path: Path, fields: Fields) -> np.ndarray:
 
 
 def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:
-    """The field of `values` and `bounds` as a file at `path` gave them.
-
-    Raises FormatError unless they are legal.
-    """
+    """The field of `values` and `bounds` in the file at `path`; raises FormatError unless legal."""
     if values.ndim not in (3, 4) or values.shape[3:] not in ((), (3,)) or values.size == 0:
         legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
         raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")

@@ -13,14 +13,7 @@ from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
-from ddrecon.io.volumes.plain import (
-    npz_names,
-    read_npz,
-    read_vol,
-    write_npz,
-    write_vol,
-    write_vti,
-)
+from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol, write_vti
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
 from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 
@@ -65,10 +58,7 @@ def field_names(path: Path) -> list[str]:
 
 
 def read_field(path: Path, name: str) -> Field:
-    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`.
-
-    Raises FormatError when it cannot be used.
-    """
+    """The field `name` (`density`, ...) of the volume at `path`; raises FormatError if unusable."""
     kind = _format_of(path)
     with guard_reading(path):
         if kind.names and name not in (known := kind.names(path)):

@@ -43,10 +43,7 @@ def write_stack(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
 
 def read_stack(path: Path, name: str) -> Field:
-    """The field in the file at `path`, taken for `name`.
-
-    Raises FormatError when it is damaged or not a legal field.
-    """
+    """The field at `path`, taken for `name`; raises FormatError if damaged or no legal field."""
     with opened(path, "TIFF") as (file, spec):
         description = spec.get_string_attribute("ImageDescription")
         facts = dict(line.split("=", 1) for line in description.splitlines() if "=" in line)

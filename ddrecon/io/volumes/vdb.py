@@ -131,7 +131,6 @@ def _topology(places: np.ndarray, masks: list[bytes], background: bytes) -> tupl
 
 
 def _metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:
-    """Each entry's name, type and value."""
     parts = [
         _text(name) + _text(kind) + struct.pack("<I", len(value)) + value
         for name, (kind, value) in entries.items()

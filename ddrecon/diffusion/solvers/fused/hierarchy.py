@@ -66,8 +66,7 @@ class Hierarchy:
         rows, memory, work = table.numpy(), list[Tensor](), list[Tensor]()
         stage, coarser, steps, threads = 0, margin(shape[3]), MAKING["STEPS"], thread_count(like)
         sums = like.new_empty(threads, 3, dtype=torch.float64)
-        sources = {"table": table, "matrix": given, "colors": shape[0]}
-        sources["is_each"] = [len(part) == shape[0] for part in given]
+        sources = {"table": table, "colors": shape[0]}
         kernel = prepare_kernel(8 * like.element_size()).bind(sources, {"sums": sums})
 
         def add(kept: list[Tensor], name: str, count: int) -> Tensor:
@@ -88,7 +87,11 @@ class Hierarchy:
 
         rows[:, COLUMNS["AXIS"]] = rows[:, COLUMNS["NEXT"]] = -1
         rows[0, :3] = shape[1:]
-        add(work, "CZ", 4)
+        *laid, loss = add(work, "CZ", 4)
+        loss.copy_(operator.loss)
+        for axis, faces, own in zip(AXES, operator.conductances, laid, strict=True):
+            lower_cells(own, axis).copy_(faces)
+            own.select(axis, -1).zero_()
         scale, is_level = add(memory, "SZ", 5)[3], True
         strengths = make(0, MAKING["WEIGH"])
         while is_level and (axes := strong_axes(shape, strengths)):
@@ -151,8 +154,6 @@ def _new_arrays(like: Tensor, shape: Sequence[int], count: int) -> Tensor:
 @functools.cache
 def prepare_kernel(bits: int) -> TextKernel:
     """Steps of making a hierarchy, each of one of the parts of its rows."""
-    text = """
-    prepare<F>({table, {}}, {matrix, is_each}, colors, first, last, item, parts, sums + 3 * item);
-    """
-    given = "long *table; F *matrix[4]; int is_each[4], colors, first, last, parts; double *sums"
+    text = "prepare<F>({table, {}}, colors, first, last, item, parts, sums + 3 * item);"
+    given = "long *table; int colors, first, last, parts; double *sums"
     return TextKernel("prepare", bits, text, given, "sums", f"{ROOM}/prepare.h")

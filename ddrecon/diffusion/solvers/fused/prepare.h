@@ -12,12 +12,6 @@ namespace ddrecon {
 // two weights of faces between pairs of cells along its axis, and the next stage's matrix.
 enum Step { SCALE_CELLS, SCALE_FACES, WEIGH, COARSEN, STEPS };
 
-// The finest matrix as it is given: faces between cells alone, of each color or of all.
-template <class F> struct Finest {
-    const F* const* matrix;
-    const int* is_each;
-};
-
 // COUNT arrays of a stage, from a column on, from the row on.
 template <int COUNT, class F>
 INLINE void find_rows(const Grids<F>& grids, int stage, int column, const Row& row, F** found) {
@@ -25,32 +19,17 @@ INLINE void find_rows(const Grids<F>& grids, int stage, int column, const Row& r
     for (int k = 0; k < COUNT; ++k) found[k] = grids.array(stage, column + k, row.at);
 }
 
-// The finest matrix is also laid out, for what comes after.
-template <bool IS_FINEST, class F> INLINE void scale_cells(
-    const Grids<F>& grids, int stage, const Row& row, const Mesh<F>& mesh, const Finest<F>& given) {
-    F *laid[4], *out[2];
-    const F* c[4];
-    find_rows<4>(grids, stage, CZ, row, laid);
+template <class F>
+INLINE void scale_cells(const Grids<F>& grids, int stage, const Row& row, const Mesh<F>& mesh) {
+    F *c[4], *out[2];
+    find_rows<4>(grids, stage, CZ, row, c);
     find_rows<2>(grids, stage, SCALE, row, out);
-    UNROLLED
-    for (int k = 0; k < 4; ++k) c[k] = laid[k];
-    if constexpr (IS_FINEST) {
-        UNROLLED
-        for (int a = 0; a < 3; ++a)
-            c[a] = mesh.at_faces(given.matrix[a], a, given.is_each[a] ? row.color : 0);
-        c[3] = given.matrix[3] + (given.is_each[3] ? row.at : row.start);
-    }
     INDEPENDENT
     for (int i = 0; i < row.width; ++i) {
         F exchanged = 0;
         UNROLLED
-        for (int k = 0; k < 6; ++k) {
-            const F face = mesh.at_face(c[k / 2], k / 2, k % 2, i);
-            exchanged += face;
-            if (IS_FINEST && k % 2) laid[k / 2][i] = face;
-        }
-        const F loss = c[3][i], scale = 1 / root(exchanged + loss);
-        if (IS_FINEST) laid[3][i] = loss;
+        for (int k = 0; k < 6; ++k) exchanged += mesh.at_face(c[k / 2], k / 2, k % 2, i);
+        const F scale = 1 / root(exchanged + c[3][i]);
         out[0][i] = scale;
         out[1][i] = scale * exchanged;
     }
@@ -154,8 +133,7 @@ INLINE void halve(const Grids<F>& grids, int stage, const Row& row, const Mesh<F
 // Steps `first` to before `last`, where stage s begins with number s STEPS; of each one of so many
 // `parts`. `sums` [3] are those of the scaled conductances of the last level.
 template <class F> INLINE void prepare(
-    const Grids<F>& grids, const Finest<F>& given, int colors, int first, int last, int part,
-    int parts, double* sums) {
+    const Grids<F>& grids, int colors, int first, int last, int part, int parts, double* sums) {
     for (int k = first; k < last; ++k) {
         const int stage = k / STEPS, step = k % STEPS, made = stage + (step >= WEIGH);
         if (step < WEIGH && !grids.at(stage, SCALE)) continue;
@@ -166,9 +144,7 @@ template <class F> INLINE void prepare(
         for (long long item = rows * part / parts; item < rows * (part + 1) / parts; ++item) {
             const Row row((int)item, nx, nz * ny, colors);
             const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
-            if (step == SCALE_CELLS && stage == 0) scale_cells<true>(grids, 0, row, mesh, given);
-            if (step == SCALE_CELLS && stage > 0)
-                scale_cells<false>(grids, stage, row, mesh, given);
+            if (step == SCALE_CELLS) scale_cells(grids, stage, row, mesh);
             if (step == SCALE_FACES) {
                 F own[3];
                 scale_faces(grids, stage, row, mesh, own);
