@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d
 
-from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 
@@ -38,44 +35,13 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
-    coarse = _volume_at_level(volume, grid)
+    coarse = volume_at_level(volume, grid)
     starts = {
         name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
         for name, start in scene.starts.items()
     }
     views = [_view_at_level(view, factor) for view in scene.views]
     return replace(scene, volume=coarse, views=views, starts=starts)
-
-
-def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
-    """`volume` on a coarser `grid`, each medium by itself."""
-    if volume.media is not None:
-        return mix_media(
-            {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
-        )
-    sigma_a, sigma_s = (
-        sigma if sigma.ndim == 1 else resample(sigma, grid)
-        for sigma in (volume.sigma_a, volume.sigma_s)
-    )
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(resample(phase.cells, grid))
-    return Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
-
-
-def resample(field: Tensor, grid: Grid) -> Tensor:
-    """`field` [..., z, y, x] on `grid`, which spans the same box.
-
-    It is averaged where `grid` is coarser, trilinearly interpolated where it is finer.
-    """
-    if tuple(field.shape[-3:]) == grid.shape:
-        return field
-    colors = field.reshape(1, -1, *field.shape[-3:])
-    if colors[0, 0].numel() > grid.cells:
-        resampled = adaptive_avg_pool3d(colors, grid.shape)
-    else:
-        resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
-    return resampled.view(*field.shape[:-3], *grid.shape)
 
 
 def _view_at_level(view: View, factor: int) -> View:
