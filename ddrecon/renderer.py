@@ -23,6 +23,7 @@ from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import UsageError
+from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import light_from_below, stay_above
@@ -118,8 +119,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return _find_light(volume, sources, settings, memory)[0]
     if isinstance(volume.grid, Slab):
         raise UsageError("ground: there is none where processes share cells; leave --slabs out")
-    factor = max(1.0, max(volume.grid.shape) / MOST_CELLS)
-    coarse = volume if factor == 1 else volume_at_level(volume, volume.grid.coarsen(factor))
+    coarse = volume_at_level(volume, exchange_grid(volume.grid))
     plane, render_settings = scene.ground.plane, scene.render
     medium = _medium_of(coarse, settings)
     ambient = ambient_radiance(sources, medium.g).flatten()
@@ -138,6 +138,11 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     )
     below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
     return replace(_find_light(volume, sources, settings, memory, below)[0], ground=lit)
+
+
+def exchange_grid(grid: Grid) -> Grid:
+    """The coarser grid of a volume on which it and a ground light each other (E5.4)."""
+    return grid.coarsen(max(1.0, max(grid.shape) / MOST_CELLS))
 
 
 def scene_sources(scene: Scene) -> list[Source]:

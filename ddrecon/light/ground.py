@@ -79,7 +79,8 @@ def texel_centers(grid: Grid, plane: Plane, like: Tensor) -> Tensor:
     """The middles of all texels of `plane` [rows, columns, 3] [u], in array order (E5.2)."""
     places: list[Tensor] = []
     for axis in plane.across:
-        count = 2 * math.ceil(grid.shape[axis] / 2)
+        # so many that none is centered where a face of the box is
+        count = 4 * math.ceil(grid.shape[axis] / 4)
         part = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (4 / count) - 2
         size = part.abs()
         place = torch.where(size > 1, part.sign() / (2 - size), part)

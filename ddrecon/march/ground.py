@@ -162,7 +162,7 @@ def see_ground(
 ) -> Tensor:
     """The radiance [C, R] behind `medium` along view `rays`: the ground's where they meet it.
 
-    Elsewhere it is what is `behind` [C, R], None for black.
+    Elsewhere it is what is `behind` [C, R or 1], None for black.
     """
     plane, down = lit.ground.plane, rays.direction[:, lit.ground.plane.axis]
     seen = torch.zeros_like(down)[None] if behind is None else behind
@@ -178,4 +178,5 @@ def see_ground(
     irradiance = lit.even[:, None] + more + _direct_irradiance(lit, medium, points, settings)
     radiance = lit.ground.albedo[:, None] / math.pi * irradiance
     colors = max(len(radiance), len(seen))
-    return seen.expand(colors, -1).index_copy(1, hit, radiance.expand(colors, -1))
+    seen = seen.expand(colors, len(down))
+    return seen.index_copy(1, hit, radiance.expand(colors, -1))
