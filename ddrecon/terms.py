@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from torch import Tensor
@@ -139,11 +138,11 @@ def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
 def _ground_term(ground: Ground, grid: Grid) -> str:
     """A ground, and on what it and the volume light each other."""
     plane, albedo = ground.plane, _listed(ground.albedo, is_by_cell=False)
-    down, up = (math.prod(rule) for rule in (DOWNWARDS, UPWARDS))
     cells = " x ".join(map(str, reversed(exchange_grid(grid).shape)))
     return (
         f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}: direct light ray by "
-        f"ray, other light by {down} directions, its own by {up}, to and fro in {cells} cells"
+        f"ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
+        f"to and fro in {cells} cells"
     )
 
 

@@ -24,10 +24,9 @@ from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.interpolation import sample_slices
-from ddrecon.numerics.legendre import gauss_legendre
 
-UPWARDS = 2, 8
-"""Directions of the ground's light: cosines of Gauss's rule, and how many around for each."""
+UPWARDS = 24
+"""Directions of the ground's light."""
 TOGETHER = 8
 """So many of them are added up at a time."""
 
@@ -106,22 +105,23 @@ def look_up_texels(texels: Tensor, grid: Grid, plane: Plane, *points: Tensor) ->
 
 @functools.cache
 @torch.inference_mode(False)
-def hemisphere(axis: int, rings: int, around: int) -> tuple[Tensor, Tensor]:
+def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     """Unit directions [N, 3] towards higher indices along `axis`, and their solid angles [N].
 
-    Even light is integrated exactly, and its irradiance too.
+    They lie on a spiral, each turned by the golden angle, as dense everywhere for a `power` of 1,
+    and as the cosine to the axis for 1/2. Even light's irradiance is exact.
     """
-    nodes, weights = gauss_legendre(rings)
-    directions = []
-    for ring, cosine in enumerate((0.5 * (nodes + 1)).tolist()):
-        for number in range(around):
-            angle = 2 * math.pi * (number + 0.5 * (ring % 2)) / around
-            sine = math.sqrt(1 - cosine * cosine)
-            way = [sine * math.cos(angle), sine * math.sin(angle)]
-            way.insert(axis, cosine)
-            directions.append(way)
-    angles = math.pi / around * weights.repeat_interleave(around)
-    return torch.tensor(directions, dtype=torch.float64), angles
+    number = torch.arange(count, dtype=torch.float64)
+    part, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))
+    cosine = part**power
+    sine = (1 - cosine**2).sqrt()
+    along = {
+        axis: cosine,
+        (axis + 1) % 3: sine * azimuth.cos(),
+        (axis + 2) % 3: sine * azimuth.sin(),
+    }
+    directions = torch.stack([along[one] for one in range(3)], -1)
+    return directions, 2 * math.pi / count * power * part ** (power - 1)
 
 
 def light_from_below(medium: Medium, plane: Plane, even: Tensor, texels: Tensor) -> Moments:
@@ -129,7 +129,7 @@ def light_from_below(medium: Medium, plane: Plane, even: Tensor, texels: Tensor)
 
     Its radiance is `even` [C], and in `texels` [C, rows, columns] so much more.
     """
-    directions, angles = (part.to(even) for part in hemisphere(plane.axis, *UPWARDS))
+    directions, angles = (part.to(even) for part in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
     weights = moment_weights(rays, medium.degree)[..., 0]
     one = even.new_ones(1, 1, 1)

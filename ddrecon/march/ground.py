@@ -28,8 +28,8 @@ from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
-DOWNWARDS = 4, 12
-"""Directions of the light that the ground receives from sky and medium, as `UPWARDS`."""
+DOWNWARDS = 64
+"""Directions of the light that the ground receives from sky and medium."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def light_texels(
         return _passed(medium, _rays_against(grid, points, travel), settings) - 1
 
     texels = torch.zeros_like(behind)
-    directions, angles = hemisphere(plane.axis, *DOWNWARDS)
+    directions, angles = hemisphere(plane.axis, DOWNWARDS, 0.5)
     sights = _sights(grid, plane, settings, behind.dtype, behind.device)
     for sight, part in zip(sights, (angles * directions[:, plane.axis]).tolist(), strict=True):
         texels = texels + part * recompute(look, sight)
@@ -98,7 +98,7 @@ def _sights(
     """Those of rays from all texels, one for each direction."""
     like = torch.empty(0, dtype=dtype, device=device)
     points = texel_centers(grid, plane, like).flatten(0, 1)
-    directions = hemisphere(plane.axis, *DOWNWARDS)[0].to(like)
+    directions = hemisphere(plane.axis, DOWNWARDS, 0.5)[0].to(like)
     return tuple(look_along(grid, _rays_against(grid, points, -up), settings) for up in directions)
 
 
