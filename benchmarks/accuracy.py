@@ -4,9 +4,10 @@
 
 `eleven`: the cases of FOLDER/images/cases.json, whose images lie beside it. `derivative`: by all
 the density of some of them, against central differences (FOLDER/fd_gradients.json).
-`angles`, `volumes`, `grounds`: scenes of ours; what FOLDER/traced does not hold of them is traced by Mitsuba 3
-(extra `reference`) and kept there. An error is the relative RMS error of the image in linear
-radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that noise.
+`angles`, `volumes`, `grounds`: scenes of ours; what FOLDER/traced does not hold of them is traced
+by Mitsuba 3 (extra `reference`) and kept there. An error is the relative RMS error of the image in
+linear radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that
+noise.
 """
 
 from __future__ import annotations

@@ -43,7 +43,9 @@ GRAY = 1e-5
 """Colors whose extinctions differ by less, relatively, share their paths."""
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
-"""How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
+"""How far from the eye Mitsuba's rays start, and from the box a ground lies at least, in diagonals
+of the box; it wants more than 0.
+"""
 COSINES = 1 << 15
 """Steps of Mitsuba's tables, which are linear between even cosines: the first is 0.6 degrees."""
 SQUARE = 1e-5
@@ -188,10 +190,14 @@ def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _ground(ground: Ground, grid: Grid) -> dict[str, Any]:
-    """A square in place of the unbounded plane: Mitsuba's runs from -1 to 1 across +z."""
-    up, half = 2 - ground.plane.axis, FAR * math.hypot(*grid.extent)
+    """A square in place of the unbounded plane: Mitsuba's runs from -1 to 1 across +z.
+
+    It lies a little below the box: of two surfaces in the same place rays meet either.
+    """
+    up, diagonal = 2 - ground.plane.axis, math.hypot(*grid.extent)
+    half, bottom = FAR * diagonal, grid.lower[ground.plane.axis] - NEAR * diagonal
     place, middle = np.zeros((4, 4)), np.array([*grid.center_xyz, 1.0])
-    middle[up] = ground.plane.height
+    middle[up] = min(ground.plane.height, bottom)
     place[[(up + 1) % 3, (up + 2) % 3, up], [0, 1, 2]] = half
     place[:, 3] = middle
     bsdf = {"type": "diffuse", "reflectance": _color(ground.albedo)}
