@@ -42,12 +42,13 @@ template <class F, int BLOCK> struct Shear : Slices {
           step(value_of(number[2])),
           bound(value_of(number[3])) {}
 
-    // Cell 0 of slice k among rays.
+    // Cell 0 of slice k among rays: rounded once, so that it is next to the same ray wherever it is
+    // asked for.
     INLINE Place<F> row_place(double k) const {
-        return Place<F>(first_row - k * (double)slope_row);
+        return Place<F>(__builtin_fma(-k, (double)slope_row, (double)first_row));
     }
     INLINE Place<F> column_place(double k) const {
-        return Place<F>(first_column - k * (double)slope_column);
+        return Place<F>(__builtin_fma(-k, (double)slope_column, (double)first_column));
     }
     INLINE long long window_row(int channel, int k, int m) const {
         return (long long)channel * slices * (height + 3) * (width + 3) +
