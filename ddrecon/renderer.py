@@ -118,7 +118,9 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     if scene.ground is None:
         return _find_light(volume, sources, settings, memory)[0]
     if isinstance(volume.grid, Slab):
-        raise UsageError("ground: there is none where processes share cells; leave --slabs out")
+        raise UsageError(
+            "ground: there is none where processes share out cells; leave --share cells out"
+        )
     coarse = volume_at_level(volume, exchange_grid(volume.grid))
     plane, render_settings = scene.ground.plane, scene.render
     medium = _medium_of(coarse, settings)
