@@ -7,8 +7,7 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,7 +25,7 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
-from ddrecon.light.ground import light_from_below, stay_above
+from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_towards
@@ -41,13 +40,14 @@ from ddrecon.light.reduced import (
 )
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.emission import Emission
-from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground
+from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
 from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -135,9 +135,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     first, source = _find_light(
         coarse, sources, settings, replace(memory, last={}), from_below(lit)
     )
-    lit = light_texels(
-        lit, sources, medium, functools.partial(_glow, first, source), render_settings
-    )
+    lit = light_texels(lit, sources, medium, _glow(first, source, plane), render_settings)
     below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
     return replace(_find_light(volume, sources, settings, memory, below)[0], ground=lit)
 
@@ -207,18 +205,27 @@ def follow_unscattered_light(
     return LightField(medium, beams, light if sky is None else light.plus(sky))
 
 
-def _glow(light_field: LightField, source: Moments | None, bundle: Rays) -> Emission:
-    """What the medium sends along parallel rays, its beams by their `source` where there is one.
+def _glow(
+    light_field: LightField, source: Moments | None, plane: Plane
+) -> Callable[[Rays, int], Emission]:
+    """What the medium sends down to a ground, along rays into one of the directions `upwards`.
 
-    That leaves out their forward peak, which the ground receives as direct light.
+    Its beams count by their `source` where there is one: that leaves out their forward peak, which
+    the ground receives as direct light.
     """
     if source is None:
-        return _emission(light_field, bundle)
-    emission, medium = _emission(replace(light_field, beams=()), bundle), light_field.medium
-    scattered = source.along(bundle.towards_eye(medium.grid))
+        return lambda rays, _: _emission(light_field, rays)
+    medium, others = light_field.medium, replace(light_field, beams=())
+    values = harmonics(-upwards(plane)[0], medium.degree).T.to(source.mean)
+    scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
     if not medium.is_cellwise:
         scattered = (1 - medium.forward_fraction) * scattered
-    return replace(emission, diffuse=emission.diffuse + scattered)
+
+    def glow(rays: Rays, number: int) -> Emission:
+        emission = _emission(others, rays)
+        return replace(emission, diffuse=emission.diffuse + scattered[number])
+
+    return glow
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:

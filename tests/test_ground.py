@@ -232,6 +232,7 @@ def test_a_ground_that_cannot_be_is_refused(overrides: list[str], what: str) -> 
         load_scene(BALL, overrides=[GROUND, VIEWS, "optimize=null", *overrides])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("ground.albedo",), ("density", "ground.albedo")])
 def test_its_albedo_is_found(names: tuple[str, ...]) -> None:
     small = [GROUND, VIEWS, *SMALL]

@@ -28,7 +28,7 @@ from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
-DOWNWARDS = 64
+DOWNWARDS = 48
 """Directions of the light that the ground receives from sky and medium."""
 
 
@@ -61,34 +61,39 @@ def light_texels(
     lit: LitGround,
     sources: Sequence[Source],
     medium: Medium,
-    glow: Callable[[Rays], Emission],
+    glow: Callable[[Rays, int], Emission],
     settings: RenderSettings,
 ) -> LitGround:
     """What is `lit` evenly by `sources`, under `medium` and in its light (E5.1).
 
-    `glow`: what the medium sends along parallel rays.
+    `glow`: what the medium sends along rays into a direction, by its number in `upwards`.
     """
     grid, plane, ambient = medium.grid, lit.ground.plane, ambient_radiance(sources, lit.even)
     points = texel_centers(grid, plane, lit.even)
     shape, points = points.shape[:2], points.flatten(0, 1)
     behind = ambient.view(-1, 1).expand(-1, len(points))
 
-    def look(sight: Sight) -> Tensor:
-        return march(glow(sight.rays), sight, settings, behind) - behind
+    def look(sight: Sight, number: int) -> Tensor:
+        return march(glow(sight.rays, number), sight, settings, behind) - behind
 
     def shade(travel: Tensor) -> Tensor:
         return _passed(medium, _rays_against(grid, points, travel), settings) - 1
 
     texels = torch.zeros_like(behind)
-    directions, angles = hemisphere(plane.axis, DOWNWARDS, 0.5)
-    sights = _sights(grid, plane, settings, behind.dtype, behind.device)
-    for sight, part in zip(sights, (angles * directions[:, plane.axis]).tolist(), strict=True):
-        texels = texels + part * recompute(look, sight)
+    directions, angles = upwards(plane)
+    parts = (angles * directions[:, plane.axis]).tolist()
+    for number, sight in enumerate(_sights(grid, plane, settings, behind.dtype, behind.device)):
+        texels = texels + parts[number] * recompute(look, sight, number)
     for sky in sources:
         if isinstance(sky, Sky):
             for travel, vector in zip(sky.travel, sky.vector, strict=True):
                 texels = texels - vector[plane.axis][:, None] * recompute(shade, travel)
     return replace(lit, texels=texels.unflatten(1, shape))
+
+
+def upwards(plane: Plane) -> tuple[Tensor, Tensor]:
+    """The directions [N, 3] into which the ground looks, and their solid angles [N] (E5.1)."""
+    return hemisphere(plane.axis, DOWNWARDS, 0.5)
 
 
 @remember
@@ -98,7 +103,7 @@ def _sights(
     """Those of rays from all texels, one for each direction."""
     like = torch.empty(0, dtype=dtype, device=device)
     points = texel_centers(grid, plane, like).flatten(0, 1)
-    directions = hemisphere(plane.axis, DOWNWARDS, 0.5)[0].to(like)
+    directions = upwards(plane)[0].to(like)
     return tuple(look_along(grid, _rays_against(grid, points, -up), settings) for up in directions)
 
 
