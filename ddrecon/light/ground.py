@@ -22,13 +22,10 @@ from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.interpolation import sample_slices
 
 UPWARDS = 24
 """Directions of the ground's light."""
-TOGETHER = 8
-"""So many of them are added up at a time."""
 
 
 @dataclass(frozen=True)
@@ -132,19 +129,12 @@ def light_from_below(medium: Medium, plane: Plane, even: Tensor, texels: Tensor)
     directions, angles = (part.to(even) for part in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
     weights = moment_weights(rays, medium.degree)[..., 0]
-    one = even.new_ones(1, 1, 1)
-
-    def add(ways: Tensor, of_moments: Tensor) -> Tensor:
-        """What comes along some ways, as moments."""
-        arriving = []
-        for way in ways:
-            (passed,), _ = attenuate_few(medium, way[None], one)
-            sent = even.view(-1, 1, 1, 1) + _see_texels(medium.grid, plane, texels, way)
-            arriving.append(passed * sent)
-        return torch.tensordot(of_moments.T, torch.stack(arriving), 1)
-
-    parts = zip(directions.split(TOGETHER), weights.split(TOGETHER), strict=True)
-    total = functools.reduce(torch.add, (recompute(add, *part) for part in parts))
+    one, arriving = even.new_ones(1, 1, 1), []
+    for way in directions:
+        (passed,), _ = attenuate_few(medium, way[None], one)
+        sent = even.view(-1, 1, 1, 1) + _see_texels(medium.grid, plane, texels, way)
+        arriving.append(passed * sent)
+    total = torch.tensordot(weights.T, torch.stack(arriving), 1)
     if len(total) == 1:
         return Moments(total[0])
     mean, z, y, x = total[:4]

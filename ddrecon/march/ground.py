@@ -83,7 +83,7 @@ def light_texels(
     directions, angles = upwards(plane)
     parts = (angles * directions[:, plane.axis]).tolist()
     for number, sight in enumerate(_sights(grid, plane, settings, behind.dtype, behind.device)):
-        texels = texels + parts[number] * recompute(look, sight, number)
+        texels = texels + parts[number] * look(sight, number)
     for sky in sources:
         if isinstance(sky, Sky):
             for travel, vector in zip(sky.travel, sky.vector, strict=True):
