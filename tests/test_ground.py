@@ -14,6 +14,7 @@ from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ddrecon import renderer
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
@@ -112,8 +113,10 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
-@pytest.mark.parametrize("kind", ["p1", "none", "environment"])
-def test_tangent_adjoint_and_differences_agree(kind: str) -> None:
+@pytest.mark.parametrize("kind", ["p1", "coarse", "none", "environment"])
+def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if kind == "coarse":
+        monkeypatch.setattr(renderer, "MOST_CELLS", 5)
     model = {"model": "none"} if kind == "none" else {"transport_rounds": 1, "degree": 3}
     density = 0.2 + random_values(*SHAPE)
     scene = on_ground(density, g=0.3, ambient=(0.3,), **model)
