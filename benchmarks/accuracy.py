@@ -1,12 +1,13 @@
 """How far images and derivatives are from path-traced ones: tables in Markdown.
 
-    python benchmarks/accuracy.py eleven|derivative|angles|volumes --references FOLDER
+    python benchmarks/accuracy.py eleven|derivative|angles|volumes|grounds --references FOLDER
 
 `eleven`: the cases of FOLDER/images/cases.json, whose images lie beside it. `derivative`: by all
 the density of some of them, against central differences (FOLDER/fd_gradients.json).
-`angles`, `volumes`: scenes of ours; what FOLDER/traced does not hold of them is traced by Mitsuba 3
-(extra `reference`) and kept there. An error is the relative RMS error of the image in linear
-radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that noise.
+`angles`, `volumes`, `grounds`: scenes of ours; what FOLDER/traced does not hold of them is traced
+by Mitsuba 3 (extra `reference`) and kept there. An error is the relative RMS error of the image in
+linear radiance, less the noise of the reference, in quadrature; `< x` is one below a third of that
+noise.
 """
 
 from __future__ import annotations
@@ -109,6 +110,8 @@ class Case:
     light: tuple[dict[str, Any], ...] = (sun(SIDE),)
     camera: dict[str, Any] | None = None
     extent: Vector = (1.0, 1.0, 1.0)
+    ground: tuple[float, float] | None = None
+    """Its height and albedo."""
 
     def write(self, folder: Path, cells: int = CELLS) -> Path:
         """Its scene file of `cells`^3 cells, in `folder`."""
@@ -119,9 +122,13 @@ class Case:
         write_field(folder / "density.npz", "density", density.numpy(), bounds)
         medium = {"sigma_t": self.sigma_t, "albedo": self.albedo, "g": self.g}
         camera = {**(self.camera or perspective(FRONT)), "target": [0, 0, 0], "up": [0, 1, 0]}
-        return write_scene(
+        path = write_scene(
             folder, folder / "density.npz", bounds, medium, list(self.light), camera, PIXELS
         )
+        if self.ground is not None:
+            ground = dict(zip(("height", "albedo"), self.ground, strict=True))
+            path.write_text(json.dumps({**json.loads(path.read_text()), "ground": ground}))
+        return path
 
 
 def write_scene(
@@ -196,6 +203,41 @@ VOLUMES = (
         camera={"type": "orthographic", "origin": list(BELOW), "width": 1.4},
     ),
 )
+ABOVE = perspective((1.3, 1.6, 2.6), 34.0)
+GROUNDS = (
+    Case("cloud over gray ground", CLOUD, 25.0, 0.99, camera=ABOVE, ground=(-0.6, 0.5)),
+    Case(
+        "cloud over white ground, g 0.85", CLOUD, 25.0, 1.0, 0.85, camera=ABOVE, ground=(-0.6, 0.9)
+    ),
+    Case(
+        "cloud over white ground, ambient light",
+        CLOUD,
+        25.0,
+        light=(AMBIENT,),
+        camera=ABOVE,
+        ground=(-0.6, 0.9),
+    ),
+    Case(
+        "ball over gray ground, point light",
+        BALL,
+        25.0,
+        light=(LAMP,),
+        camera=ABOVE,
+        ground=(-0.6, 0.5),
+    ),
+    Case(
+        "plume on gray ground, g 0.5",
+        plume_density,
+        25.0,
+        g=0.5,
+        extent=(1.0, 1.5, 1.0),
+        camera=ABOVE,
+        ground=(-0.75, 0.5),
+    ),
+)
+
+
+CASES = {"angles": ANGLES, "volumes": VOLUMES, "grounds": GROUNDS}
 
 
 def image_of(scene: Scene) -> np.ndarray:
@@ -313,7 +355,7 @@ def print_cases(cases: tuple[Case, ...], folder: Path, place: Path) -> None:
 def main() -> None:
     """Prints what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("eleven", "derivative", "angles", "volumes"))
+    parser.add_argument("what", choices=("eleven", "derivative", *CASES))
     parser.add_argument("--references", type=Path, default=Path("references"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -322,8 +364,7 @@ def main() -> None:
         elif given.what == "derivative":
             print_derivatives(given.references, Path(name))
         else:
-            cases = ANGLES if given.what == "angles" else VOLUMES
-            print_cases(cases, given.references, Path(name))
+            print_cases(CASES[given.what], given.references, Path(name))
 
 
 if __name__ == "__main__":

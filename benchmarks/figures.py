@@ -28,6 +28,7 @@ COMMANDS = {
     "eleven": "python benchmarks/accuracy.py eleven --references FOLDER",
     "angles": "python benchmarks/accuracy.py angles --references FOLDER",
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
+    "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
     "thick": "python benchmarks/thick_cells.py",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
     "rounds": "python benchmarks/rounds.py",

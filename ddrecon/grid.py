@@ -75,7 +75,7 @@ class Grid:
             coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
         return coordinates
 
-    def coarsen(self, factor: int) -> Grid:
+    def coarsen(self, factor: float) -> Grid:
         """The same box with about `factor` times fewer cells along each axis (at least one)."""
         z, y, x = (max(1, round(cells / factor)) for cells in self.shape)
         return Grid((z, y, x), self.lower, self.upper)

@@ -7,7 +7,7 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,8 +23,10 @@ from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import UsageError
+from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
+from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_towards
@@ -38,16 +40,23 @@ from ddrecon.light.reduced import (
     scatter_sky,
     sum_unscattered_sky,
 )
-from ddrecon.light.sky import Sky, decompose_lights
+from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.emission import Emission
+from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_through
-from ddrecon.medium.coefficients import Medium, cut_volume, keep_medium, scale_medium
+from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
+from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
+from ddrecon.slabs.slab import Slab
+
+MOST_CELLS = 32
+"""Cells along the longest side, at most, where light goes to and fro between volume and ground."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,8 @@ class LightField:
 
     `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E8.11).
+    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `ground` is what
+    lies below, where there is any.
     """
 
     medium: Medium
@@ -64,6 +74,7 @@ class LightField:
     diffuse: Moments
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
+    ground: LitGround | None = None
 
 
 @dataclass(frozen=True)
@@ -102,42 +113,123 @@ def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> lis
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     """The light inside the volume of `scene`: reduced, and scattered often (E2.4, E2.5).
 
-    Reduced light alone where nothing scatters twice.
+    Reduced light alone where nothing scatters twice. With a ground, whose light is another source,
+    it begins with light that goes to and fro on a coarse grid (E5.4).
     """
-    volume = cut_volume(scene.volume)
-    medium = scale_medium(volume, scene.diffusion.angles)
-    if not multiply_scatters(medium, scene.diffusion):
-        return follow_unscattered_light(keep_medium(volume), scene.lights)
+    volume, sources, settings = cut_volume(scene.volume), scene_sources(scene), scene.diffusion
+    if scene.ground is None:
+        return _find_light(volume, sources, settings, memory)[0]
+    if isinstance(volume.grid, Slab):
+        raise UsageError(
+            "ground: there is none where processes share out cells; leave --share cells out"
+        )
+    coarse = volume_at_level(volume, exchange_grid(volume.grid))
+    plane, render_settings = scene.ground.plane, scene.render
+    medium = _medium_of(coarse, settings)
+    cells = average_cells(medium)
+    ambient = ambient_radiance(sources, medium.g).flatten()
+
+    def from_below(lit: LitGround) -> Moments:
+        """What the ground sends into the box, less the ambient light from everywhere."""
+        even, texels = reflect(lit, medium, render_settings)
+        return light_from_below(cells, plane, even - ambient, texels)
+
+    lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
+    first, source = _find_light(
+        coarse, sources, settings, replace(memory, last={}), from_below(lit)
+    )
+    lit = light_texels(lit, sources, medium, _glow(first, source, plane), render_settings)
+    below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
+    return replace(_find_light(volume, sources, settings, memory, below)[0], ground=lit)
+
+
+def exchange_grid(grid: Grid) -> Grid:
+    """The coarser grid of a volume on which it and a ground light each other (E5.4)."""
+    return grid.coarsen(max(1.0, max(grid.shape) / MOST_CELLS))
+
+
+def scene_sources(scene: Scene) -> list[Source]:
+    """What light comes from in `scene`: of its lights what a ground does not hide."""
+    sources = decompose_lights(scene.lights)
+    return sources if scene.ground is None else stay_above(sources, scene.ground.plane)
+
+
+def _medium_of(volume: Volume, settings: DiffusionSettings) -> Medium:
+    """As it is, with its forward peak, where light is scattered no more than once."""
+    medium = scale_medium(volume, settings.angles)
+    return medium if multiply_scatters(medium, settings) else keep_medium(volume)
+
+
+def _find_light(
+    volume: Volume,
+    lights: Sequence[Source],
+    settings: DiffusionSettings,
+    memory: SolveMemory,
+    below: Moments | None = None,
+) -> tuple[LightField, Moments | None]:
+    """The light of `lights` in `volume`, and of what comes from `below`.
+
+    Also the source of its beams where light scatters more than once.
+    """
+    medium = _medium_of(volume, settings)
+    if not multiply_scatters(medium, settings):
+        return follow_unscattered_light(medium, lights, below), None
     cells = average_cells(medium)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
-    lights = decompose_lights(scene.lights)
-    source, turned = receive_light(cells, lights, cells.degree)
+    beams, turned = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
+    if below is not None:
+        sky = below if sky is None else sky.plus(below)
+    source = beams
     if sky is not None:
         source = source.plus(sky.weighted(remaining_moments(cells)))
     outside = ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
-    diffuse = solve_diffuse(cells, source, outside, scene.diffusion, memory)
+    diffuse = solve_diffuse(cells, source, outside, settings, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, follow_lights(medium, lights), light, turned=turned)
+    return LightField(medium, follow_lights(medium, lights), light, turned=turned), beams
 
 
-def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
+def follow_unscattered_light(
+    medium: Medium, lights: Sequence[Source], below: Moments | None = None
+) -> LightField:
     """The light inside `medium` that has not been scattered.
 
-    Beams, and by quadrature over directions ambient light and skies.
+    Beams, and by quadrature over directions ambient light, skies and what comes from `below`.
     """
-    parts = decompose_lights(lights)
-    beams = follow_lights(medium, parts)
-    skies = tuple(part for part in parts if isinstance(part, Sky))
-    if any(isinstance(part, AmbientLight) for part in parts):
-        skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
-    nothing = Moments(torch.zeros_like(medium.extinction.value))
+    beams = follow_lights(medium, lights)
+    skies = tuple(light for light in lights if isinstance(light, Sky))
+    if any(isinstance(light, AmbientLight) for light in lights):
+        skies = (*skies, ambient_sky(ambient_radiance(lights, medium.g)))
+    light = Moments(torch.zeros_like(medium.extinction.value)) if below is None else below
     if medium.is_anisotropic:
-        return LightField(medium, beams, nothing, skies)
+        return LightField(medium, beams, light, skies)
     sky = sum_unscattered_sky(medium, skies, 0)
-    return LightField(medium, beams, nothing if sky is None else sky)
+    return LightField(medium, beams, light if sky is None else light.plus(sky))
+
+
+def _glow(
+    light_field: LightField, source: Moments | None, plane: Plane
+) -> Callable[[Rays, int], Emission]:
+    """What the medium sends down to a ground, along rays into one of the directions `upwards`.
+
+    Its beams count by their `source` where there is one: that leaves out their forward peak, which
+    the ground receives as direct light.
+    """
+    if source is None:
+        return lambda rays, _: _emission(light_field, rays)
+    medium, others = light_field.medium, replace(light_field, beams=())
+    values = harmonics(-upwards(plane)[0], medium.degree).T.to(source.mean)
+    scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
+    if not medium.is_cellwise:
+        scattered = (1 - medium.forward_fraction) * scattered
+
+    def glow(rays: Rays, number: int) -> Emission:
+        emission = _emission(others, rays)
+        return replace(emission, diffuse=emission.diffuse + scattered[number])
+
+    return glow
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
@@ -213,9 +305,10 @@ def view_image(
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
+    unlit = _without_background(scene)
     parts = [
         (replace(light_field, diffuse=nothing, turned=()), scene, camera, behind),
-        (replace(light_field, beams=(), skies=()), _without_background(scene), camera, None),
+        (replace(light_field, beams=(), skies=(), ground=None), unlit, camera, None),
     ]
     varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
@@ -234,9 +327,10 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     radiance are those of the medium itself, and the difference, light scattered forward once or
     more, belongs to `multiple`.
     """
-    once = follow_unscattered_light(keep_medium(cut_volume(scene.volume)), scene.lights)
+    unscattered = replace(scene, diffusion=replace(scene.diffusion, model="none"))
+    once = solve_light(unscattered, SolveMemory())
     image = view_image(light_field, scene, camera)
-    single = view_image(once, _without_background(scene), camera)
+    single = view_image(replace(once, ground=None), _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
     return Components(reduced, single, image - reduced - single)
 
@@ -244,7 +338,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
 def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor | None) -> Tensor:
     """Radiance [3, h, w]: E2.1, averaged over the rays of each pixel.
 
-    Behind the volume is what is `given` [C, h, w], else the lights.
+    Behind the volume is the ground, or what is `given` [C, h, w], else the lights.
     """
     sight = look_through(camera, scene.volume.grid, scene.render)
     samples = scene.render.samples_per_pixel
@@ -253,6 +347,9 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         behind = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)
     elif scene.render.background:
         behind = _background(scene.lights, sight.rays)
+    if light_field.ground is not None:
+        medium = light_field.medium
+        behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
     radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     if samples > 1:
         radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)

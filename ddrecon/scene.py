@@ -14,6 +14,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera
 from ddrecon.display import Displayed
 from ddrecon.errors import UsageError
+from ddrecon.light.ground import Ground
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
@@ -50,7 +51,7 @@ class Scene(Displayed):
     """A loaded scene.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
-    optimized parameter starts from.
+    optimized parameter starts from; `ground` lies under the volume, where there is any.
     """
 
     volume: Volume
@@ -61,6 +62,7 @@ class Scene(Displayed):
     optimize: OptimizeSettings | None = None
     starts: dict[str, Tensor] = field(default_factory=dict)
     path: Path | None = None
+    ground: Ground | None = None
 
     def view(self, name: str) -> View:
         """The view called `name`; raises UsageError with the known names."""

@@ -8,13 +8,16 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.engine import engine_of_parts, has_kernels
+from ddrecon.grid import Grid
+from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
+from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
-from ddrecon.renderer import multiply_scatters
+from ddrecon.renderer import exchange_grid, multiply_scatters
 from ddrecon.scene import Scene
 
 
@@ -29,6 +32,7 @@ def needed_terms(scene: Scene) -> list[str]:
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
         *_light_terms(scene.lights, is_diffuse),
+        *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
     ]
@@ -129,6 +133,17 @@ def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
             sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
             terms.append(f"environment map {width} x {height}: {beams}{sky}")
     return terms
+
+
+def _ground_term(ground: Ground, grid: Grid) -> str:
+    """A ground, and on what it and the volume light each other."""
+    plane, albedo = ground.plane, _listed(ground.albedo, is_by_cell=False)
+    cells = " x ".join(map(str, reversed(exchange_grid(grid).shape)))
+    return (
+        f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}: direct light ray by "
+        f"ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
+        f"to and fro in {cells} cells"
+    )
 
 
 def _listed(numbers: Tensor, is_by_cell: bool) -> str:

@@ -60,6 +60,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "file where left out."
             ),
             "resolution": "Cells along x, y and z; those of the field's file where left out.",
+            "up": "The axis that the height of a `ground` is measured along.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -84,6 +85,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "media": "Two media by names of your choice; see below.",
             "bounds": "As of one medium.",
             "resolution": "As of one medium.",
+            "up": "As of one medium.",
         },
     ),
     (
@@ -152,6 +154,16 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "refractive_index": "Of the droplets; of water 1.33.",
             "effective_radius": "In micrometers: of clouds 5 to 15.",
             "effective_variance": "Of the distribution: of clouds about 0.1.",
+        },
+    ),
+    (
+        "ground",
+        schema.GroundSection,
+        "An unbounded plane under the box that reflects light evenly into all directions.\n"
+        "Cameras see it, in shadow and in the light of the volume, and it lights the volume.",
+        {
+            "height": "Along `volume.up` [u]: at the bottom of the box, or below.",
+            "albedo": "The part of the light that it reflects; `ground.albedo` can be optimized.",
         },
     ),
     (

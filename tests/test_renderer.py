@@ -17,6 +17,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import Components, render, solve_light, view_components
 from ddrecon.scene import Scene, View
 from ddrecon.validate.gradcheck import GradientCheck, check_parameters

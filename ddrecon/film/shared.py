@@ -62,11 +62,12 @@ def hold(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> 
     """
     views = {view["name"]: view for view in described["views"]}
     lights = (f"lights.{index}" for index in range(len(described["lights"])))
-    known = {*lights, *(f"views.{name}" for name in views)}
+    known = {*lights, *(f"views.{name}" for name in views), *({"ground"} & {*described})}
     strange = [
         name
         for name in values
-        if name.startswith(("views.", "lights.")) and name.rpartition(".")[0] not in known
+        if name.startswith(("views.", "lights.", "ground."))
+        and name.rpartition(".")[0] not in known
     ]
     if strange:
         raise UsageError(f"{source}: {strange[0]}: the scene has none; name that of its cameras")

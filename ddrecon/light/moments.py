@@ -7,7 +7,7 @@ Transport rounds go on to higher degrees (docs/theory.md E2.8).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -84,6 +84,15 @@ class Moments:
             mean * self.mean,
             None if self.flux is None else _vector(flux * component for component in self.flux),
             None if (of_light := self.spelled().higher) is None else higher * of_light,
+        )
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Moments:
+        """The same with what `function` makes of each of its tensors."""
+        flux, higher = self.flux, self.spelled().higher
+        return Moments(
+            function(self.mean),
+            None if flux is None else _vector(map(function, flux)),
+            None if higher is None else function(higher),
         )
 
     def weighted(self, factors: Tensor) -> Moments:

@@ -90,11 +90,11 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     skies = _lit_skies(lights)
     if not skies:
         return None
-    weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
+    weights = torch.cat([moment_weights(sky, degree) for sky in skies])
     return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
 
-def _moment_weights(sky: Sky, degree: int) -> Tensor:
+def moment_weights(sky: Sky, degree: int) -> Tensor:
     """What transmittance is multiplied by, [N, moments, C]: the moments of light outside."""
     weights = [sky.irradiance[:, None]]
     if degree > 0:

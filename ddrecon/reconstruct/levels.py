@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
-from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
+from torch.nn.functional import adaptive_avg_pool2d
 
-from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Volume, put_volume
-from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 
@@ -36,36 +32,13 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
-    coarse = _volume_at_level(volume, grid)
+    coarse = volume_at_level(volume, grid)
     starts = {
         name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
         for name, start in scene.starts.items()
     }
     views = [_view_at_level(view, factor) for view in scene.views]
     return replace(scene, volume=coarse, views=views, starts=starts)
-
-
-def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
-    if volume.media is not None:
-        return mix_media(
-            {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
-        )
-    return put_volume(volume, grid, partial(resample, grid=grid))
-
-
-def resample(field: Tensor, grid: Grid) -> Tensor:
-    """`field` [..., z, y, x] on `grid`, which spans the same box.
-
-    It is averaged where `grid` is coarser, trilinearly interpolated where it is finer.
-    """
-    if tuple(field.shape[-3:]) == grid.shape:
-        return field
-    colors = field.reshape(1, -1, *field.shape[-3:])
-    if colors[0, 0].numel() > grid.cells:
-        resampled = adaptive_avg_pool3d(colors, grid.shape)
-    else:
-        resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
-    return resampled.view(*field.shape[:-3], *grid.shape)
 
 
 def _view_at_level(view: View, factor: int) -> View:

@@ -25,6 +25,7 @@ from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.environment import rotate_directions
+from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
@@ -42,11 +43,15 @@ GRAY = 1e-5
 """Colors whose extinctions differ by less, relatively, share their paths."""
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
-"""How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
+"""How far from the eye Mitsuba's rays start, and from the box a ground lies at least, in diagonals
+of the box; it wants more than 0.
+"""
 COSINES = 1 << 15
 """Steps of Mitsuba's tables, which are linear between even cosines: the first is 0.6 degrees."""
 SQUARE = 1e-5
 """Pixels this little off square are taken for square: the error is that part of the height."""
+FAR = 100.0
+"""Half the width of a ground, in diagonals of the box: it ends half a degree below the horizon."""
 MEDIUM = "medium"
 
 
@@ -77,6 +82,7 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
             "interior": {"type": "ref", "id": MEDIUM},
         },
         **mitsuba_lights(scene.lights),
+        **({"ground": _ground(scene.ground, grid)} if scene.ground else {}),
     }
 
 
@@ -180,6 +186,21 @@ def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def _ground(ground: Ground, grid: Grid) -> dict[str, Any]:
+    """A square in place of the unbounded plane: Mitsuba's runs from -1 to 1 across +z.
+
+    It lies a little below the box: of two surfaces in the same place rays meet either.
+    """
+    up, diagonal = 2 - ground.plane.axis, math.hypot(*grid.extent)
+    half, bottom = FAR * diagonal, grid.lower[ground.plane.axis] - NEAR * diagonal
+    place, middle = np.zeros((4, 4)), np.array([*grid.center_xyz, 1.0])
+    middle[up] = min(ground.plane.height, bottom)
+    place[[(up + 1) % 3, (up + 2) % 3, up], [0, 1, 2]] = half
+    place[:, 3] = middle
+    bsdf = {"type": "diffuse", "reflectance": _color(ground.albedo)}
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     """The camera of `view`, whose film keeps the mean of each pixel.
 
@@ -201,7 +222,7 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
         },
         "sampler": {"type": "independent", "sample_count": SAMPLES},
         "near_clip": NEAR * diagonal,
-        "far_clip": 2 * (diagonal + math.dist(origin, grid.center_xyz)),
+        "far_clip": 2 * (FAR * diagonal + math.dist(origin, grid.center_xyz)),
     }
     start = cast_rays(camera).origin.detach()
     lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))

@@ -159,7 +159,10 @@ def pick_color(scene: Scene, color: int) -> Scene:
         for name in names
         if hasattr(light, name)
     ]
-    return replace(scene, volume=volume, lights=lights)
+    ground = scene.ground
+    if ground is not None:
+        ground = replace(ground, albedo=_pick(ground.albedo, color))
+    return replace(scene, volume=volume, lights=lights, ground=ground)
 
 
 def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:

@@ -184,7 +184,7 @@ class RunFolder(Checkpoints):
         parameters: dict[str, Any] = {}
         coefficients = "density", *EXTINCTION_AND_ALBEDO
         for name in variable_names(scene):
-            is_light, value = name.startswith("lights."), value_of(scene, name)
+            is_light, value = name.startswith(("lights.", "ground.")), value_of(scene, name)
             if is_light and value.ndim >= 3:
                 parameters[name] = stored.get(name) or self._store(scene, name)
             elif is_light or (

@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, suggestion
+from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
+from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.march.samplers import choose_steps, greatest_depth
 from ddrecon.medium.coefficients import Volume
@@ -100,6 +102,10 @@ def build_scene(
     for index, section in enumerate(tree.lights):
         with problems.collecting():
             lights.append(_build_light(scene_file, index, section, dtype, place))
+    ground = None
+    if media and tree.ground is not None:
+        with problems.collecting():
+            ground = _build_ground(scene_file, grid, views, dtype, place)
     optimize = tree.optimize
     for name, settings in optimize.parameters.items() if optimize else ():
         if isinstance(settings.init, FieldFile):
@@ -121,7 +127,9 @@ def build_scene(
     diffusion, render = choose_rounds(tree, volume.phase, is_flat, volume), tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
-    scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
+    scene = Scene(
+        volume, lights, views, render, diffusion, optimize, path=scene_file.path, ground=ground
+    )
     for name, settings in optimize.parameters.items() if optimize else ():
         with problems.collecting():
             scene.starts[name] = _start(scene_file, scene, name, settings)
@@ -157,6 +165,31 @@ def _build_light(
     radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
     numbers = tensor(section.scale), tensor(section.rotation)
     return EnvironmentLight(radiance, *numbers, section.directions, section.up)
+
+
+def _build_ground(
+    scene_file: SceneFile,
+    grid: Grid,
+    views: Sequence[View],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Ground:
+    tree = scene_file.tree
+    section, axis = tree.ground, "zyx".index(tree.volume.up)
+    assert section is not None
+    if section.height > grid.lower[axis]:
+        raise scene_file.refused(
+            "ground.height",
+            f"{section.height:g} is above the bottom of the box, {grid.lower[axis]:g} along "
+            f"{tree.volume.up}; a ground lies there or below",
+        )
+    for view in views:
+        if float(view.camera.pose[2 - axis, 3]) <= section.height:
+            what = f"the camera of view {view.name!r} is not above it"
+            raise scene_file.refused("ground.height", what)
+    albedo = tree.share_color("ground.albedo", section.albedo)
+    reflected = torch.tensor(albedo, dtype=dtype, device=device).view(-1)
+    return Ground(reflected, Plane(section.height, axis))
 
 
 def _read_map(path: Path) -> np.ndarray:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ddrecon.light.ground import stay_above
+from ddrecon.light.lights import EnvironmentLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import extinction_of, with_values
@@ -35,6 +37,7 @@ def find_doubts(scene: Scene) -> list[str]:
         *_doubt_depth(volume, extinction),
         *_doubt_faces(volume, extinction, scene.diffusion.angles),
         *_doubt_cameras(scene),
+        *_doubt_ground(scene),
     ]
 
 
@@ -96,4 +99,16 @@ def _doubt_cameras(scene: Scene) -> list[str]:
         f"views: {what} camera {names[0]}"
         f"{f' and {len(names) - 1} more' if len(names) > 1 else ''}; {UNITS}"
         for what, names in doubted.items()
+    ]
+
+
+def _doubt_ground(scene: Scene) -> list[str]:
+    """Lights that a ground hides."""
+    if scene.ground is None:
+        return []
+    plane = scene.ground.plane
+    return [
+        f"lights.{index}: shines from below the ground at {plane.height:g}, and is not seen"
+        for index, light in enumerate(scene.lights)
+        if not isinstance(light, EnvironmentLight) and not stay_above([light], plane)
     ]

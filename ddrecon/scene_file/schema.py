@@ -146,6 +146,7 @@ class VolumeSection(MediumSection):
     phase: PhaseSection | None = None  # type: ignore[assignment]
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
@@ -161,6 +162,7 @@ class MixtureSection:
     media: Mapping[str, MediumSection]
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         if len(self.media) != 2:
@@ -168,6 +170,14 @@ class MixtureSection:
         for name in self.media:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
+
+
+@dataclass(frozen=True)
+class GroundSection:
+    """A plane at `height` [u] along the volume's `up`; `albedo`: part of light that it reflects."""
+
+    height: float
+    albedo: Color = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)
@@ -430,6 +440,7 @@ class SceneTree:
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
     frames: FramesSection | None = None
+    ground: GroundSection | None = None
 
     @property
     def media(self) -> Mapping[str, VolumeSection | MediumSection]:
@@ -460,6 +471,8 @@ class SceneTree:
             has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
             if last == "phase.g" and has_one:
                 yield "optimize", f"parameters.{name} is called {medium}g here"
+        if self.ground is not None and self.diffusion.scheme == "printed":
+            yield "ground", "the printed scheme has none; leave diffusion.scheme out"
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:

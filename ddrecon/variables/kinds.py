@@ -187,6 +187,7 @@ KINDS: Mapping[str, Kind] = {
         components=XYZ,
         difference_steps=SHORT_STEPS,
     ),
+    "ground.albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
         pose_rate,
@@ -222,8 +223,8 @@ RESPONSE = {"exposure": 1.0, "offset": 0.0}
 
 
 def is_of_volume(name: str) -> bool:
-    """Whether the variable `name` is the volume's, and not of a light or a view."""
-    return not name.startswith(("lights.", "views."))
+    """Whether the variable `name` is the volume's, and not of a light, the ground or a view."""
+    return not name.startswith(("lights.", "ground.", "views."))
 
 
 def kind_of(name: str) -> Kind:

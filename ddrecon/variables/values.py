@@ -1,9 +1,9 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
 `density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
-`lights.0.irradiance` is any number of the first light; `views.front.camera` is the twist of a
-camera, `.focal`, `.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors
-lead.
+`lights.0.irradiance` is any number of the first light; `ground.albedo` is the ground's;
+`views.front.camera` is the twist of a camera, `.focal`, `.principal_point` and `.distortion` are
+its lens. Vectors are (x, y, z), colors lead.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def variable_names(scene: Scene) -> list[str]:
         for name in _tensors(light)
     ]
     views = [f"views.{view.name}.{part}" for view in scene.views for part in _view_parts(view)]
-    return [*_volume_names(scene.volume), *lights, *views]
+    ground = [] if scene.ground is None else ["ground.albedo"]
+    return [*_volume_names(scene.volume), *lights, *ground, *views]
 
 
 def density_names(scene: Scene) -> list[str]:
@@ -75,6 +76,9 @@ def value_of(scene: Scene, name: str) -> Tensor:
         raise _unknown(scene, name)
     if is_of_volume(known):
         return _volume_value(scene.volume, known)
+    if known == "ground.albedo":
+        assert scene.ground is not None
+        return scene.ground.albedo
     section, _, path = name.partition(".")
     if section == "views":
         view, _, part = path.rpartition(".")
@@ -105,7 +109,11 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     volume = _replace_volume(
         scene.volume, {name: value for name, value in values.items() if is_of_volume(name)}
     )
-    return replace(scene, volume=volume, lights=lights, views=views)
+    ground, albedo = scene.ground, values.get("ground.albedo")
+    if ground is not None and albedo is not None:
+        require_form("ground.albedo", albedo, ground.albedo, scene.volume.density, ())
+        ground = replace(ground, albedo=albedo)
+    return replace(scene, volume=volume, lights=lights, views=views, ground=ground)
 
 
 def require_legal(scene: Scene, *, waits: bool = False) -> None:
@@ -123,6 +131,8 @@ def require_legal(scene: Scene, *, waits: bool = False) -> None:
     }
     for index, light in enumerate(scene.lights):
         numbers |= {f"lights.{index}.{name}": getattr(light, name) for name in _tensors(light)}
+    if scene.ground is not None:
+        numbers["ground.albedo"] = scene.ground.albedo
     for name, value in numbers.items():
         require_form(name, value, value, density, cells)
         if waits or value.device.type == "cpu":

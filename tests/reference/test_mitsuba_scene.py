@@ -12,6 +12,7 @@ from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.errors import SceneError
+from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.medium.phase_blend import Blend, TwoLobe
@@ -71,6 +72,21 @@ def test_gray_is_told_through_rounding() -> None:
     scene = make_scene(density.float(), sigma_a=12 * (1 - albedo), sigma_s=12 * albedo)
     assert is_gray(scene.volume) and extinction(described(scene)["medium"]).shape == (*SHAPE, 1)
     assert not is_gray(make_scene(density, sigma_a=12 * (1 - albedo), sigma_s=(9.0,)).volume)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("height", [-0.6, -2.0])
+def test_a_ground_is_a_wide_square_below_the_box(axis: int, height: float) -> None:
+    """Its corners are where the plane is, or a little below the box, and it looks up."""
+    scene = make_scene(random_values(*SHAPE))
+    albedo = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    found = described(replace(scene, ground=Ground(albedo, Plane(height, axis))))["ground"]
+    turned, up, grid = found["to_world"], 2 - axis, scene.volume.grid
+    corners = [turned @ [x, y, 0, 1] for x in (-1, 1) for y in (-1, 1)]
+    expected = pytest.approx(min(height, grid.lower[axis]), abs=1e-3)
+    assert all(corner[up] == expected and corner[up] < grid.lower[axis] for corner in corners)
+    assert np.ptp(corners, axis=0).max() > 100 and (turned @ [0, 0, 1, 0])[up] > 0
+    assert np.linalg.det(turned[:3, :3]) > 0 and found["bsdf"]["reflectance"] == (0.1, 0.2, 0.3)
 
 
 def every_light(like: Tensor) -> list[Any]:

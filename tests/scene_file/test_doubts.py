@@ -71,3 +71,12 @@ def test_a_thick_face_is_told_by_what_it_costs() -> None:
             f"volume.g={g}",
         )
         assert words in found[0] if words else found == []
+
+
+def test_a_light_below_the_ground() -> None:
+    ground = "ground={height: -9, albedo: 0.3}"
+    below = (
+        "lights=[{type: point, position: [0, -9.5, 0], intensity: 1}, {type: ambient, radiance: 1}]"
+    )
+    (line,) = doubts(ground, below)
+    assert line == "lights.0: shines from below the ground at -9, and is not seen"

@@ -25,6 +25,17 @@ template <class N> INLINE void clear(N* to, int count) {
     for (int t = 0; t < count; ++t) to[t] = N(0);
 }
 
+// c - a b, whose product is rounded by itself: were that left to where it is inlined, a place at a
+// ray could be just below it here, and just above it there.
+INLINE double less_product(double c, double a, double b) {
+#if defined(__CUDA_ARCH__)
+    return __dsub_rn(c, __dmul_rn(a, b));
+#else
+#pragma clang fp contract(off)
+    return c - a * b;
+#endif
+}
+
 struct Slices {
     int slices, height, width, rows, columns, first_row, first_column, start, slice_stride;
     int row_stride, window_slice_stride, window_row_stride, is_slices_first;
@@ -44,10 +55,10 @@ template <class F, int BLOCK> struct Shear : Slices {
 
     // Cell 0 of slice k among rays.
     INLINE Place<F> row_place(double k) const {
-        return Place<F>(first_row - k * (double)slope_row);
+        return Place<F>(less_product(first_row, k, slope_row));
     }
     INLINE Place<F> column_place(double k) const {
-        return Place<F>(first_column - k * (double)slope_column);
+        return Place<F>(less_product(first_column, k, slope_column));
     }
     INLINE long long window_row(int channel, int k, int m) const {
         return (long long)channel * slices * (height + 3) * (width + 3) +

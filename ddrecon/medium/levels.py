@@ -1,0 +1,42 @@
+"""Volumes on other grids of the same box."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d, interpolate
+
+from ddrecon.grid import Grid
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
+
+
+def volume_at_level(volume: Volume, grid: Grid) -> Volume:
+    """`volume` on a coarser `grid`, each medium by itself."""
+    if volume.media is not None:
+        return mix_media(
+            {name: volume_at_level(medium, grid) for name, medium in volume.media.items()}
+        )
+    sigma_a, sigma_s = (
+        sigma if sigma.ndim == 1 else resample(sigma, grid)
+        for sigma in (volume.sigma_a, volume.sigma_s)
+    )
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(resample(phase.cells, grid))
+    density = volume.density if volume.support is None else volume.density * volume.support
+    return Volume(grid, resample(density, grid), sigma_a, sigma_s, phase)
+
+
+def resample(field: Tensor, grid: Grid) -> Tensor:
+    """`field` [..., z, y, x] on `grid`, which spans the same box.
+
+    It is averaged where `grid` is coarser, trilinearly interpolated where it is finer.
+    """
+    if tuple(field.shape[-3:]) == grid.shape:
+        return field
+    colors = field.reshape(1, -1, *field.shape[-3:])
+    if colors[0, 0].numel() > grid.cells:
+        resampled = adaptive_avg_pool3d(colors, grid.shape)
+    else:
+        resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
+    return resampled.view(*field.shape[:-3], *grid.shape)

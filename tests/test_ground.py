@@ -1,0 +1,248 @@
+"""A ground: closed forms, energy, derivatives and invariance."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from media import half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon import renderer
+from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import ENGINES, use_engine
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.reconstruct.loop import optimize
+from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.scene import Scene, View
+from ddrecon.scene_file.build import load_scene
+from ddrecon.variables.values import with_values
+
+CAMERA = (
+    "{{name: {}, camera: {{type: perspective, origin: [{}, 1, {}], target: [0, 0, 0], fov: 40,"
+    " resolution: [12, 11]}}}}"
+)
+PLACES = ("front", 0, 2.5), ("side", 2.5, 0), ("back", -1.8, -1.8)
+VIEWS = f"views=[{', '.join(CAMERA.format(*place) for place in PLACES)}]"
+SMALL = ["volume.resolution=[8, 8, 8]", "volume.density=0.5", "diffusion.transport_rounds=0"]
+BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
+SHAPE = (6, 7, 5)
+ALBEDO, HEIGHT = (0.6, 0.4, 0.2), -0.8
+VIEW = {"eye": (0.5, 1.5, 2.5), "size": (6, 7), "half_width": 0.5}
+"""Most of its picture is ground."""
+pytestmark = pytest.mark.parametrize("engine", ENGINES)
+
+
+@pytest.fixture(autouse=True)
+def _engine(engine: str) -> None:
+    if engine == "warp":
+        pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+    use_engine(engine)
+
+
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def on_ground(
+    density: Tensor, height: float = HEIGHT, albedo: tuple[float, ...] = ALBEDO, **scene: Any
+) -> Scene:
+    camera = scene.pop("camera", make_camera(**VIEW))
+    made = make_scene(density, camera=camera, **scene)
+    return replace(made, ground=Ground(tensor(*albedo), Plane(height, 1)))
+
+
+def test_an_empty_box_leaves_the_light_of_sun_lamp_and_sky() -> None:
+    scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), ambient=(0.2, 0.3, 0.5))
+    scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
+    # straight from above, and only the plane is seen
+    pose = look_at(tensor(0.1, 9, 0.2), tensor(0.1, 0, 0.2), tensor(0, 0, -1))
+    scene.views = [View("above", Camera(pose, (5, 6), 3.0, is_perspective=False))]
+    row, column = (torch.arange(n, dtype=torch.float64) + 0.5 - n / 2 for n in (5, 6))
+    x, z = 0.1 + column[None], 0.2 + row[:, None]
+    height = 1.0 - HEIGHT
+    distance = ((x - 0.3) ** 2 + (z + 0.2) ** 2 + height**2).sqrt()
+    sun = 3 * 2 / 3
+    irradiance = sun + 2 * height / distance**3 + math.pi * tensor(0.2, 0.3, 0.5)[:, None, None]
+    expected = tensor(*ALBEDO)[:, None, None] / math.pi * irradiance
+    torch.testing.assert_close(render(scene)[0], expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("form", ["ambient", "environment"])
+@pytest.mark.parametrize("g", [0.0, 0.4])
+def test_a_white_furnace_is_white(form: str, g: float) -> None:
+    """Ground and medium reflect all light, and from everywhere comes the same."""
+    density = 3 * half_empty(*SHAPE)
+    made = {"sigma_a": (0.0,), "sigma_s": (8.0,), "g": g, "transport_rounds": 1, "degree": 3}
+    scene = on_ground(density, albedo=(1.0,), directional=None, **made)
+    sky = EnvironmentLight(tensor(1.0).expand(1, 4, 6), tensor(1.0)[0], tensor(0.0)[0])
+    scene.lights = [AmbientLight(tensor(1.0)) if form == "ambient" else sky]
+    torch.testing.assert_close(render(scene), torch.ones(1, 3, 6, 7).double(), rtol=1e-9, atol=0)
+
+
+def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
+    """Its shadow has the depth of a slanted way, and all of it together is all light it takes."""
+    depth, cosine = 1.3, 0.8
+    grid = Grid((12, 4, 16), (-0.6, 0.0, -0.8), (0.6, 0.2, 0.8))
+    density = torch.ones(12, 4, 16, dtype=torch.float64)
+    travel = (0.6, -cosine, 0.0)
+    slab: dict[str, Any] = {"sigma_a": (depth / 0.2,), "sigma_s": (0.0,), "travel": travel}
+    pose = look_at(tensor(3.0, 5, 0), tensor(3.0, 0, 0), tensor(0, 0, -1))
+    camera = Camera(pose, (100, 200), 2.0, is_perspective=False)
+    made = on_ground(density, -3.9, (1.0,), grid=grid, camera=camera, **slab)
+    lost = 3 * cosine / math.pi - render(made)[0, 0]
+    # The shadow's middle is 0.6 / 0.8 of the height to the side, at x = 3: amid the picture.
+    expected = 3 * cosine / math.pi * -math.expm1(-depth / cosine)
+    assert float(lost[45:55, 80:120].mean()) == pytest.approx(expected, rel=1e-3)
+    # Rays are inside for a while, slanted: by the place where each meets the upper face's plane.
+    place = torch.linspace(-0.95, 0.95, 3801, dtype=torch.float64)
+    across = ((place + 0.15).clamp(max=0.8) - place.clamp(min=-0.8)).clamp(min=0)
+    taken = 1.9 * float(-torch.expm1(-depth / 0.2 * across / 0.6).mean())
+    total = 3 * cosine / math.pi * 1.2 * taken
+    assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["p1", "coarse", "none", "environment"])
+def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if kind == "coarse":
+        monkeypatch.setattr(renderer, "MOST_CELLS", 5)
+    model = {"model": "none"} if kind == "none" else {"transport_rounds": 1, "degree": 3}
+    density = 0.2 + random_values(*SHAPE)
+    scene = on_ground(density, g=0.3, ambient=(0.3,), **model)
+    scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
+    if kind == "environment":
+        sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 8)
+        scene.lights.append(sky)
+    values = {
+        "density": density,
+        "ground.albedo": scene.ground.albedo,
+        "lights.0.irradiance": scene.lights[0].irradiance,
+        "lights.0.direction": scene.lights[0].direction,
+        "lights.1.radiance": scene.lights[1].radiance,
+        "lights.2.position": scene.lights[2].position,
+    }
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    weights = random_values(1, 3, 6, 7, seed=3)
+    total = (weights * render(with_values(scene, leaves))).sum()
+    bars = dict(zip(leaves, torch.autograd.grad(total, [*leaves.values()]), strict=True))
+    for seed, (name, value) in enumerate(values.items()):
+        way = random_values(*value.shape, seed=seed) - 0.5
+
+        def along(step: float, name: str = name, value: Tensor = value, way: Tensor = way) -> float:
+            changed = with_values(scene, {name: value + step * way})
+            return float((weights * render(changed)).sum())
+
+        with forward_ad.dual_level():
+            dual = with_values(scene, {name: forward_ad.make_dual(value, way)})
+            tangent = float((weights * forward_ad.unpack_dual(render(dual)).tangent).sum())
+        adjoint = float((bars[name] * way).sum())
+        assert tangent == pytest.approx(adjoint, rel=1e-9)
+        difference = (along(1e-5) - along(-1e-5)) / 2e-5
+        assert difference == pytest.approx(adjoint, rel=2e-4, abs=1e-6), name
+
+
+def test_parts_sum_to_the_picture() -> None:
+    scene = on_ground(random_values(*SHAPE), g=0.3, ambient=(0.2,), transport_rounds=1)
+    parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
+    torch.testing.assert_close(parts.reduced + parts.single + parts.multiple, render(scene)[0])
+    # Most that is seen of the ground is seen through nothing.
+    assert float(parts.reduced.median()) > 0.1 > float(parts.single.median())
+
+
+def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:
+    """The same scene in other units of length, x, y and z taking each other's place `turns` times.
+
+    The ground's up is then z, or x.
+    """
+    volume, ground, (view,) = scene.volume, scene.ground, scene.views
+    assert ground is not None
+    grid, axes = volume.grid, [(axis + turns) % 3 for axis in range(3)]
+    lower, upper = ([size * end[axis] for axis in axes] for end in (grid.lower, grid.upper))
+    pose = view.camera.pose.roll(turns, 0) * tensor(1, 1, 1, size)
+    sun, sky, lamp = scene.lights
+    place, intensity = size * lamp.position.roll(turns), size**2 * lamp.intensity
+    return replace(
+        scene,
+        volume=Volume(
+            Grid(tuple(grid.shape[axis] for axis in axes), tuple(lower), tuple(upper)),
+            volume.density.permute(axes),
+            volume.sigma_a / size,
+            volume.sigma_s / size,
+            volume.phase,
+        ),
+        lights=[
+            replace(sun, direction=sun.direction.roll(turns)),
+            sky,
+            PointLight(place, intensity),
+        ],
+        views=[View("view", replace(view.camera, pose=pose))],
+        ground=Ground(ground.albedo, Plane(size * ground.plane.height, axes.index(1))),
+    )
+
+
+@pytest.mark.parametrize(("turns", "size"), [(0, 1e3), (1, 1.0), (2, 1.0)])
+def test_units_and_the_way_up_do_not_matter(turns: int, size: float) -> None:
+    scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
+    scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
+    found, known = render(moved(scene, turns, size)), render(scene)
+    torch.testing.assert_close(found, known, rtol=1e-8, atol=1e-10)
+
+
+def test_lights_from_below_are_hidden() -> None:
+    scene = on_ground(random_values(*SHAPE))
+    known = render(scene)
+    scene.lights += [DirectionalLight(tensor(0.1, 1, 0), tensor(1.0))]
+    scene.lights += [PointLight(tensor(0, -1, 0), tensor(1.0))]
+    assert torch.equal(render(scene), known)
+
+
+def test_texels_are_found_where_they_are() -> None:
+    grid, plane = Grid(SHAPE, (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), Plane(HEIGHT, 1)
+    points = texel_centers(grid, plane, tensor(0))
+    texels = random_values(2, *points.shape[:2])
+    z, x = points[..., 0].flatten(), points[..., 2].flatten()
+    found = look_up_texels(texels, grid, plane, z[None], x[None])
+    torch.testing.assert_close(found[0], texels.flatten(1))
+    assert float(z.max()) > 3 * grid.upper[0] and float(z.min()) < 3 * grid.lower[0]
+
+
+GROUND = "ground={height: -0.75, albedo: 0.3}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "what"),
+    [
+        (["ground.height=0"], "ground.height: 0 is above the bottom of the box, -0.5 along y"),
+        (["volume.up=z", "ground.height=0"], "above the bottom of the box, -0.5 along z"),
+        (["ground.albedo=1.1"], "ground.albedo: must be at most 1, found 1.1"),
+        (["diffusion.scheme=printed"], "ground: the printed scheme has none"),
+        (["views.0.camera.origin=[0, -1, 3]"], "the camera of view 'front' is not above it"),
+    ],
+)
+def test_a_ground_that_cannot_be_is_refused(overrides: list[str], what: str) -> None:
+    with pytest.raises(SceneError, match=re.escape(what)):
+        load_scene(BALL, overrides=[GROUND, VIEWS, "optimize=null", *overrides])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("ground.albedo",), ("density", "ground.albedo")])
+def test_its_albedo_is_found(names: tuple[str, ...]) -> None:
+    small = [GROUND, VIEWS, *SMALL]
+    known = load_scene(BALL, overrides=[*small, "optimize=null", "ground.albedo=0.6"])
+    views = [replace(view, image=render(known, view.name)[0]) for view in known.views]
+    parameters = ", ".join(f"{name}: {{}}" for name in names)
+    optimized = f"optimize={{iterations: 25, refine_at: [], parameters: {{{parameters}}}}}"
+    scene = load_scene(BALL, overrides=[*small, optimized])
+    found = optimize(replace(scene, views=views)).scene.ground
+    assert found is not None and float(found.albedo) == pytest.approx(0.6, abs=0.01)
