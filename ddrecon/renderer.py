@@ -7,6 +7,7 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -46,6 +47,7 @@ from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
+from ddrecon.slabs.exchange import gather_slabs
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,14 @@ class LightField:
 
     `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E8.11).
+    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `received`
+    [C, z, y, x] is the mean over directions of the light of `beams` in each cell.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
+    received: Tensor
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
 
@@ -118,7 +122,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, reduced.beams, light, turned=reduced.turned)
+    return LightField(medium, reduced.beams, light, reduced.mean, turned=reduced.turned)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -127,15 +131,32 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     Beams, and by quadrature over directions ambient light and skies.
     """
     parts = decompose_lights(lights)
-    beams = reduced_light(medium, parts, 0).beams
+    reduced = reduced_light(medium, parts, 0)
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     if medium.is_anisotropic:
-        return LightField(medium, beams, nothing, skies)
+        return LightField(medium, reduced.beams, nothing, reduced.mean, skies)
     sky = sum_unscattered_sky(medium, skies, 0)
-    return LightField(medium, beams, nothing if sky is None else sky)
+    return LightField(medium, reduced.beams, nothing if sky is None else sky, reduced.mean)
+
+
+def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
+    """The fluence [C, z, y, x] of all light inside the volume of `scene`: E5.2.
+
+    Differentiable as `render`, and `memory` as there.
+    """
+    return fluence_of(solve_light(scene, memory or SolveMemory()))
+
+
+def fluence_of(light_field: LightField) -> Tensor:
+    """The fluence [C, z, y, x] >= 0, averaged over each cell: of the whole grid, also in slabs."""
+    medium = light_field.medium
+    mean = light_field.diffuse.mean + light_field.received
+    sky = sum_unscattered_sky(medium, light_field.skies, 0)
+    mean = mean if sky is None else mean + sky.mean
+    return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:

@@ -8,7 +8,15 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.engine import engine_of_parts, has_kernels
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+)
+from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
@@ -28,7 +36,7 @@ def needed_terms(scene: Scene) -> list[str]:
     return [
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
-        *_light_terms(scene.lights, is_diffuse),
+        *_light_terms(scene, is_diffuse),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
     ]
@@ -106,17 +114,22 @@ def _has_pairs(medium: Medium, scene: Scene) -> bool:
 def _has_beams(lights: Sequence[Light]) -> bool:
     """Whether a light is directional, or has suns that are."""
     return any(
-        isinstance(light, DirectionalLight)
+        isinstance(light, DirectionalLight | BeamLight)
         or (isinstance(light, EnvironmentLight) and count_suns(light)[0] > 0)
         for light in lights
     )
 
 
-def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
-    terms = []
+def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
+    lights, terms = scene.lights, list[str]()
     for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
         if count := sum(isinstance(light, kind) for light in lights):
             terms.append(f"transmittance towards {_count(count, name)}")
+    for light in lights:
+        if isinstance(light, BeamLight):
+            given, seen = float(light.radius), float(seen_radius(light.radius, scene.volume.grid))
+            beam = f"a beam of radius {given:.3g} u" if given > 0 else "a pencil"
+            terms.append(f"transmittance towards {beam}; in these cells its radius is {seen:.3g} u")
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
 from torch import Tensor
 
 from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams
-from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
+from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
+from ddrecon.light.profile import profile_in
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
@@ -29,48 +30,72 @@ from ddrecon.numerics.remember import remember
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light of directional and point lights not yet scattered.
+    """Light of beams not yet scattered.
 
     `source`: Q0, Q1 and what follows, of all `beams` together, averaged over cells, to the degree
-    that was wanted. `turned`: light that backward peaks have turned back and forth (E8.11).
+    that was wanted. `mean` [C, z, y, x]: that of their light itself over directions and cells, what
+    peaks have turned among it. `turned`: light that backward peaks have turned back and forth
+    (E8.11).
     """
 
     beams: tuple[Beam | PointBeam, ...]
     source: Moments
+    mean: Tensor
     turned: tuple[TurnedBeam, ...] = ()
+
+    def plus(self, other: ReducedLight) -> ReducedLight:
+        """The light of both."""
+        source, turned = self.source.plus(other.source), self.turned + other.turned
+        return ReducedLight(self.beams + other.beams, source, self.mean + other.mean, turned)
+
+    def across(self, profile: Tensor) -> ReducedLight:
+        """This light of directional lights, its irradiance times `profile` [1, z, y, x]."""
+        beams = (replace(beam, profile=profile) for beam in self.beams if isinstance(beam, Beam))
+        source = self.source.scaled(profile, profile, profile)
+        turned = (replace(one, radiance=profile * one.radiance) for one in self.turned)
+        return ReducedLight(tuple(beams), source, profile * self.mean, tuple(turned))
 
 
 def reduced_light(
     medium: Medium, lights: Sequence[Source], degree: int, has_pairs: bool = False
 ) -> ReducedLight:
-    """The light of directional and point `lights` that reaches each cell unscattered.
+    """The light of directional, point and beam `lights` that reaches each cell unscattered.
 
     Of lights that go along w the source holds the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
     moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. With
-    `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E8.11).
+    `has_pairs`, what backward peaks turn back belongs to the beams of parallel light (E8.11).
     """
-    beams: list[Beam | PointBeam] = []
-    sources: list[Moments] = []
-    turned: list[TurnedBeam] = []
-    directional = [light for light in lights if isinstance(light, DirectionalLight)]
-    if has_pairs:
-        for parallel in directional:
-            beam, pair = follow_pair(medium, parallel)
-            beams.append(beam)
-            sources.append(pair.source(medium))
-            turned += pair.turned
-    elif directional:
-        found, source = follow_beams(medium, directional, degree)
-        beams += found
-        sources.append(source)
+    parts = list[ReducedLight]()
+    if parallel := [light for light in lights if isinstance(light, DirectionalLight)]:
+        parts.append(_follow_parallel(medium, parallel, degree, has_pairs))
     for light in lights:
         if isinstance(light, PointLight):
             point_beam, received = follow_point_light(medium, light, degree)
-            beams.append(point_beam)
-            sources.append(received.weighted(remaining_moments(medium)))
-    nothing = Moments(torch.zeros_like(medium.extinction.value))
-    source = reduce(Moments.plus, sources) if sources else nothing
-    return ReducedLight(tuple(beams), source, tuple(turned))
+            source = received.weighted(remaining_moments(medium))
+            parts.append(ReducedLight((point_beam,), source, received.mean))
+        elif isinstance(light, BeamLight):
+            parallel = [DirectionalLight(light.direction, light.power)]
+            found = _follow_parallel(medium, parallel, degree, has_pairs)
+            parts.append(found.across(profile_in(medium.grid, light)))
+    nothing = torch.zeros_like(medium.extinction.value)
+    return (
+        reduce(ReducedLight.plus, parts) if parts else ReducedLight((), Moments(nothing), nothing)
+    )
+
+
+def _follow_parallel(
+    medium: Medium, lights: Sequence[DirectionalLight], degree: int, has_pairs: bool
+) -> ReducedLight:
+    """The light of directional `lights`, at least one; arguments as of `reduced_light`."""
+    if not has_pairs:
+        beams, source = follow_beams(medium, lights, degree)
+        return ReducedLight(tuple(beams), source, source.mean)
+    parts = list[ReducedLight]()
+    for light in lights:
+        beam, pair = follow_pair(medium, light)
+        mean = pair.along + pair.against
+        parts.append(ReducedLight((beam,), pair.source(medium), mean, pair.turned))
+    return reduce(ReducedLight.plus, parts)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

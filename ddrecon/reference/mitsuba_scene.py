@@ -25,7 +25,14 @@ from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.environment import rotate_directions
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+)
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Mixture
@@ -247,7 +254,7 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
 
     Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels
     of an environment map.
-    Raises SceneError for more than one environment map.
+    Raises SceneError for more than one environment map, and for beams.
     """
     emitters: dict[str, dict[str, Any]] = {}
     ambient, maps = np.zeros(3), list[EnvironmentLight]()
@@ -264,6 +271,8 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
                 "position": light.position.tolist(),
                 "intensity": _color(light.intensity),
             }
+        elif isinstance(light, BeamLight):
+            raise SceneError(f"lights.{index}: Mitsuba has no Gaussian beams; leave it out")
         elif isinstance(light, AmbientLight):
             ambient = ambient + _color(light.radiance)
         else:
