@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import reduce
+from itertools import product
 from typing import Any
 
 import torch
@@ -40,71 +40,20 @@ from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
+FACES = "-z", "+z", "-y", "+y", "-x", "+x"
+"""Of the box, in array order."""
+Beamed = DirectionalLight | PointLight | BeamLight
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
-@dataclass(frozen=True)
-class Balance:
-    """Powers of each color [C]: what `enters` the box of each light, and what is `absorbed` there.
-
-    And what leaves through each of `faces_of` [6, C], `unscattered` and `scattered`.
-    """
-
-    enters: dict[str, Tensor]
-    absorbed: Tensor
-    unscattered: Tensor
-    scattered: Tensor
-
-    @property
-    def entered(self) -> Tensor:
-        """All that enters [C]."""
-        return reduce(torch.add, self.enters.values())
-
-    @property
-    def defect(self) -> Tensor:
-        """The part of what enters that is neither absorbed nor leaves [C]."""
-        left = (self.unscattered + self.scattered).sum(0)
-        return 1 - (self.absorbed + left) / self.entered
-
-
-@dataclass(frozen=True)
-class Face:
-    """A face of the box of `grid` across `axis`, on the lower or the upper `side` (0 or 1)."""
-
-    grid: Grid
-    axis: int
-    side: int
-
-    @property
-    def area(self) -> float:
-        """That of one of its cells [u^2]."""
-        return math.prod(self.grid.spacing) / self.grid.spacing[self.axis]
-
-    def centers(self, like: Tensor) -> list[Tensor]:
-        """The middles of its cells, as of `Grid.centers`."""
-        lines, ends = self.grid.centers(like), (self.grid.lower, self.grid.upper)
-        lines[self.axis] = like.new_full((1, 1, 1), ends[self.side][self.axis])
-        return lines
-
-    def outward(self, travel: Tensor) -> Tensor:
-        """The part of the irradiance along unit `travel` [..., 3] that leaves through it."""
-        return (travel[..., self.axis] * (2 * self.side - 1)).clamp(min=0)
-
-    def layer(self, field: Tensor) -> Tensor:
-        """The cells of `field` [C, z, y, x] at this face."""
-        return field.select(1 + self.axis, -self.side)
-
-
-def faces_of(grid: Grid) -> list[Face]:
-    """The faces of the box: -z, +z, -y, +y, -x, +x."""
-    return [Face(grid, axis, side) for axis in range(3) for side in range(2)]
-
-
 @torch.no_grad()
-def find_balance(scene: Scene) -> Balance:
-    """The energy balance of `scene`.
+def find_balance(scene: Scene) -> dict[str, Any]:
+    """What power `enters` the box of `scene` of each light, is `absorbed` there, and `leaves`.
 
-    Raises UsageError where no light enters, or where nobody follows light that is scattered.
+    By each face, as unscattered and as scattered light. `fractions` are the same of all that
+    enters; `defect_percent` is what enters and neither is absorbed nor leaves. Of one color each is
+    a number, else a list of three. Raises UsageError where no light enters, or where nobody follows
+    light that is scattered.
     """
     light_field = solve_light(scene, SolveMemory())
     medium, angles = light_field.medium, scene.diffusion.angles
@@ -113,16 +62,16 @@ def find_balance(scene: Scene) -> Balance:
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
     media = medium, keep_medium(scene.volume)
-    sources, enters, through = list[Source](), dict[str, Tensor](), list[Tensor]()
+    sources, enters, leaves = list[Source](), dict[str, Tensor](), list[Tensor]()
     for number, light in enumerate(scene.lights):
         parts = decompose_lights([light])
         crossing = reduce(torch.add, (_cross_box(part, media, angles) for part in parts))
-        enters[f"lights.{number}"] = crossing[:, 0].sum(0)
-        through.append(crossing[:, 1:])
+        enters[f"lights.{number}"] = crossing[0].sum(0)
+        leaves.append(crossing[1:])
         sources += parts
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    passing, unscattered = reduce(torch.add, through).unbind(1)
+    passing, unscattered = reduce(torch.add, leaves)
     reduced = reduced_light(medium, sources, medium.degree, has_backward_peak(medium))
     factors = remaining_moments(medium)[: medium.degree + 1]
     source = light_field.diffuse.weighted(factors).plus(reduced.source)
@@ -132,65 +81,84 @@ def find_balance(scene: Scene) -> Balance:
         scattered = scattered + _leave_turned(beam, medium.grid)
     lost = medium.absorption.value * fluence_of(light_field)
     absorbed = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
-    return Balance(enters, absorbed, unscattered, scattered)
+    entered = reduce(torch.add, enters.values())
+    left = absorbed + (unscattered + scattered).sum(0)
+
+    def in_units(unit: Tensor) -> dict[str, Any]:
+        parts = zip(FACES, unscattered / unit, scattered / unit, strict=True)
+        return {
+            "enters": {name: _plain(power / unit) for name, power in enters.items()},
+            "absorbed": _plain(absorbed / unit),
+            "leaves": {f: {"unscattered": _plain(u), "scattered": _plain(s)} for f, u, s in parts},
+        }
+
+    powers, fractions = in_units(torch.ones_like(entered)), in_units(entered)
+    return {**powers, "fractions": fractions, "defect_percent": _plain(100 * (1 - left / entered))}
+
+
+def _plain(values: Tensor) -> float | list[float]:
+    numbers: list[float] = values.tolist()
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _cross_box(part: Source, media: Sequence[Medium], angles: int) -> Tensor:
-    """The power of `part` of a light that leaves by each face, [6, 1 + media, C].
+    """The power of `part` of a light that leaves by each of `FACES`, [1 + media, 6, C].
 
-    First what would if the box were empty, then what does unscattered with each of the `media`.
+    First what would if the box were empty, then what does unscattered in each of the `media`.
     """
-    grid = media[0].grid
     if isinstance(part, AmbientLight):
-        areas = [grid.cells * math.prod(grid.spacing) / grid.extent[f.axis] for f in faces_of(grid)]
-        empty = math.pi * torch.outer(part.radiance.new_tensor(areas), part.radiance).double()
-        nothing = torch.zeros_like(media[0].extinction.value)
-        given = Moments(nothing), cell_gradient(nothing), part.radiance.view(-1, 1, 1, 1), angles
+        grid, radiance = media[0].grid, part.radiance
+        sides = [math.prod(grid.extent) / grid.extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
+        empty = math.pi * torch.outer(radiance.new_tensor(sides), radiance).double()
+        dark = Moments(torch.zeros_like(media[0].extinction.value))
+        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), angles
         found = [empty, *(empty + _sweep_out(medium, *given) for medium in media)]
-        return torch.stack(torch.broadcast_tensors(*found), 1)
-    beams: Sequence[DirectionalLight | PointLight | BeamLight]
+        return torch.stack(torch.broadcast_tensors(*found))
     if isinstance(part, Sky):
         each = zip(part.travel, part.irradiance, strict=True)
-        beams = [DirectionalLight(array_order(travel), power) for travel, power in each]
-    else:
-        beams = [part]
-    faces = faces_of(grid)
-    each_beam = (torch.stack([_cross_face(beam, media, face) for face in faces]) for beam in beams)
-    return reduce(torch.add, each_beam)
+        regions = (DirectionalLight(array_order(travel), power) for travel, power in each)
+        return reduce(torch.add, (_follow_out(region, media) for region in regions))
+    return _follow_out(part, media)
 
 
-def _cross_face(
-    light: DirectionalLight | PointLight | BeamLight, media: Sequence[Medium], face: Face
-) -> Tensor:
-    """The same of one beam by one face [1 + media, C], along rays to the middles of its cells."""
-    grid, field = media[0].grid, media[0].extinction.field
-    lines = face.centers(field)
+def _follow_out(light: Beamed, media: Sequence[Medium]) -> Tensor:
+    """The same of a beam, along rays to the middles of cells at faces."""
+    grid, field, powers = media[0].grid, media[0].extinction.field, list[Tensor]()
+    for axis, side in product(range(3), range(2)):
+        lines, size = grid.centers(field), list(grid.spacing)
+        lines[axis] = field.new_full((1, 1, 1), (grid.lower, grid.upper)[side][axis])
+        area, size[axis] = math.prod(size) / size[axis], 0.0
+        rays, irradiance = _shine_on(light, lines, size, grid)
+        outward = (rays.direction[:, axis] * (2 * side - 1)).clamp(min=0)
+        leaving, sight = [area * irradiance * outward], look_along(grid, rays, RAY_BY_RAY)
+        for medium in media:
+            dark = (), torch.zeros_like(field[:1]), medium.seen, None
+            emission = Emission(grid, medium.extinction, medium.scattering, *dark)
+            seen = march(emission, sight, RAY_BY_RAY, torch.ones_like(outward[None]))
+            leaving.append(leaving[0] * seen)
+        powers.append(torch.stack(torch.broadcast_tensors(*leaving)).sum(2, dtype=torch.float64))
+    return torch.stack(powers, 1)
+
+
+def _shine_on(
+    light: Beamed, lines: Sequence[Tensor], size: Sequence[float], grid: Grid
+) -> tuple[Rays, Tensor]:
+    """The rays of `light` that end in the middles of cells at a face, and its irradiance [C, R].
+
+    That is averaged over these cells of `size`, which lie along `lines`.
+    """
     points = torch.stack(torch.broadcast_tensors(*lines), -1).flatten(0, 2)
     if isinstance(light, PointLight):
         eye = array_order(light.position)
         distance = torch.linalg.vector_norm(points - eye, dim=1, keepdim=True)
         rays = Rays(eye.expand_as(points), (points - eye) / distance, eye)
-        irradiance = light.intensity[:, None] / distance[:, 0] ** 2
-    else:
-        travel = normalize(array_order(light.direction), dim=0).expand_as(points)
-        rays = Rays(points - 2 * math.hypot(*grid.extent) * travel, travel, None)
-        if isinstance(light, BeamLight):
-            z, y, x = (0.0 if axis == face.axis else h for axis, h in enumerate(grid.spacing))
-            beam = light.position, light.direction, seen_radius(light.radius, grid)
-            irradiance = light.power[:, None] * mean_profile(lines, (z, y, x), *beam).flatten()
-        else:
-            irradiance = light.irradiance[:, None]
-    leaving = face.area * irradiance * face.outward(rays.direction)
-    colors = max(len(leaving), *(len(medium.extinction.scale) for medium in media))
-    if not bool(leaving.any()):
-        return leaving.new_zeros(1 + len(media), colors, dtype=torch.float64)
-    powers, sight = [leaving.expand(colors, -1)], look_along(grid, rays, RAY_BY_RAY)
-    for medium in media:
-        dark = torch.zeros_like(field[:1])
-        given = medium.extinction, medium.scattering, (), dark, medium.seen, None
-        seen = march(Emission(grid, *given), sight, RAY_BY_RAY, torch.ones_like(leaving[:1]))
-        powers.append(seen * leaving)
-    return torch.stack(powers).sum(2, dtype=torch.float64)
+        return rays, light.intensity[:, None] / distance[:, 0] ** 2
+    travel = normalize(array_order(light.direction), dim=0).expand_as(points)
+    rays = Rays(points - 2 * math.hypot(*grid.extent) * travel, travel, None)
+    if isinstance(light, DirectionalLight):
+        return rays, light.irradiance[:, None]
+    beam = light.position, light.direction, seen_radius(light.radius, grid)
+    return rays, light.power[:, None] * mean_profile(lines, size, *beam).flatten()
 
 
 def _sweep_out(
@@ -210,11 +178,10 @@ def _sweep_out(
         course, left = Course.of(grid, direction), leaving.clone()
         gone = leaving.new_zeros(6, len(leaving), dtype=torch.float64)
         # What leaves a cell goes on to the next slice, or beyond it, and there beyond other faces.
-        for axis in sorted(range(3), key=lambda axis: -abs(course.moved[axis])):
-            face, part = Face(grid, axis, int(course.moved[axis] > 0)), abs(course.moved[axis])
-            beyond = part * face.layer(left)
-            face.layer(left).sub_(beyond)
-            gone[2 * axis + face.side] = beyond.sum((1, 2))
+        for axis, moved in sorted(enumerate(course.moved), key=lambda one: -abs(one[1])):
+            layer = left.select(1 + axis, -int(moved > 0))
+            gone[2 * axis + (moved > 0)] = abs(moved) * layer.sum((1, 2))
+            layer *= 1 - abs(moved)
         power = power + 4 * math.pi * weight * math.prod(grid.spacing) / course.step * gone
     return power
 
@@ -222,67 +189,33 @@ def _sweep_out(
 def _leave_turned(beam: TurnedBeam, grid: Grid) -> Tensor:
     """The power [6, C] of a beam that a backward peak has turned (E8.11).
 
-    Irradiance on a face is on the line through the two outermost cells.
+    At a face it is on the line through the two outermost cells.
     """
-    powers = []
-    for face in faces_of(grid):
-        inner = min(1, grid.shape[face.axis] - 1)
-        last = face.layer(beam.radiance)
-        before = beam.radiance.select(1 + face.axis, -1 - inner if face.side else inner)
-        on_face = (1.5 * last - 0.5 * before).clamp(min=0).sum((1, 2), dtype=torch.float64)
-        powers.append(4 * math.pi * face.area * face.outward(beam.direction) * on_face)
-    return torch.stack(powers)
-
-
-def describe(balance: Balance) -> dict[str, Any]:
-    """The balance as plain values: powers, and `fractions` of all that enters.
-
-    Of one color each is a number, else a list of three.
-    """
-
-    def plain(values: Tensor) -> float | list[float]:
-        numbers: list[float] = values.tolist()
-        return numbers[0] if len(numbers) == 1 else numbers
-
-    def in_units(unit: Tensor) -> dict[str, Any]:
-        return {
-            "entered": plain(balance.entered / unit),
-            "enters": {name: plain(power / unit) for name, power in balance.enters.items()},
-            "absorbed": plain(balance.absorbed / unit),
-            "leaves": {
-                f"{sign}{axis}": {
-                    "unscattered": plain(balance.unscattered[place] / unit),
-                    "scattered": plain(balance.scattered[place] / unit),
-                }
-                for axis, first in zip("xyz", (4, 2, 0), strict=True)
-                for sign, place in (("-", first), ("+", first + 1))
-            },
-        }
-
-    powers, fractions = in_units(torch.ones_like(balance.entered)), in_units(balance.entered)
-    return {**powers, "fractions": fractions, "defect_percent": plain(100 * balance.defect)}
+    power = beam.radiance.new_zeros(6, len(beam.radiance), dtype=torch.float64)
+    for axis, along in enumerate(beam.direction.tolist()):
+        end = -1 if along > 0 else 0
+        last, before = (beam.radiance.select(1 + axis, k) for k in (end, end + (-1 if end else 1)))
+        area = 4 * math.pi * abs(along) * math.prod(grid.spacing) / grid.spacing[axis]
+        power[2 * axis + (along > 0)] = area * (1.5 * last - 0.5 * before).clamp(min=0).sum((1, 2))
+    return power
 
 
 def lines(report: dict[str, Any]) -> list[str]:
-    """The report of `describe` as lines of text."""
+    """The balance as lines of text."""
 
-    def text(*keys: str) -> str:
-        power, part = (
-            reduce(dict.__getitem__, keys, which) for which in (report, report["fractions"])
+    def text(value: float | list[float], form: str) -> str:
+        return ", ".join(
+            format(one, form) for one in (value if isinstance(value, list) else [value])
         )
-        return f"{_listed(power, '.4g')} ({_listed(part, '.2%')})"
 
+    parts = report["fractions"]
     return [
-        *(f"enters by {name}: {text('enters', name)}" for name in report["enters"]),
-        f"absorbed: {text('absorbed')}",
+        *(f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()),
+        f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})",
         *(
-            f"leaves by {face}: unscattered {text('leaves', face, 'unscattered')}, "
-            f"scattered {text('leaves', face, 'scattered')}"
-            for face in report["leaves"]
+            f"leaves by {face}: unscattered {text(part['unscattered'], '.2%')}, "
+            f"scattered {text(part['scattered'], '.2%')}"
+            for face, part in parts["leaves"].items()
         ),
-        f"neither absorbed nor left: {_listed(report['defect_percent'], '.2g')} %",
+        f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %",
     ]
-
-
-def _listed(value: Any, form: str) -> str:
-    return ", ".join(format(one, form) for one in (value if isinstance(value, list) else [value]))

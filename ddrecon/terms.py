@@ -127,9 +127,8 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
             terms.append(f"transmittance towards {_count(count, name)}")
     for light in lights:
         if isinstance(light, BeamLight):
-            given, seen = float(light.radius), float(seen_radius(light.radius, scene.volume.grid))
-            beam = f"a beam of radius {given:.3g} u" if given > 0 else "a pencil"
-            terms.append(f"transmittance towards {beam}; in these cells its radius is {seen:.3g} u")
+            radius = float(seen_radius(light.radius, scene.volume.grid))
+            terms.append(f"transmittance towards a beam, in these cells of radius {radius:.3g} u")
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"

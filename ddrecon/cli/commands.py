@@ -70,18 +70,7 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-ALL = (
-    check,
-    render,
-    balance,
-    optimize,
-    uncertainty,
-    watch,
-    gradcheck,
-    reference,
-    bench,
-    export,
-    info,
-)
+OF_SCENES = check, render, balance, optimize, uncertainty, watch
+ALL = (*OF_SCENES, gradcheck, reference, bench, export, info)
 for command in ALL:
     main.add_command(command)

@@ -53,9 +53,9 @@ def check(session: Session, scene: Path) -> None:
 def balance(session: Session, scene: Path) -> None:
     """Print what power enters the box of SCENE, what is absorbed in it and what leaves it."""
     loaded = session.load(scene)
-    from ddrecon.balance import describe, find_balance, lines
+    from ddrecon.balance import find_balance, lines
 
-    report = describe(find_balance(loaded))
+    report = find_balance(loaded)
     session.show(report, lines(report))
 
 
@@ -91,18 +91,8 @@ def balance(session: Session, scene: Path) -> None:
     metavar="N",
     help="N views around the volume instead, and ring.png of them.",
 )
-@click.option(
-    "--fluence",
-    "has_fluence",
-    is_flag=True,
-    help="Also write volumes/fluence.npz: the fluence in each cell.",
-)
-@click.option(
-    "--export",
-    "exported",
-    type=EXPORTED,
-    help="Also write volumes/fluence.vdb and so on.",
-)
+@click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
+@click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
 @SHARE
 @DTYPE
 @REPORT
@@ -123,7 +113,7 @@ def render(
     """Render the views of SCENE, a scene file or the folder of a finished run."""
     if exported and not has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
-    kinds = dict.fromkeys(["npz", *filter(None, [exported])]) if has_fluence else {}
+    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     if lights:
         session = session.with_override(f"lights=[{', '.join(lights)}]")
     scene_file = session.read(scene)
@@ -148,8 +138,8 @@ def render(
     if parameter is not None:
         require_variation(loaded, parameter)
     with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
-        parts = components, session.progress, parameter, [*kinds]
-        report = render_to_folder(loaded, views, output, *parts)
+        choice = components, session.progress, parameter, kinds
+        report = render_to_folder(loaded, views, output, *choice)
         if not is_first():
             return
         if count is not None:

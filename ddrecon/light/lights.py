@@ -71,6 +71,8 @@ class BeamLight:
     radius: Tensor
 
 
-Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight | BeamLight
+Given = DirectionalLight | AmbientLight | PointLight | BeamLight
+"""Lights that are not decomposed into others."""
+Light = Given | EnvironmentLight
 BRIGHTNESS = ("irradiance", "radiance", "intensity", "power", "scale")
 """Their numbers that multiply the light they send."""

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ddrecon.grid import Grid, Triple, array_order
-from ddrecon.light.lights import BeamLight
+from ddrecon.grid import Grid, array_order
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.remember import remember
 
@@ -36,19 +35,19 @@ def seen_radius(radius: Tensor, grid: Grid) -> Tensor:
     return torch.linalg.vector_norm(torch.stack([radius, thinnest]), ord=NORM_ORDER)
 
 
-def profile_in(grid: Grid, light: BeamLight) -> Tensor:
-    """The irradiance in each cell of `grid` [1, z, y, x] over the power of `light` [1/u^2]."""
-    return _profile_in(grid, light.position, light.direction, light.radius)[None]
-
-
 @remember
-def _profile_in(grid: Grid, position: Tensor, direction: Tensor, radius: Tensor) -> Tensor:
-    seen = seen_radius(radius, grid)
-    return mean_profile(grid.centers(position), grid.spacing, position, direction, seen)
+def profile_in(grid: Grid, position: Tensor, direction: Tensor, radius: Tensor) -> Tensor:
+    """The irradiance of a beam in each cell over its power, [1, z, y, x] [1/u^2]."""
+    beam = position, direction, seen_radius(radius, grid)
+    return mean_profile(grid.centers(position), grid.spacing, *beam)[None]
 
 
 def mean_profile(
-    centers: Sequence[Tensor], size: Triple, position: Tensor, direction: Tensor, radius: Tensor
+    centers: Sequence[Tensor],
+    size: Sequence[float],
+    position: Tensor,
+    direction: Tensor,
+    radius: Tensor,
 ) -> Tensor:
     """The mean of E5.1 over boxes of `size` around `centers` (along z, y, x), [z, y, x]."""
     travel = normalize(array_order(direction), dim=0)

@@ -76,7 +76,8 @@ def reduced_light(
         elif isinstance(light, BeamLight):
             parallel = [DirectionalLight(light.direction, light.power)]
             found = _follow_parallel(medium, parallel, degree, has_pairs)
-            parts.append(found.across(profile_in(medium.grid, light)))
+            shape = light.position, light.direction, light.radius
+            parts.append(found.across(profile_in(medium.grid, *shape)))
     nothing = torch.zeros_like(medium.extinction.value)
     return (
         reduce(ReducedLight.plus, parts) if parts else ReducedLight((), Moments(nothing), nothing)

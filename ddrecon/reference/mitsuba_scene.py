@@ -25,14 +25,7 @@ from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.environment import rotate_directions
-from ddrecon.light.lights import (
-    AmbientLight,
-    BeamLight,
-    DirectionalLight,
-    EnvironmentLight,
-    Light,
-    PointLight,
-)
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Mixture
@@ -271,12 +264,12 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
                 "position": light.position.tolist(),
                 "intensity": _color(light.intensity),
             }
-        elif isinstance(light, BeamLight):
-            raise SceneError(f"lights.{index}: Mitsuba has no Gaussian beams; leave it out")
         elif isinstance(light, AmbientLight):
             ambient = ambient + _color(light.radiance)
-        else:
+        elif isinstance(light, EnvironmentLight):
             maps.append(light)
+        else:
+            raise SceneError(f"lights.{index}: Mitsuba has no Gaussian beams; leave it out")
     if len(maps) > 1:
         raise SceneError(
             f"the scene has {len(maps)} environment maps, and Mitsuba takes one; "
