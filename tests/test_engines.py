@@ -122,14 +122,12 @@ LIGHTS = {
     "ambient": {"directional": None, "ambient": (0.4, 0.3, 0.2)},
     "points": {"ambient": (0.3,)},
     "sky": {"directional": None},
-    "laser": {"directional": None},
 }
 KINDS = [
     ("gray", "gray beam"),
     ("colored", "beam"),
     ("colored", "sky"),
     ("cellwise", "points"),
-    ("colored", "laser"),
     ("cellwise", "ambient"),
     ("black", "points"),
 ]
@@ -172,10 +170,10 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
         scene.lights += [
             PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
             PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3])),
+            BeamLight(
+                tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
+            ),
         ]
-    if lit == "laser":
-        way = tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1])
-        scene.lights.append(BeamLight(*way, tensor([1.0, 2.0, 3.0]), tensor(0.2)))
     if lit == "sky":
         sky = random_values(3, 4, 8, seed=seed + 3, dtype=dtype)
         scene.lights.append(EnvironmentLight(sky, tensor(0.5), tensor(20.0), 6))
