@@ -57,8 +57,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     """
     light_field = solve_light(scene, SolveMemory())
     medium, angles = light_field.medium, scene.diffusion.angles
-    is_followed = multiply_scatters(medium, scene.diffusion)
-    if not is_followed and is_any_nonzero(medium.scattering.scale):
+    if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, scene.diffusion):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
     media = medium, keep_medium(scene.volume)
@@ -187,14 +186,11 @@ def _sweep_out(
 
 
 def _leave_turned(beam: TurnedBeam, grid: Grid) -> Tensor:
-    """The power [6, C] of a beam that a backward peak has turned (E8.11).
-
-    At a face it is on the line through the two outermost cells.
-    """
+    """The power [6, C] of a turned `beam` (E8.11), at faces the line through two cells."""
     power = beam.radiance.new_zeros(6, len(beam.radiance), dtype=torch.float64)
     for axis, along in enumerate(beam.direction.tolist()):
-        end = -1 if along > 0 else 0
-        last, before = (beam.radiance.select(1 + axis, k) for k in (end, end + (-1 if end else 1)))
+        layers = beam.radiance.unbind(1 + axis)[:: -1 if along > 0 else 1]
+        last, before = layers[0], layers[min(1, len(layers) - 1)]
         area = 4 * math.pi * abs(along) * math.prod(grid.spacing) / grid.spacing[axis]
         power[2 * axis + (along > 0)] = area * (1.5 * last - 0.5 * before).clamp(min=0).sum((1, 2))
     return power
@@ -204,9 +200,7 @@ def lines(report: dict[str, Any]) -> list[str]:
     """The balance as lines of text."""
 
     def text(value: float | list[float], form: str) -> str:
-        return ", ".join(
-            format(one, form) for one in (value if isinstance(value, list) else [value])
-        )
+        return ", ".join(format(one, form) for one in torch.tensor(value).view(-1).tolist())
 
     parts = report["fractions"]
     return [

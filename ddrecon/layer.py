@@ -34,10 +34,7 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
-    """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it, of a legal `scene`.
-
-    Raises UsageError where `require_legal` does.
-    """
+    """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
     require_plain_autograd()
     require_legal(scene)
     return renderer.fluence(scene, memory)

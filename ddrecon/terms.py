@@ -128,7 +128,9 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
     for light in lights:
         if isinstance(light, BeamLight):
             radius = float(seen_radius(light.radius, scene.volume.grid))
-            terms.append(f"transmittance towards a beam, in these cells of radius {radius:.3g} u")
+            terms.append(
+                f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
+            )
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"

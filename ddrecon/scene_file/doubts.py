@@ -8,7 +8,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.light.lights import BeamLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import extinction_of, with_values
@@ -36,7 +35,6 @@ def find_doubts(scene: Scene) -> list[str]:
         *_doubt_depth(volume, extinction),
         *_doubt_faces(volume, extinction, scene.diffusion.angles),
         *_doubt_cameras(scene),
-        *_doubt_beams(scene),
     ]
 
 
@@ -79,16 +77,6 @@ def _doubt_faces(volume: Volume, extinction: Tensor, angles: int) -> list[str]:
     return [
         f"volume: cells at the faces of the box are up to {whole:.3g} optical depths thick; images "
         f"may be off by a fifth and more: {advice}"
-    ]
-
-
-def _doubt_beams(scene: Scene) -> list[str]:
-    low, high = map(torch.tensor, scene.volume.grid.bounds_xyz)
-    return [
-        f"lights.{number}: its position is in the box; a beam comes from outside, along its axis"
-        for number, light in enumerate(scene.lights)
-        if isinstance(light, BeamLight)
-        and bool(((low < light.position.cpu()) & (light.position.cpu() < high)).all())
     ]
 
 

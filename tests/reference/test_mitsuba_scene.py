@@ -12,13 +12,7 @@ from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.errors import SceneError
-from ddrecon.light.lights import (
-    AmbientLight,
-    BeamLight,
-    DirectionalLight,
-    EnvironmentLight,
-    PointLight,
-)
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
@@ -106,13 +100,6 @@ def test_one_color_of_a_scene_is_that_color() -> None:
         np.testing.assert_array_equal(
             one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1)
         )
-
-
-def test_a_gaussian_beam_is_refused() -> None:
-    color = random_values(3)
-    lights = [BeamLight(color, color, color, color[0])]
-    with pytest.raises(SceneError, match=r"lights.0: .* no Gaussian beams"):
-        described(replace(make_scene(random_values(*SHAPE)), lights=lights))
 
 
 def test_ambient_light_is_part_of_an_environment_map() -> None:

@@ -43,13 +43,6 @@ def test_a_box_in_kilometers() -> None:
     assert "smaller than a pixel or two to camera front" in small
 
 
-def test_a_beam_that_is_placed_in_the_box() -> None:
-    beam = "lights=[{{type: beam, position: [0, {}, 0], direction: [0, -1, 0], power: 1}}]"
-    (line,) = doubts(beam.format(0.1))
-    assert line.startswith("lights.0: ") and "outside" in line
-    assert doubts(beam.format(0.5)) == []
-
-
 def test_thick_cells_at_the_faces() -> None:
     """They are told where a medium fills its box, scatters, and is coarse; empty layers help."""
     filled = "volume.density=1", "volume.sigma_a=1", "volume.sigma_s=89", "optimize=null"
