@@ -53,14 +53,14 @@ class Emission:
         that has one, as of a directional light where that scatters by so much more.
         """
         plain, parts = list[Beam | PointBeam](), list[Emission]()
-        nothing, scattering = torch.zeros_like(self.diffuse[:1]), self.scattering
         for beam in self.beams:
             if isinstance(beam, PointBeam) or beam.profile is None:
                 plain.append(beam)
                 continue
-            lit = replace(scattering, field=scattering.field * beam.profile)
+            lit = replace(self.scattering, field=self.scattering.field * beam.profile)
             one = replace(self, scattering=lit, beams=(replace(beam, profile=None),))
-            parts.append(replace(one, diffuse=nothing, remaining=None))
+            dark = torch.zeros_like(self.diffuse[:1])
+            parts.append(replace(one, diffuse=dark, remaining=None))
         return [replace(self, beams=tuple(plain)), *parts]
 
     @functools.cached_property
