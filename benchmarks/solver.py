@@ -54,7 +54,7 @@ def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tens
     light = DirectionalLight(
         torch.tensor([-2.0, -2.0, -1.0], device=device), torch.full((3,), 3.14, device=device)
     )
-    source = receive_light(medium, [light], 1)[0]
+    source = receive_light(medium, [light], 1).source
     outside = torch.zeros(1, 1, 1, 1, device=device)
     problem = DiffusionProblem(
         medium,

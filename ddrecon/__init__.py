@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "ddrecon.scene_file.build",
     "render": "ddrecon.layer",
+    "fluence": "ddrecon.layer",
     "VolumeRenderer": "ddrecon.layer",
     "optimize": "ddrecon.reconstruct.loop",
     "optimize_sequence": "ddrecon.film.drive",

@@ -33,6 +33,13 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     return renderer.render(scene, view, memory)
 
 
+def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
+    """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
+    require_plain_autograd()
+    require_legal(scene)
+    return renderer.fluence(scene, memory)
+
+
 class VolumeRenderer(torch.nn.Module):
     """Renders the views of `scene`, with fields of its caller in place of the scene's own.
 

@@ -7,6 +7,7 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,6 +34,7 @@ from ddrecon.light.outgoing import scatter_towards
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
+    Received,
     ambient_radiance,
     ambient_sky,
     follow_lights,
@@ -53,6 +55,7 @@ from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
+from ddrecon.slabs.exchange import gather_slabs
 from ddrecon.slabs.slab import Slab
 
 MOST_CELLS = 32
@@ -65,13 +68,16 @@ class LightField:
 
     `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `ground` is what
+    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `means` are those
+    of `diffuse` light in cells, and `received` is what cells receive of `beams`. `ground` is what
     lies below, where there is any.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
+    means: Moments
+    received: Received
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
@@ -118,7 +124,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     """
     volume, sources, settings = cut_volume(scene.volume), scene_sources(scene), scene.diffusion
     if scene.ground is None:
-        return _find_light(volume, sources, settings, memory)[0]
+        return _find_light(volume, sources, settings, memory)
     if isinstance(volume.grid, Slab):
         raise UsageError(
             "ground: there is none where processes share out cells; leave --share cells out"
@@ -135,12 +141,11 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return light_from_below(cells, plane, even - ambient, texels)
 
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
-    first, source = _find_light(
-        coarse, sources, settings, replace(memory, last={}), from_below(lit)
-    )
-    lit = light_texels(lit, sources, medium, _glow(first, source, plane), render_settings)
+    first = _find_light(coarse, sources, settings, replace(memory, last={}), from_below(lit))
+    glow = _glow(first, plane, multiply_scatters(medium, settings))
+    lit = light_texels(lit, sources, medium, glow, render_settings)
     below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
-    return replace(_find_light(volume, sources, settings, memory, below)[0], ground=lit)
+    return replace(_find_light(volume, sources, settings, memory, below), ground=lit)
 
 
 def exchange_grid(grid: Grid) -> Grid:
@@ -166,29 +171,30 @@ def _find_light(
     settings: DiffusionSettings,
     memory: SolveMemory,
     below: Moments | None = None,
-) -> tuple[LightField, Moments | None]:
-    """The light of `lights` in `volume`, and of what comes from `below`.
-
-    Also the source of its beams where light scatters more than once.
-    """
+) -> LightField:
+    """The light of `lights` in `volume`, and of what comes from `below`."""
     medium = _medium_of(volume, settings)
     if not multiply_scatters(medium, settings):
-        return follow_unscattered_light(medium, lights, below), None
+        return follow_unscattered_light(medium, lights, below)
     cells = average_cells(medium)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
-    beams, turned = receive_light(cells, lights, cells.degree)
+    received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     if below is not None:
         sky = below if sky is None else sky.plus(below)
-    source = beams
+    source = received.source
     if sky is not None:
         source = source.plus(sky.weighted(remaining_moments(cells)))
     outside = ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(cells, source, outside, settings, memory)
+    # Views see values at centers.
+    seen = sharpen(cells, diffuse) if settings.rounds else diffuse
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
-    light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, follow_lights(medium, lights), light, turned=turned), beams
+    seen, means = (one if sky is None else one.plus(sky) for one in (seen, diffuse))
+    return LightField(
+        medium, follow_lights(medium, lights), seen, means, received, turned=received.turned
+    )
 
 
 def follow_unscattered_light(
@@ -198,27 +204,46 @@ def follow_unscattered_light(
 
     Beams, and by quadrature over directions ambient light, skies and what comes from `below`.
     """
-    beams = follow_lights(medium, lights)
+    beams, received = follow_lights(medium, lights), receive_light(average_cells(medium), lights, 0)
     skies = tuple(light for light in lights if isinstance(light, Sky))
     if any(isinstance(light, AmbientLight) for light in lights):
         skies = (*skies, ambient_sky(ambient_radiance(lights, medium.g)))
     light = Moments(torch.zeros_like(medium.extinction.value)) if below is None else below
     if medium.is_anisotropic:
-        return LightField(medium, beams, light, skies)
+        return LightField(medium, beams, light, light, received, skies)
     sky = sum_unscattered_sky(medium, skies, 0)
-    return LightField(medium, beams, light if sky is None else light.plus(sky))
+    light = light if sky is None else light.plus(sky)
+    return LightField(medium, beams, light, light, received)
+
+
+def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
+    """The fluence [C, z, y, x] of all light inside the volume of `scene`: E5.6.
+
+    Differentiable as `render`, and `memory` as there.
+    """
+    return fluence_of(solve_light(scene, memory or SolveMemory()))
+
+
+def fluence_of(light_field: LightField) -> Tensor:
+    """The fluence [C, z, y, x] >= 0, averaged over each cell: of the whole grid, also in slabs."""
+    medium = light_field.medium
+    mean = light_field.means.mean + light_field.received.mean
+    sky = sum_unscattered_sky(medium, light_field.skies, 0)
+    mean = mean if sky is None else mean + sky.mean
+    return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
 
 
 def _glow(
-    light_field: LightField, source: Moments | None, plane: Plane
+    light_field: LightField, plane: Plane, has_source: bool
 ) -> Callable[[Rays, int], Emission]:
     """What the medium sends down to a ground, along rays into one of the directions `upwards`.
 
-    Its beams count by their `source` where there is one: that leaves out their forward peak, which
-    the ground receives as direct light.
+    Its beams count by what cells receive of them where it `has_source`: that leaves out their
+    forward peak, which the ground receives as direct light.
     """
-    if source is None:
+    if not has_source:
         return lambda rays, _: _emission(light_field, rays)
+    source = light_field.received.source
     medium, others = light_field.medium, replace(light_field, beams=())
     values = harmonics(-upwards(plane)[0], medium.degree).T.to(source.mean)
     scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
@@ -267,9 +292,7 @@ def solve_diffuse(
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    if settings.rounds == 0:
-        return light
-    return sharpen(medium, run_rounds(problem, light, solve, settings.rounds, settings.angles))
+    return run_rounds(problem, light, solve, settings.rounds, settings.angles)
 
 
 def view_picture(

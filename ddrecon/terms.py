@@ -10,7 +10,15 @@ from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+)
+from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
@@ -31,7 +39,7 @@ def needed_terms(scene: Scene) -> list[str]:
     return [
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
-        *_light_terms(scene.lights, is_diffuse),
+        *_light_terms(scene, is_diffuse),
         *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
@@ -110,17 +118,23 @@ def _has_pairs(medium: Medium, scene: Scene) -> bool:
 def _has_beams(lights: Sequence[Light]) -> bool:
     """Whether a light is directional, or has suns that are."""
     return any(
-        isinstance(light, DirectionalLight)
+        isinstance(light, DirectionalLight | BeamLight)
         or (isinstance(light, EnvironmentLight) and count_suns(light)[0] > 0)
         for light in lights
     )
 
 
-def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
-    terms = []
+def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
+    lights, terms = scene.lights, list[str]()
     for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
         if count := sum(isinstance(light, kind) for light in lights):
             terms.append(f"transmittance towards {_count(count, name)}")
+    for light in lights:
+        if isinstance(light, BeamLight):
+            radius = float(seen_radius(light.radius, scene.volume.grid))
+            terms.append(
+                f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
+            )
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"

@@ -212,6 +212,20 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "lights: {type: beam}",
+        schema.BeamSection,
+        "A collimated Gaussian beam, such as a laser's, that comes from outside the box.",
+        {
+            "position": "A point on its axis [u]; where on it does not matter.",
+            "direction": "The direction in which it travels, of any length.",
+            "power": "Of the whole beam.",
+            "radius": (
+                "Where irradiance is 1/e^2 of that on the axis [u]. 0 is a pencil: its radius is "
+                "half the longest side of a cell, and no beam is thinner."
+            ),
+        },
+    ),
+    (
         "views",
         schema.ViewSection,
         "A list of pictures, or of cameras to render.\n"

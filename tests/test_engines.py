@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
@@ -170,6 +170,9 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
         scene.lights += [
             PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
             PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3])),
+            BeamLight(
+                tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
+            ),
         ]
     if lit == "sky":
         sky = random_values(3, 4, 8, seed=seed + 3, dtype=dtype)

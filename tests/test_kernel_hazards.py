@@ -141,7 +141,7 @@ def test_light_through_what_is_no_number_is_none(engine: str):
     scene = every_light()
     scene.volume.density[1, 2, 3] = torch.nan
     medium, lights = scale_medium(scene.volume), decompose_lights(scene.lights)
-    source, _ = receive_light(medium, lights, degree=1)
+    source = receive_light(medium, lights, degree=1).source
     sky = sum_unscattered_sky(medium, lights, degree=1)
     assert sky is not None and source.flux is not None
     assert bool(sky.mean.isnan()[:, 1, 2, 3].all())

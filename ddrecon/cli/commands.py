@@ -10,7 +10,7 @@ import click
 
 from ddrecon import __version__
 from ddrecon.cli.file_commands import export, info
-from ddrecon.cli.scene_commands import check, optimize, render, uncertainty, watch
+from ddrecon.cli.scene_commands import balance, check, optimize, render, uncertainty, watch
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
@@ -70,6 +70,7 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-ALL = check, render, optimize, uncertainty, watch, gradcheck, reference, bench, export, info
+OF_SCENES = check, render, balance, optimize, uncertainty, watch
+ALL = (*OF_SCENES, gradcheck, reference, bench, export, info)
 for command in ALL:
     main.add_command(command)

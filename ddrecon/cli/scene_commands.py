@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from ddrecon.cli.session import Session
 
 
+EXPORTED = click.Choice(["vdb", "vti", "npz"])
+
+
 @click.command()
 @SCENE
 @DTYPE
@@ -39,6 +42,20 @@ def check(session: Session, scene: Path) -> None:
     first = next(scenes)
     supports = supports_of(chain([first], scenes))
     report = describe(first, expert, supports, session.share == "cells")
+    session.show(report, lines(report))
+
+
+@click.command()
+@SCENE
+@DTYPE
+@REPORT
+@in_session
+def balance(session: Session, scene: Path) -> None:
+    """Print what power enters the box of SCENE, what is absorbed in it and what leaves it."""
+    loaded = session.load(scene)
+    from ddrecon.balance import find_balance, lines
+
+    report = find_balance(loaded)
     session.show(report, lines(report))
 
 
@@ -74,6 +91,8 @@ def check(session: Session, scene: Path) -> None:
     metavar="N",
     help="N views around the volume instead, and ring.png of them.",
 )
+@click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
+@click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
 @SHARE
 @DTYPE
 @REPORT
@@ -88,8 +107,13 @@ def render(
     parameter: str | None,
     lights: tuple[str, ...],
     count: int | None,
+    has_fluence: bool,
+    exported: str | None,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
+    if exported and not has_fluence:
+        raise click.UsageError("--export is for the fluence: say --fluence as well")
+    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     if lights:
         session = session.with_override(f"lights=[{', '.join(lights)}]")
     scene_file = session.read(scene)
@@ -114,7 +138,8 @@ def render(
     if parameter is not None:
         require_variation(loaded, parameter)
     with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
-        report = render_to_folder(loaded, views, output, components, session.progress, parameter)
+        choice = components, session.progress, parameter, kinds
+        report = render_to_folder(loaded, views, output, *choice)
         if not is_first():
             return
         if count is not None:
@@ -150,7 +175,7 @@ def render(
 @click.option(
     "--export",
     "exported",
-    type=click.Choice(["vdb", "vti", "npz"]),
+    type=EXPORTED,
     help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
 )
 @SHARE

@@ -54,7 +54,7 @@ def _plain_average(field: Tensor) -> Tensor:
 
 
 def sharpen(cells: Medium, light: Moments) -> Moments:
-    """The values at centers of light whose means in `cells` are `light` (E2.11).
+    """The values at centers of light whose means in `cells` are `light` (E2.12).
 
     Of the mean L0 and the flux an eighth of the second differences along each axis is taken off,
     and ever less where cells have more than `THIN` optical depths: there light bends within them.

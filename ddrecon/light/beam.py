@@ -34,11 +34,13 @@ class Beam:
 
     `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
     `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside.
+    With a `profile` [1, z, y, x] irradiance is that many times as much in each cell.
     """
 
     mass: Tensor
     direction: Tensor
     irradiance: Tensor
+    profile: Tensor | None = None
 
     def scatter(
         self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None

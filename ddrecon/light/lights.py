@@ -56,6 +56,28 @@ class PointLight:
     intensity: Tensor
 
 
-Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight
-BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
+@dataclass(eq=False)
+class BeamLight:
+    """A collimated Gaussian beam that comes from outside the box.
+
+    `position` [3]: a point on its axis [u]; `direction` [3]: the way it travels, of any length > 0;
+    `power` [C] of the whole beam; `radius` >= 0 [u]: scalar, where irradiance is 1/e^2 of that on
+    the axis; 0 is a pencil, as thin as cells allow (`ddrecon.light.profile`).
+    """
+
+    position: Tensor
+    direction: Tensor
+    power: Tensor
+    radius: Tensor
+
+    @property
+    def unconfined(self) -> DirectionalLight:
+        """Light of an irradiance equal to its power, everywhere."""
+        return DirectionalLight(self.direction, self.power)
+
+
+Given = DirectionalLight | AmbientLight | PointLight | BeamLight
+"""Lights that are not decomposed into others."""
+Light = Given | EnvironmentLight
+BRIGHTNESS = ("irradiance", "radiance", "intensity", "power", "scale")
 """Their numbers that multiply the light they send."""

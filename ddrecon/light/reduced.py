@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
 from torch import Tensor
 
 from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams, receive_beams
-from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
+from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
+from ddrecon.light.profile import profile_in
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
@@ -26,39 +28,76 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
 
 
-def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
-    """The beams of directional and point `lights` in `medium`."""
-    directional = [light for light in lights if isinstance(light, DirectionalLight)]
-    beams = follow_beams(medium, directional) if directional else []
-    points = (light for light in lights if isinstance(light, PointLight))
-    return (*beams, *(follow_point_light(medium, light) for light in points))
+@dataclass(frozen=True)
+class Received:
+    """What each cell receives of beams, light that is not yet scattered, averaged over the cell.
 
-
-def receive_light(
-    cells: Medium, lights: Sequence[Source], degree: int
-) -> tuple[Moments, tuple[TurnedBeam, ...]]:
-    """What each of `cells` receives unscattered of directional and point `lights`, as its mean.
-
-    Of lights that go along w it is the sum of p_l Y_k(w) E tau / (4 pi), p_l being the moments of
-    the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What backward
-    peaks turn back belongs to the beams of directional lights, and is the second (E8.11).
+    `source`: Q0, Q1 and what follows, to the degree that was wanted. `mean` [C, z, y, x]: that of
+    the light itself over directions, what peaks have turned among it. `turned`: light that backward
+    peaks have turned back and forth (E8.11).
     """
-    sources: list[Moments] = []
-    turned: list[TurnedBeam] = []
-    directional = [light for light in lights if isinstance(light, DirectionalLight)]
-    if directional and has_backward_peak(cells):
-        for parallel in directional:
-            pair = follow_pair(cells, parallel)
-            sources.append(pair.source(cells))
-            turned += pair.turned
-    elif directional:
-        sources.append(receive_beams(cells, directional, degree))
+
+    source: Moments
+    mean: Tensor
+    turned: tuple[TurnedBeam, ...] = ()
+
+    def plus(self, other: Received) -> Received:
+        """The light of both."""
+        source, turned = self.source.plus(other.source), self.turned + other.turned
+        return Received(source, self.mean + other.mean, turned)
+
+    def across(self, profile: Tensor) -> Received:
+        """This light of directional lights, its irradiance times `profile` [1, z, y, x]."""
+        turned = (replace(one, radiance=profile * one.radiance) for one in self.turned)
+        source = self.source.scaled(profile, profile, profile)
+        return Received(source, profile * self.mean, tuple(turned))
+
+
+def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
+    """The beams of directional, point and beam `lights` in `medium`."""
+    parallel = [light for light in lights if isinstance(light, DirectionalLight)]
+    beams: list[Beam | PointBeam] = [*follow_beams(medium, parallel)] if parallel else []
+    for light in lights:
+        if isinstance(light, PointLight):
+            beams.append(follow_point_light(medium, light))
+        elif isinstance(light, BeamLight):
+            (beam,) = follow_beams(medium, [light.unconfined])
+            beams.append(replace(beam, profile=_profile(medium, light)))
+    return tuple(beams)
+
+
+def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Received:
+    """What `cells` receive of directional, point and beam `lights`.
+
+    Of lights that go along w the source is the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
+    moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What
+    backward peaks turn back belongs to the beams of parallel light (E8.11).
+    """
+    parts = list[Received]()
+    if parallel := [light for light in lights if isinstance(light, DirectionalLight)]:
+        parts.append(_receive_parallel(cells, parallel, degree))
     for light in lights:
         if isinstance(light, PointLight):
             received = receive_point_light(cells, light, degree)
-            sources.append(received.weighted(remaining_moments(cells)))
-    nothing = Moments(torch.zeros_like(cells.extinction.value))
-    return reduce(Moments.plus, sources) if sources else nothing, tuple(turned)
+            parts.append(Received(received.weighted(remaining_moments(cells)), received.mean))
+        elif isinstance(light, BeamLight):
+            found = _receive_parallel(cells, [light.unconfined], degree)
+            parts.append(found.across(_profile(cells, light)))
+    nothing = torch.zeros_like(cells.extinction.value)
+    return reduce(Received.plus, parts) if parts else Received(Moments(nothing), nothing)
+
+
+def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Received:
+    if not has_backward_peak(cells):
+        source = receive_beams(cells, lights, degree)
+        return Received(source, source.mean)
+    pairs = [follow_pair(cells, light) for light in lights]
+    parts = (Received(one.source(cells), one.along + one.against, one.turned) for one in pairs)
+    return reduce(Received.plus, parts)
+
+
+def _profile(medium: Medium, light: BeamLight) -> Tensor:
+    return profile_in(medium.grid, light.position, light.direction, light.radius)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
@@ -46,6 +47,21 @@ class Emission:
             *(beam.irradiance.shape[0] for beam in self.beams),
             1,
         )
+
+    def parts(self) -> list[Emission]:
+        """Emissions without profiles, which sum to this: of all beams that have none, and of each
+        that has one, as of a directional light where that scatters by so much more.
+        """
+        plain, parts = list[Beam | PointBeam](), list[Emission]()
+        for beam in self.beams:
+            if isinstance(beam, PointBeam) or beam.profile is None:
+                plain.append(beam)
+                continue
+            lit = replace(self.scattering, field=self.scattering.field * beam.profile)
+            one = replace(self, scattering=lit, beams=(replace(beam, profile=None),))
+            dark = torch.zeros_like(self.diffuse[:1])
+            parts.append(replace(one, diffuse=dark, remaining=None))
+        return [replace(self, beams=tuple(plain)), *parts]
 
     @functools.cached_property
     def fields(self) -> dict[str, Tensor]:

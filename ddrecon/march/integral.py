@@ -47,6 +47,17 @@ def march(
     order. A pixel that this might change by more than `settings.tolerance` of the image's root
     mean square keeps its own ray.
     """
+    first, *others = emission.parts()
+    radiance = _march_part(first, sight, settings, behind)
+    for part in others:
+        radiance = radiance + _march_part(part, sight, settings, None)
+    return radiance
+
+
+def _march_part(
+    emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None
+) -> Tensor:
+    """As `march`, of an `emission` whose beams have no profile."""
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing if behind is None else nothing + behind

@@ -265,7 +265,7 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
 
     Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels
     of an environment map.
-    Raises SceneError for more than one environment map.
+    Raises SceneError for more than one environment map, and for beams.
     """
     emitters: dict[str, dict[str, Any]] = {}
     ambient, maps = np.zeros(3), list[EnvironmentLight]()
@@ -284,8 +284,10 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
             }
         elif isinstance(light, AmbientLight):
             ambient = ambient + _color(light.radiance)
-        else:
+        elif isinstance(light, EnvironmentLight):
             maps.append(light)
+        else:
+            raise SceneError(f"lights.{index}: Mitsuba has no Gaussian beams; leave it out")
     if len(maps) > 1:
         raise SceneError(
             f"the scene has {len(maps)} environment maps, and Mitsuba takes one; "

@@ -19,8 +19,9 @@ from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_over_ranks
-from ddrecon.renderer import LightField, solve_light, view_components, view_picture
+from ddrecon.renderer import LightField, fluence_of, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
+from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
@@ -39,17 +40,19 @@ def render_to_folder(
     has_components: bool,
     progress: Progress,
     parameter: str | None = None,
+    kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The report of rendering `views` of `scene`, with their components if wanted, to `folder`.
 
     With a `parameter`, which `require_variation` must allow, also the images' derivatives by it.
-    The first rank alone writes.
+    The fluence is written in files of these `kinds`. The first rank alone writes.
     """
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
     with torch.no_grad(), varied(scene, parameter) as world:
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
+        fluence_files = _write_fluence(light_field, scene, folder, kinds) if kinds else []
         names = ["", *(PARTS if has_components else ())]
         if parameter is not None:
             names = [kind + name for name in names for kind in ("", GRADIENT)]
@@ -79,9 +82,25 @@ def render_to_folder(
         "preview": PREVIEW,
         "psnr": quality,
     }
+    if fluence_files:
+        report["fluence"] = fluence_files
     if parameter is not None:
         report["gradient"] = {"parameter": parameter, "full_scale": scales}
     return report
+
+
+def _write_fluence(
+    light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
+) -> list[str]:
+    """The names of files of these `kinds` in `folder`, which the first rank writes."""
+    found = forward_ad.unpack_dual(fluence_of(light_field)).primal
+    stem = folder / "volumes" / "fluence"
+    if not is_first():
+        return []
+    stem.parent.mkdir(exist_ok=True)
+    grid = scene.volume.grid
+    names = [write_values(stem, stem.name, found, grid, kind=kind) for kind in kinds]
+    return [f"{stem.parent.name}/{name}" for name in names]
 
 
 def write_ring(views: list[View], folder: Path) -> dict[str, Any]:
@@ -126,6 +145,8 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
     if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
         lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
+    if "fluence" in report:
+        lines.append(f"fluence: {', '.join(report['fluence'])}")
     if "ring" in report:
         files, white = ", ".join(report["ring"]["files"]), report["ring"]["white"]
         lines.append(f"around: {files} (radiance {white:.3g} is white)")

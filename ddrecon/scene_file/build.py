@@ -18,7 +18,14 @@ from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+)
 from ddrecon.march.samplers import choose_steps, greatest_depth
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
@@ -33,6 +40,7 @@ from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
 from ddrecon.scene_file.schema import (
     AmbientSection,
+    BeamSection,
     Color,
     DirectionalSection,
     LightSection,
@@ -158,6 +166,9 @@ def _build_light(
         return AmbientLight(color("radiance"))
     if isinstance(section, PointSection):
         return PointLight(tensor(section.position), color("intensity"))
+    if isinstance(section, BeamSection):
+        position, direction = tensor(section.position), tensor(section.direction)
+        return BeamLight(position, direction, color("power"), tensor(section.radius))
     pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
     is_gray = bool((pixels == pixels[..., :1]).all())
     if is_gray and not scene_file.tree.may_change(f"lights.{index}.radiance"):

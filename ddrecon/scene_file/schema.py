@@ -231,7 +231,23 @@ class PointSection:
     intensity: Color = bounded(minimum=0)
 
 
-LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
+@dataclass(frozen=True)
+class BeamSection:
+    """A collimated Gaussian beam from outside the box, or a pencil; `position` is on its axis."""
+
+    type: ClassVar[str] = "beam"
+
+    position: Triple
+    direction: Triple
+    power: Color = bounded(minimum=0)
+    radius: float = bounded(0.0, minimum=0)
+
+    def violations(self) -> Iterator[Violation]:
+        if not any(self.direction):
+            yield "direction", "must not be zero"
+
+
+LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection | BeamSection
 
 
 @dataclass(frozen=True, kw_only=True)

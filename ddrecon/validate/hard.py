@@ -300,7 +300,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     problem = DiffusionProblem(
         medium,
         Closure(settings.closure, grid, settings.floor),
-        receive_light(medium, lights, medium.degree)[0],
+        receive_light(medium, lights, medium.degree).source,
         ambient_radiance(lights, solution),
         medium.degree > 0,
     )

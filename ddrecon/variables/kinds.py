@@ -61,7 +61,7 @@ def cross_section_rate(scene: Scene, name: str, start: Tensor) -> float:
 
 def brightness_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the mean, which counts as at least `RELATIVE_STEP`, seen from the box's side."""
-    unit = _side(scene) ** 2 if name.endswith(".intensity") else 1.0
+    unit = _side(scene) ** 2 if name.endswith((".intensity", ".power")) else 1.0
     return RELATIVE_STEP * max(float(start.mean()), RELATIVE_STEP * unit)
 
 
@@ -172,6 +172,7 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
+    "lights.N.power": _BRIGHTNESS,
     "lights.N.scale": Kind(brightness_rate, low=0, release=0.3),
     # in degrees
     "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
@@ -188,6 +189,11 @@ KINDS: Mapping[str, Kind] = {
         difference_steps=SHORT_STEPS,
     ),
     "ground.albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True),
+    "lights.N.radius": Kind(
+        lambda scene, name, start: RELATIVE_STEP * _side(scene),
+        low=0,
+        difference_steps=SHORT_STEPS,
+    ),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
         pose_rate,

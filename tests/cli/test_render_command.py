@@ -12,7 +12,9 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
+import ddrecon
 from ddrecon.io.images.table import read_image
+from ddrecon.io.volumes.table import read_field
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
@@ -86,6 +88,31 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert Path("out/front.npy").is_file() and Path("out/front.png").is_file()
     (line,) = [line for line in result.stdout.splitlines() if "OpenImageIO" in line]
     assert "no .exr" in line and "pip install" in line
+
+
+@pytest.mark.parametrize("kind", ["npz", "vti", "vdb"])
+def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
+    said = succeed(*RENDER, "--fluence", "--export", kind).stdout
+    assert f"volumes/fluence.{kind}" in said and Path(f"out/volumes/fluence.{kind}").is_file()
+    field = read_field(Path("out/volumes/fluence.npz"), "fluence")
+    expected = ddrecon.fluence(ddrecon.load_scene("scene.yaml")).permute(1, 2, 3, 0)
+    np.testing.assert_allclose(field.values, expected.numpy(), rtol=1e-4)
+    assert field.values.shape == (4, 5, 6, 3)
+    assert field.bounds is not None and field.bounds.tolist() == [[-0.5] * 3, [0.5] * 3]
+    succeed(*RENDER, "--overwrite", "--fluence", "-D", "volume.sigma_s=5", "-D", "optimize=")
+    assert read_field(Path("out/volumes/fluence.npz"), "fluence").values.shape == (4, 5, 6)
+
+
+def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
+    record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
+    assert set(record["enters"]) == {"lights.0", "lights.1"}
+    assert set(record["leaves"]) == {sign + axis for sign in "-+" for axis in "xyz"}
+    entered = np.array([*record["enters"].values()]).sum(0)
+    assert np.allclose(record["fractions"]["absorbed"], record["absorbed"] / entered)
+    left = sum(np.array(part) for face in record["leaves"].values() for part in face.values())
+    defect = 100 * (1 - (np.array(record["absorbed"]) + left) / entered)
+    assert np.allclose(defect, record["defect_percent"])
+    assert "neither absorbed nor left" in succeed("balance", "scene.yaml").stdout
 
 
 def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:

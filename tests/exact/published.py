@@ -14,7 +14,8 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -25,8 +26,10 @@ import torch
 from numpy.polynomial.legendre import leggauss, legval
 from numpy.typing import NDArray
 
+from ddrecon.balance import find_balance
 from ddrecon.io.volumes.table import write_field
 from ddrecon.renderer import render
+from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 
 Array = NDArray[np.float64]
@@ -91,19 +94,13 @@ class Layer:
                 return weight * one**degrees + (1 - weight) * other**degrees
         return np.asarray(self.phase["g"] ** degrees, float)
 
-    def seen(self, overrides: Sequence[str] = ()) -> Seen:
-        """What ddrecon makes of it."""
+    @property
+    def volume(self) -> dict[str, Any]:
+        """The volume of its scene."""
         depth, layers = self.shown_depth, round(self.shown_depth / self.cell)
         columns = max(round(self.across / self.cell), 1)
         half = self.across / 2 or 5e5 * depth
-        sides = [(1, 0.0, "R", "up"), (-1, -depth, "T", "down")]
-        sides = sides[: 1 if self.depth == math.inf else 2]
-        cameras = [
-            _camera([0.0, math.sqrt(1 - cosine**2), side * cosine], [0.0, 0.0, height], 1e-3, 1)
-            for side, height, *_ in sides
-            for cosine in (*FLUX_NODES.tolist(), *VIEWS.tolist())
-        ]
-        volume = {
+        return {
             "bounds": {"min": [-half, -half, -depth], "max": [half, half, 0.0]},
             "resolution": [columns, columns, layers],
             "density": 1.0,
@@ -111,7 +108,26 @@ class Layer:
             "albedo": self.albedo,
             "phase": self.phase,
         }
-        radiance = show(_scene(volume, self.sun, cameras), overrides) / self.sun
+
+    def balance(self) -> Seen:
+        """Its reflectance `R` and transmittance `T` by the energy balance, and `A`, the rest."""
+        camera = _camera([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], 1e-3, 1)
+        with loaded(_scene(self.volume, self.sun, [camera])) as scene:
+            parts = find_balance(scene)["fractions"]
+        by_face = {face: sum(part.values()) for face, part in parts["leaves"].items()}
+        return {"R": by_face["+z"], "T": by_face["-z"], "A": parts["absorbed"]}
+
+    def seen(self, overrides: Sequence[str] = ()) -> Seen:
+        """What ddrecon makes of it."""
+        depth = self.shown_depth
+        sides = [(1, 0.0, "R", "up"), (-1, -depth, "T", "down")]
+        sides = sides[: 1 if self.depth == math.inf else 2]
+        cameras = [
+            _camera([0.0, math.sqrt(1 - cosine**2), side * cosine], [0.0, 0.0, height], 1e-3, 1)
+            for side, height, *_ in sides
+            for cosine in (*FLUX_NODES.tolist(), *VIEWS.tolist())
+        ]
+        radiance = show(_scene(self.volume, self.sun, cameras), overrides) / self.sun
         found: Seen = {}
         for (_, height, flux, views), part in zip(
             sides, np.split(radiance, len(sides)), strict=True
@@ -191,10 +207,17 @@ def _scene(volume: dict[str, Any], sun: float, cameras: list[dict[str, Any]]) ->
 
 def show(scene: dict[str, Any], overrides: Sequence[str] = ()) -> Array:
     """Gray images [views, h, w] of a scene file."""
-    with tempfile.TemporaryDirectory() as name, torch.no_grad():
+    with loaded(scene, overrides) as world, torch.no_grad():
+        return render(world).mean(1).double().numpy()
+
+
+@contextmanager
+def loaded(scene: dict[str, Any], overrides: Sequence[str] = ()) -> Iterator[Scene]:
+    """A scene file as tensors."""
+    with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "scene.yaml"
         path.write_text(json.dumps(scene))
-        return render(load_scene(path, overrides=overrides)).mean(1).double().numpy()
+        yield load_scene(path, overrides=overrides)
 
 
 @cache

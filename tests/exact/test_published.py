@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,24 @@ def test_ordinates_are_van_de_hulsts_and_ambartsumians():
 @pytest.mark.parametrize("albedo", [0.5, 0.9, 0.99, 0.999])
 def test_half_spaces_are_ambartsumians(albedo: float, sun: float):
     assert_within(HALF_SPACE, Layer(albedo, sun=sun).seen(), h_reflection(albedo, sun))
+
+
+@pytest.mark.parametrize(
+    ("layer", "truth"),
+    [
+        (replace(SLAB, across=0.0), VAN_DE_HULST),
+        *((Layer(albedo), h_reflection(albedo, 1.0)) for albedo in (0.5, 0.9, 0.99)),
+        (Layer(0.9, sun=0.5), h_reflection(0.9, 0.5)),
+    ],
+    ids=["slab", "albedo 0.5", "0.9", "0.99", "slanted"],
+)
+def test_balances_are_those_of_slabs_and_half_spaces(layer: Layer, truth: dict[str, Any]) -> None:
+    """Within 1 %, or 0.2 % of what enters."""
+    found = layer.balance()
+    for key in truth.keys() & {"R", "T"}:
+        assert found[key] == pytest.approx(float(truth[key]), rel=0.01, abs=2e-3)
+    if "T" in truth:
+        assert found["A"] == pytest.approx(float(1 - truth["R"] - truth["T"]), rel=0.01)
 
 
 @pytest.mark.slow

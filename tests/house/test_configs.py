@@ -24,14 +24,17 @@ ROOT = Path(__file__).parents[2]
 CONFIGS = [
     config
     for config in sorted((ROOT / "configs").glob("*.yaml"))
-    if config.stem not in ("gradcheck_all", "ground")
+    if config.stem not in ("gradcheck_all", "ground", "phantom")
 ]
 """Those with images to reconstruct from; the derivatives of the first other are checked in
 tests/validate.
 """
 
 
-KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
+KINDS = [
+    *sorted((ROOT / "configs" / "kinds").glob("*.yaml")),
+    *(ROOT / "configs" / f"{name}.yaml" for name in ("ground", "phantom")),
+]
 
 
 def small(config: Path) -> Scene:

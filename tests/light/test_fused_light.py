@@ -120,7 +120,7 @@ def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int)
     use_engine(engine)
     changed = with_values(scene, values)
     medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
-    source, _ = receive_light(medium, lights, degree)
+    source = receive_light(medium, lights, degree).source
     sky = sum_unscattered_sky(medium, lights, degree)
     assert sky is not None
 

@@ -14,7 +14,14 @@ from media import half_empty, make_camera, make_scene
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    Light,
+    PointLight,
+)
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 
@@ -38,6 +45,9 @@ LIGHTS: dict[str, Light] = {
     "sky with a sun": environment(has_sun=True),
     "point outside": PointLight(tensor(0.3, 1.7, 1.1), tensor(3.0, 2.0, 1.0)),
     "point inside": PointLight(tensor(0.11, 0.13, 0.17), tensor(1.0)),
+    "beam": BeamLight(
+        tensor(0.1, 1.0, 0.05), tensor(-0.2, -1.0, -0.1), tensor(1.0, 2.0, 3.0), tensor(0.2)[0]
+    ),
 }
 NUMBERS = [
     (light, field.name)

@@ -38,7 +38,7 @@ def unscattered_ambient(medium: Medium, radiance: Tensor) -> Moments:
 
 
 def received(grid: Grid, density: Tensor, lights: list, **medium) -> Moments:
-    return receive_light(medium_in(grid, density, **medium), lights, degree=1)[0]
+    return receive_light(medium_in(grid, density, **medium), lights, degree=1).source
 
 
 @pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])

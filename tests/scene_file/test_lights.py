@@ -11,7 +11,7 @@ import torch
 from example_scene import changed
 
 from ddrecon.errors import DataWarning
-from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
@@ -33,9 +33,10 @@ def test_lights_are_built_and_written_back(
     sky = {"type": "environment", "file": "sky.npy"}
     point = {"type": "point", "position": [0, 2, -1]}
     lights = [sky, sky | TURNED, point | {"intensity": 5}, point | {"intensity": [1, 2, 3]}]
+    lights.append(point | {"type": "beam", "direction": [0, -1, 0], "power": [1, 2, 3]})
     scene_file = read_scene(write(changed(lights=lights)))
     with pytest.warns(DataWarning, match="2 pixels with negative radiance are taken as 0"):
-        plain, turned, gray, colored = build_scene(scene_file, dtype=torch.float64).lights
+        plain, turned, gray, colored, pencil = build_scene(scene_file, dtype=torch.float64).lights
     assert isinstance(plain, EnvironmentLight) and isinstance(turned, EnvironmentLight)
     assert torch.equal(plain.radiance, torch.from_numpy(pixels.clip(0)).double().permute(2, 0, 1))
     numbers = turned.scale.item(), turned.rotation.item(), turned.directions, turned.up
@@ -44,5 +45,7 @@ def test_lights_are_built_and_written_back(
     assert isinstance(gray, PointLight) and isinstance(colored, PointLight)
     assert gray.position.tolist() == [0, 2, -1] and gray.intensity.tolist() == [5]
     assert colored.intensity.tolist() == [1, 2, 3]
+    assert isinstance(pencil, BeamLight) and pencil.radius == 0
+    assert pencil.power.tolist() == [1, 2, 3] and pencil.direction.tolist() == [0, -1, 0]
     dump_scene(describe(scene_file), tmp_path / "again.yaml")
     assert read_scene(tmp_path / "again.yaml").tree.lights == scene_file.tree.lights

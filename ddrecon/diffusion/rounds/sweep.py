@@ -47,7 +47,7 @@ def sweep(
     outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
-    directions, weights, values = _rule(degree, count)
+    directions, weights, values = sweep_rule(degree, count)
     values = values.to(source)
     axis, shape, ways = 0, list(grid.shape), [0] * len(directions)
     nothing = source.new_zeros(())
@@ -153,7 +153,7 @@ def cell_gradient(q: Tensor) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def _rule(degree: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
+def sweep_rule(degree: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
     """Directions, weights, and the first `count` harmonics [N, K] of each direction."""
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
     values = harmonics(points, degree).T[:, :count].contiguous()

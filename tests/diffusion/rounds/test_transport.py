@@ -55,7 +55,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
         tolerance=1e-10,
     )
     medium = average_cells(scale_medium(scene.volume))
-    source, _ = receive_light(medium, scene.lights, 0)
+    source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
     light = last + source.mean
     swept = sweep(medium, light[None], cell_gradient(light), None, 3)[0]

@@ -1,0 +1,133 @@
+"""Fluence and energy balance: closed forms, derivatives, and no light that is lost or made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from media import box_grid, make_scene, random_values
+from torch import Tensor
+from torch.autograd import forward_ad
+
+import ddrecon
+from ddrecon.balance import find_balance, lines
+from ddrecon.errors import UsageError
+from ddrecon.grid import Grid
+from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Light, PointLight
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def lit_by(light: Light, density: Tensor, **changes: Any) -> Scene:
+    return replace(make_scene(density, **changes), lights=[light])
+
+
+PENCIL = BeamLight(tensor(0.03, 2.0, -0.02), tensor(0.0, -1.0, 0.0), tensor(2.0), tensor(0.0)[0])
+WIDE = BeamLight(tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.2)[0])
+DOWN = DirectionalLight(tensor(0.0, -1.0, 0.0), tensor(3.0, 2.0, 1.0))
+SLANTED = DirectionalLight(tensor(-2.0, -2.1, -1.0), tensor(3.0, 2.0, 1.0))
+LAMP = PointLight(tensor(0.4, 1.7, 0.2), tensor(1.0))
+BLACK = {"sigma_a": (1.5, 4.0, 9.0), "sigma_s": (0.0,)}
+
+
+def test_fluence_of_a_beam_that_is_absorbed_is_its_mean_in_each_cell() -> None:
+    density = random_values(4, 1, 5)
+    density = density.expand(4, 6, 5).contiguous()
+    found = ddrecon.fluence(lit_by(DOWN, density, **BLACK))
+    step = tensor(*BLACK["sigma_a"]).view(3, 1, 1, 1) * density * box_grid((4, 6, 5)).spacing[1]
+    entered = torch.exp(-(step.flip(2).cumsum(2).flip(2) - step))
+    expected = DOWN.irradiance.view(3, 1, 1, 1) * entered * -torch.expm1(-step) / step
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"g": 0.7}, {"model": "none"}, {"g": 0.7, "model": "none"}]
+)
+def test_fluence_of_even_light_without_absorption_is_4_pi_times_it(changes: dict[str, Any]) -> None:
+    shape, sigma_s = (5, 4, 6), 0.0 if "model" in changes else 6.0
+    medium = {"sigma_a": (0.0,), "sigma_s": (sigma_s,), **changes}
+    scene = lit_by(AmbientLight(tensor(0.7)), random_values(*shape), **medium)
+    expected = torch.full((1, *shape), 4 * math.pi * 0.7, dtype=torch.float64)
+    torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("scene", [{"g": 0.0}, {"g": 0.85, "degree": 3}], ids=str)
+@pytest.mark.parametrize("light", [SLANTED, WIDE], ids=["sun", "beam"])
+def test_fluence_has_tangent_adjoint_and_differences(light: Light, scene: dict[str, Any]) -> None:
+    world = lit_by(light, 0.2 + random_values(4, 5, 6), transport_rounds=1, **scene)
+    names = ["density", *(f"lights.0.{name}" for name in vars(light))]
+    weights, values = random_values(3, 4, 5, 6, seed=1), {n: value_of(world, n) for n in names}
+
+    def loss(named: dict[str, Tensor]) -> Tensor:
+        return (weights * ddrecon.fluence(with_values(world, named))).sum()
+
+    shifts = {n: random_values(*v.shape, seed=2).view(v.shape) - 0.4 for n, v in values.items()}
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    bars = torch.autograd.grad(loss(leaves), list(leaves.values()))
+    adjoint = sum((bar * shifts[n]).sum() for n, bar in zip(names, bars, strict=True))
+    with forward_ad.dual_level():
+        duals = {n: forward_ad.make_dual(v.clone(), shifts[n]) for n, v in values.items()}
+        tangent = forward_ad.unpack_dual(loss(duals)).tangent
+    with torch.no_grad():
+        up, down = (
+            loss({n: v + sign * 1e-5 * shifts[n] for n, v in values.items()}) for sign in (1, -1)
+        )
+    assert float(tangent) == pytest.approx(float(adjoint), rel=1e-10)
+    assert float(up - down) / 2e-5 == pytest.approx(float(adjoint), rel=1e-6)
+
+
+def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face() -> None:
+    """Beer and Lambert, to rounding, also of a beam thinner than a cell."""
+    density = random_values(6, 1, 5).expand(6, 8, 5).contiguous()
+    for light, power in ((DOWN, 0.9 * DOWN.irradiance), (PENCIL, tensor(2.0, 2.0, 2.0))):
+        record = find_balance(lit_by(light, density, **BLACK))
+        entered, absorbed = tensor(*record["enters"]["lights.0"]), tensor(*record["absorbed"])
+        by_face = {face: tensor(*part["unscattered"]) for face, part in record["leaves"].items()}
+        torch.testing.assert_close(entered, power, rtol=1e-7, atol=0)
+        torch.testing.assert_close(absorbed, entered - by_face.pop("-y"), rtol=1e-7, atol=0)
+        assert not torch.stack([*by_face.values()]).any()
+        assert tensor(*record["defect_percent"]).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("sigma_a", [(0.0,), (0.5, 1.0, 2.0)], ids=["no absorption", "absorption"])
+@pytest.mark.parametrize("g", [0.0, 0.8, -0.6])
+@pytest.mark.parametrize("light", [DOWN, WIDE, PENCIL], ids=["sun", "beam", "pencil"])
+def test_what_enters_is_absorbed_or_leaves(
+    light: Light, g: float, sigma_a: tuple[float, ...]
+) -> None:
+    """Rounds that have come to rest lose nothing."""
+    grid = Grid((10, 12, 10), (-0.5, -0.6, -0.5), (0.5, 0.6, 0.5))
+    changes = {"transport_rounds": 12, "degree": 3, "tolerance": 1e-9, "grid": grid}
+    density = torch.ones(grid.shape, dtype=torch.float64)
+    record = find_balance(lit_by(light, density, g=g, sigma_a=sigma_a, sigma_s=(5.0,), **changes))
+    assert torch.tensor(record["defect_percent"]).abs().max() < 0.6
+    assert bool(torch.tensor(record["absorbed"]).all()) == any(sigma_a)
+
+
+def test_light_that_nothing_stops_leaves_as_it_came() -> None:
+    empty = torch.zeros(4, 5, 6, dtype=torch.float64)
+    sky = AmbientLight(tensor(0.3, 0.2, 0.1))
+    scene = replace(make_scene(empty), lights=[DOWN, WIDE, LAMP, sky])
+    record = find_balance(scene)
+    assert torch.tensor(record["defect_percent"]).abs().max() < 1e-5
+    assert not any(record["absorbed"])
+    surface = 2 * (1.0 * 1.2 + 1.2 * 0.9 + 0.9 * 1.0)
+    assert record["enters"]["lights.3"] == pytest.approx(
+        [math.pi * surface * c for c in (0.3, 0.2, 0.1)]
+    )
+    assert any(line.startswith("leaves by +x") for line in lines(record))
+
+
+def test_a_balance_needs_light_and_somebody_who_follows_it() -> None:
+    density = random_values(3, 4, 5)
+    with pytest.raises(UsageError, match="none enters"):
+        find_balance(replace(make_scene(density), lights=[]))
+    with pytest.raises(UsageError, match="take p1"):
+        find_balance(make_scene(density, model="none"))
