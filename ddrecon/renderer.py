@@ -164,6 +164,8 @@ def solve_diffuse(
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
+        if medium.emission is not None:
+            scattered = replace(scattered, mean=scattered.mean + medium.emission)
         return solve_printed(medium, diffusion, scattered, outside, by_jacobi, medium.has_flux)
     solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
     if settings.model == "flux_limited":
@@ -211,7 +213,12 @@ def view_image(
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
     parts = [
         (replace(light_field, diffuse=nothing, turned=()), scene, camera, behind),
-        (replace(light_field, beams=(), skies=()), _without_background(scene), camera, None),
+        (
+            replace(_without_glow(light_field), beams=(), skies=()),
+            _without_background(scene),
+            camera,
+            None,
+        ),
     ]
     varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
@@ -223,6 +230,10 @@ def _without_background(scene: Scene) -> Scene:
     return replace(scene, render=replace(scene.render, background=False))
 
 
+def _without_glow(light_field: LightField) -> LightField:
+    return replace(light_field, medium=replace(light_field.medium, emission=None))
+
+
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
     """The image of `camera` split into its terms; `light_field` must be that of `scene`.
 
@@ -232,7 +243,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     """
     once = follow_unscattered_light(keep_medium(cut_volume(scene.volume)), scene.lights)
     image = view_image(light_field, scene, camera)
-    single = view_image(once, _without_background(scene), camera)
+    single = view_image(_without_glow(once), _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
     return Components(reduced, single, image - reduced - single)
 
@@ -256,7 +267,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera that `bundle` belongs to (E2.2, E2.3)."""
+    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11)."""
     medium = light_field.medium
     diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:
@@ -272,6 +283,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.peak,
         medium.remaining if medium.is_cellwise else None,
         medium.support,
+        medium.emission,
     )
 
 

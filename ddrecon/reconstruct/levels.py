@@ -53,14 +53,17 @@ def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
         return mix_media(
             {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
         )
-    sigma_a, sigma_s = (
-        sigma if sigma.ndim == 1 else resample(sigma, grid)
-        for sigma in (volume.sigma_a, volume.sigma_s)
+    given = volume.sigma_a, volume.sigma_s, volume.emission, volume.black_body
+    sigma_a, sigma_s, *glow = (
+        one if one is None or one.ndim == 1 else resample(one, grid) for one in given
     )
     phase = volume.phase
     if phase.cells is not None:
         phase = phase.with_cells(resample(phase.cells, grid))
-    return Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
+    density, (emission, black_body) = resample(volume.density, grid), glow
+    return Volume(
+        grid, density, sigma_a, sigma_s, phase, emission=emission, black_body=black_body
+    )
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:
