@@ -61,9 +61,7 @@ def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
     if phase.cells is not None:
         phase = phase.with_cells(resample(phase.cells, grid))
     density, (emission, black_body) = resample(volume.density, grid), glow
-    return Volume(
-        grid, density, sigma_a, sigma_s, phase, emission=emission, black_body=black_body
-    )
+    return Volume(grid, density, sigma_a, sigma_s, phase, emission=emission, black_body=black_body)
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

@@ -291,6 +291,10 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
             key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
         ) from None
     kind = kind_of(name)
+    if name == "emission" and _is_dark(value):
+        # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.
+        value = torch.full_like(value, START_OF_EMISSION * unit_of(scene, name))
+        settings = replace(settings, field=settings.field is not False)
     if isinstance(settings.init, FieldFile):
         if not kind.is_cellwise:
             raise scene_file.refused(f"{key}.init.file", f"{name} is not a field: give its numbers")
@@ -299,10 +303,6 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         field = read_referenced(scene_file, f"{key}.init.file", settings.init.file, read)
         cells = cells_of(field).to(value)
         value = cells if kind.is_color else cells[0]
-    elif name == "emission" and settings.init is None and _is_dark(value):
-        # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.
-        value = torch.full_like(value, START_OF_EMISSION * unit_of(scene, name))
-        settings = replace(settings, field=settings.field is not False)
     elif settings.init is not None:
         value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:

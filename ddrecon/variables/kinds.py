@@ -34,7 +34,7 @@ DENSITY_STEP = 1.7
 """Optical depth that one step may lay across the box's shortest side."""
 SOUGHT_DEPTH = 20.0
 """Optical depth that the densest medium may have across the box, where density is not known yet."""
-EMISSION_STEP = 0.3
+EMISSION_STEP = 5.0
 """Brightness of the pictures that one step may add across the box's shortest side."""
 PIXELS = 0.25
 """Pixels by which one step of a camera's pose may move the image."""
@@ -108,11 +108,13 @@ def unit_of(scene: Scene, name: str) -> float:
 def shown_emission(scene: Scene) -> float:
     """The emission [radiance/u] that looks as bright as the pictures do, across the shortest side.
 
-    By the mean of the training views' pictures, of 1 where there are none.
+    That is the mean of the training views' pictures, weighted by themselves, so that black around
+    what shines does not count; 1 where there are none.
     """
     shown = [view.image for view in scene.views if view.image is not None and not view.is_test]
-    brightness = sum(float(image.mean()) for image in shown) / max(1, len(shown))
-    return (brightness or 1.0) / _side(scene)
+    total = sum(float(image.mean()) for image in shown)
+    squares = sum(float(image.square().mean()) for image in shown)
+    return (squares / total if total > 0 else 1.0) / _side(scene)
 
 
 def fixed_rate(rate: float) -> Rate:
@@ -181,6 +183,7 @@ KINDS: Mapping[str, Kind] = {
         is_color=True,
         is_cellwise=True,
         tv=1e-3,
+        is_compressed=True,
     ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
