@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
@@ -53,15 +54,15 @@ def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
         return mix_media(
             {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
         )
-    given = volume.sigma_a, volume.sigma_s, volume.emission, volume.black_body
-    sigma_a, sigma_s, *glow = (
-        one if one is None or one.ndim == 1 else resample(one, grid) for one in given
-    )
+    names = "density", "sigma_a", "sigma_s", "emission", "black_body"
+    fields: dict[str, Any] = {name: getattr(volume, name) for name in names}
+    for name, field in fields.items():
+        if field is not None and field.ndim >= 3:
+            fields[name] = resample(field, grid)
     phase = volume.phase
     if phase.cells is not None:
         phase = phase.with_cells(resample(phase.cells, grid))
-    density, (emission, black_body) = resample(volume.density, grid), glow
-    return Volume(grid, density, sigma_a, sigma_s, phase, emission=emission, black_body=black_body)
+    return Volume(grid, phase=phase, **fields)
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

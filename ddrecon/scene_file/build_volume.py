@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -106,8 +106,8 @@ class _Medium:
             emission = self.values("emission").to(device, dtype)
         elif self.tree.may_change(self.prefix + "emission"):
             emission = sigma_a.new_zeros(3)
-        glow = {"emission": emission, "black_body": black_body}
-        return Volume(grid, density, sigma_a, sigma_s, phase, **glow)
+        medium = Volume(grid, density, sigma_a, sigma_s, phase)
+        return replace(medium, emission=emission, black_body=black_body)
 
 
 def _read_fields(

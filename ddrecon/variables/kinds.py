@@ -182,7 +182,7 @@ KINDS: Mapping[str, Kind] = {
         low=0,
         is_color=True,
         is_cellwise=True,
-        tv=1e-3,
+        tv=3e-3,
         is_compressed=True,
     ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),

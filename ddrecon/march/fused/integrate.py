@@ -65,7 +65,7 @@ def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]
     """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
-    light that of what remains, `diffuse_scale`; beams' irradiances, and p where it is one of the `factors`
+    light that of what remains; beams' irradiances, and p where it is one of the `factors`
     [1 or C, R] (E2.2).
     """
     diffuse, *arriving = out.split(emission.colors)

@@ -27,8 +27,9 @@ class Layout(NamedTuple):
 
     `colors` C leave the volume. A node holds the `extinction`'s field (K = 1 or C channels),
     `diffuse` light (1 or C), K masses for each beam, `scattering` (0: it is the extinction's field
-    again; else 1 or C), what is `emitted` (0: nothing is; else 1 or C), and `peak`: -1 without a forward peak, 0 where it is one number a color,
-    else 1 or C channels. `phases`: 1, or C where colors have phase functions of their own.
+    again; else 1 or C), what is `emitted` (0: nothing is; else 1 or C), and `peak`: -1 without a
+    forward peak, 0 where it is one number a color, else 1 or C channels. `phases`: 1, or C where
+    colors have phase functions of their own.
 
     Where the phase function differs from cell to cell, `form` is how it depends on the number that
     does (`bundle.py`): a node holds these `numbers` (1 or C), of which there are so many `tables`
