@@ -29,7 +29,7 @@ GLOW = half_empty(3, *SHAPE, seed=4)
 CASES: dict[str, dict[str, Any]] = {
     "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (2.0,), "transport_rounds": 1},
     "glowing": {"emission": GLOW, "sigma_a": (1.0,), "sigma_s": (6.0,), "transport_rounds": 2},
-    "glowing cells, black": {"emission": GLOW[:1], "sigma_s": (0.0,), "directional": None},
+    "glowing alone": {"emission": GLOW[:1], "sigma_s": (0.5,), "directional": None},
     "forward, degree 1": {"g": 0.4, "degree": 1, "transport_rounds": 2},
     "forward, degree 3": {"g": 0.4, "degree": 3, "transport_rounds": 2, "closure": "smooth"},
     "backward, degree 3": {"g": -0.6, "degree": 3, "transport_rounds": 2, "ambient": (0.3,)},
