@@ -176,7 +176,8 @@ def _find_light(
     medium = _medium_of(volume, settings)
     if not multiply_scatters(medium, settings):
         return follow_unscattered_light(medium, lights, below)
-    cells = average_cells(medium)
+    # The paper's own scheme knows values at centers only.
+    cells = medium if settings.scheme == "printed" else average_cells(medium)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
@@ -283,6 +284,8 @@ def solve_diffuse(
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
+        if medium.emission is not None:
+            scattered = replace(scattered, mean=scattered.mean + medium.emission)
         return solve_printed(medium, diffusion, scattered, outside, by_jacobi, medium.has_flux)
     solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
     if settings.model == "flux_limited":
@@ -328,10 +331,14 @@ def view_image(
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    unlit = _without_background(scene)
     parts = [
         (replace(light_field, diffuse=nothing, turned=()), scene, camera, behind),
-        (replace(light_field, beams=(), skies=(), ground=None), unlit, camera, None),
+        (
+            replace(_without_glow(light_field), beams=(), skies=(), ground=None),
+            _without_background(scene),
+            camera,
+            None,
+        ),
     ]
     varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
@@ -341,6 +348,10 @@ def view_image(
 
 def _without_background(scene: Scene) -> Scene:
     return replace(scene, render=replace(scene.render, background=False))
+
+
+def _without_glow(light_field: LightField) -> LightField:
+    return replace(light_field, medium=replace(light_field.medium, emission=None))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -353,7 +364,9 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     unscattered = replace(scene, diffusion=replace(scene.diffusion, model="none"))
     once = solve_light(unscattered, SolveMemory())
     image = view_image(light_field, scene, camera)
-    single = view_image(replace(once, ground=None), _without_background(scene), camera)
+    single = view_image(
+        replace(_without_glow(once), ground=None), _without_background(scene), camera
+    )
     reduced = view_image(once, scene, camera) - single
     return Components(reduced, single, image - reduced - single)
 
@@ -380,7 +393,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera that `bundle` belongs to (E2.2, E2.3)."""
+    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11)."""
     medium = light_field.medium
     diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:
@@ -396,6 +409,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.peak,
         medium.remaining if medium.is_cellwise else None,
         medium.support,
+        medium.emission,
     )
 
 

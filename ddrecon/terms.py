@@ -22,7 +22,7 @@ from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
-from ddrecon.medium.coefficients import Medium, scale_medium
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import exchange_grid, multiply_scatters
@@ -40,6 +40,7 @@ def needed_terms(scene: Scene) -> list[str]:
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
         *_light_terms(scene, is_diffuse),
+        *_glow_terms(scene.volume, is_diffuse),
         *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
@@ -73,6 +74,13 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
         "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
     }
     return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
+
+
+def _glow_terms(volume: Volume, is_diffuse: bool) -> list[str]:
+    if volume.emission is None and volume.black_body is None:
+        return []
+    what = "emission" if volume.black_body is None else "emission of a black body"
+    return [f"{what}, {'scattered and seen' if is_diffuse else 'only seen: it is not scattered'}"]
 
 
 def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:

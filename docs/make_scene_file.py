@@ -74,6 +74,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "A file gives it cell by cell."
             ),
             "phase": "How light is scattered by angle, in place of `g`; see below.",
+            "emission": (
+                "Radiance that a unit of length emits [radiance/u], whatever the density. As a "
+                "parameter that starts from 0 it is a field, one number a color."
+            ),
+            "temperature": (
+                "In place of `emission`, of a black body [K]: absorption times its radiance, of "
+                "luminance 1 at 1500 K ([E2.11](theory.md#2-the-forward-model))."
+            ),
         },
     ),
     (
@@ -445,7 +453,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density, of whose logarithm it is (E11.3), and 0 for others."
+                " density and emission, of whose logarithm it is (E11.3), and 0 for others."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

@@ -74,6 +74,7 @@ def make_scene(
     ambient: tuple[float, ...] | None = None,
     camera: Camera | None = None,
     grid: Grid | None = None,
+    emission: Tensor | None = None,
     **diffusion: Any,
 ) -> Scene:
     """A scene in the precision of `density`, solved as closely as that precision allows; lights
@@ -92,7 +93,7 @@ def make_scene(
     tolerance = 1e-13 if density.dtype == torch.float64 else 1e-6
     diffusion = {"tolerance": tolerance, "transport_rounds": 0} | diffusion
     return Scene(
-        Volume(grid, density, sigma_a, sigma_s, tensor(g)),
+        Volume(grid, density, sigma_a, sigma_s, tensor(g), emission=emission),
         lights,
         [View("view", camera)],
         RenderSettings(),

@@ -36,7 +36,10 @@ def average_cells(medium: Medium) -> Medium:
         name: replace(getattr(medium, name), field=means[id(field)])
         for name, field in fields.items()
     }
-    return replace(medium, **coefficients)
+    emission = medium.emission
+    if emission is not None:
+        emission = _whole(_average(emission), medium.grid)
+    return replace(medium, emission=emission, **coefficients)
 
 
 def _average(field: Tensor) -> Tensor:

@@ -64,14 +64,17 @@ class DiffusionProblem:
             z, y, x, loss, right = assemble_system(
                 self.medium, self.diffusion, self.source, self.outside
             )
-            return Operator((z, y, x), loss), right
+            return Operator((z, y, x), loss), self._with_emission(right)
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
             _loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside
         )
         for axis, flux in zip(AXES, self.source.flux or (), strict=self.source.flux is not None):
             right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
-        return Operator((z, y, x), loss), right
+        return Operator((z, y, x), loss), self._with_emission(right)
+
+    def _with_emission(self, right: Tensor) -> Tensor:
+        return right if self.medium.emission is None else right + self.medium.emission
 
     def flux(
         self, mean: Tensor, more: Vector | None = None, begun: Vector | None = None, sign: int = 1

@@ -145,14 +145,15 @@ def solve_flux_limited(
     """
     balance = Balance(medium.grid, limiter)
     scattered = source.scaled(medium.remaining_scattering, medium.remaining_scattering)
+    gained = scattered.mean if medium.emission is None else scattered.mean + medium.emission
     fields = [
         medium.transport_extinction,
         medium.absorption.value,
-        scattered.mean,
+        gained,
         *(scattered.flux or ()),
     ]
     transport_extinction, absorption, gain, *flux = (
-        field.expand_as(scattered.mean + outside) for field in fields
+        field.expand_as(gained + outside) for field in fields
     )
     mean = ImplicitFixedPoint.apply(
         solve, balance, transport_extinction, absorption, gain, outside, *flux

@@ -25,7 +25,8 @@ class Emission:
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
     does to p (E8.7). `remaining`, where given, scatters diffuse light in place of kappa_s: where
     the phase function differs from cell to cell, that is interpolated as the extinction is. Where
-    `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for.
+    `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for. `emitted`
+    [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11).
     """
 
     grid: Grid
@@ -37,6 +38,21 @@ class Emission:
     peak: Tensor | None
     remaining: Coefficient | None = None
     support: Tensor | None = None
+    emitted: Tensor | None = None
+
+    @property
+    def diffusing(self) -> Coefficient:
+        """What scatters diffuse light."""
+        return self.remaining or self.scattering
+
+    @property
+    def diffuse_scale(self) -> Tensor:
+        """By what rays multiply the integral of diffuse light and of what is emitted, [C, 1, 1, 1].
+
+        Where something is, 1, and `fields` has diffuse light times the scale of what scatters it.
+        """
+        scale = self.diffusing.scale
+        return scale if self.emitted is None else torch.ones_like(scale[:1])
 
     @property
     def colors(self) -> int:
@@ -45,7 +61,7 @@ class Emission:
             self.diffuse.shape[0],
             self.extinction.scale.shape[0],
             *(beam.irradiance.shape[0] for beam in self.beams),
-            1,
+            1 if self.emitted is None else len(self.emitted),
         )
 
     def parts(self) -> list[Emission]:
@@ -71,10 +87,13 @@ class Emission:
         `peak` where it is the same everywhere. Where the phase function differs from cell to cell,
         `number` is that of its numbers which does, and `remaining` is what scatters diffuse light.
         """
-        fields = {"extinction": self.extinction.field, "diffuse": self.diffuse}
+        diffuse = self.diffuse if self.emitted is None else self.diffuse * self.diffusing.scale
+        fields = {"extinction": self.extinction.field, "diffuse": diffuse}
         fields |= {f"mass {index}": beam.mass for index, beam in enumerate(self.beams)}
         if self.scattering.field is not self.extinction.field:
             fields["scattering"] = self.scattering.field
+        if self.emitted is not None:
+            fields["emitted"] = self.emitted
         if self.peak is not None and self.peak.shape[1:].numel() > 1:
             fields["peak"] = self.peak
         if self.seen.phase.cells is not None:
@@ -88,6 +107,6 @@ class Emission:
         """Of these channels the masses, interpolated to third order; the others are linearly."""
         if not self.beams:
             return None
-        first = len(self.extinction.field) + len(self.diffuse)
+        first = len(self.extinction.field) + len(self.fields["diffuse"])
         last = first + sum(len(beam.mass) for beam in self.beams)
         return ThirdOrder(first, last, self.extinction.mass_bound, border=1)

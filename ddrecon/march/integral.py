@@ -176,10 +176,11 @@ def integrate_segments(
     if front is not None:
         end = end + front
     begin = end - mass
-    # E2.3: the integral of tau kappa_s (L0 + g L1 . w).
+    # E2.3, E2.11: the integral of tau (kappa_s (L0 + g L1 . w) + j).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
+    diffuse = diffuse + at_nodes["emitted"] if "emitted" in at_nodes else diffuse
     scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
-    scattered = scattered * (emission.remaining or emission.scattering).scale.view(-1, 1)
+    scattered = scattered * emission.diffuse_scale.view(-1, 1)
     passed = torch.cat([begin[:1], end])
     seen: SeenPhase | SeenNodes = emission.seen
     if "number" in at_nodes:

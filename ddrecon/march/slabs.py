@@ -63,7 +63,13 @@ def _without_light(emission: Emission) -> Emission:
     """The extinction of `emission` alone."""
     dark, extinction = torch.zeros_like(emission.diffuse[:1]), emission.extinction
     return replace(
-        emission, scattering=extinction, beams=(), diffuse=dark, peak=None, remaining=None
+        emission,
+        scattering=extinction,
+        beams=(),
+        diffuse=dark,
+        peak=None,
+        remaining=None,
+        emitted=None,
     )
 
 

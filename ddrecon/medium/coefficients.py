@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,6 +36,10 @@ class Volume(Displayed):
     mean cosine of Henyey and Greenstein's. Tensors may be replaced or require gradients. `media`:
     what the volume was mixed from, by name (`mixture`). `support` [z, y, x]: where it is 0 the
     volume counts as empty, and derivatives by density are 0; None: it is 1 everywhere.
+
+    What glows has an `emission` >= 0, the radiance that a unit of length adds (E2.11), or is as
+    bright as a `black_body` [radiance], whose light it emits as it absorbs: each [C] or
+    [C, z, y, x], or None.
     """
 
     grid: Grid
@@ -44,6 +49,8 @@ class Volume(Displayed):
     phase: PhaseFunction
     media: Mapping[str, Volume] | None = None
     support: Tensor | None = None
+    emission: Tensor | None = None
+    black_body: Tensor | None = None
 
     def __init__(
         self,
@@ -54,9 +61,12 @@ class Volume(Displayed):
         phase: PhaseFunction | Tensor,
         media: Mapping[str, Volume] | None = None,
         support: Tensor | None = None,
+        emission: Tensor | None = None,
+        black_body: Tensor | None = None,
     ):
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
         self.media, self.support = media, support
+        self.emission, self.black_body = emission, black_body
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
 
     @property
@@ -113,7 +123,8 @@ class Medium:
     remains. f, g and g' are scalars, [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the
     phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
     times a mass, it is the depth x of E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of
-    it varies, and None without a peak. `support` is the volume's.
+    it varies, and None without a peak. `support` is the volume's. `emission` j [C, z, y, x] is the
+    radiance that a unit of length adds (E2.11), None where nothing glows.
     """
 
     grid: Grid
@@ -127,6 +138,7 @@ class Medium:
     peak: Tensor | None
     seen: SeenPhase
     support: Tensor | None = None
+    emission: Tensor | None = None
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -171,15 +183,16 @@ def cut_volume(volume: Volume) -> Volume:
 
 def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> Volume:
     """`volume` on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
-    density, sigma_a, sigma_s = (
-        values if values.ndim == 1 else put(values)
-        for values in (volume.density, volume.sigma_a, volume.sigma_s)
-    )
+    names = "density", "sigma_a", "sigma_s", "support", "emission", "black_body"
+    given = {name: getattr(volume, name) for name in names}
+    fields: dict[str, Any] = {
+        name: put(field) if field is not None and field.ndim >= 3 else field
+        for name, field in given.items()
+    }
     phase = volume.phase
     if phase.cells is not None:
         phase = phase.with_cells(put(phase.cells))
-    support = None if volume.support is None else put(volume.support)
-    return Volume(grid, density, sigma_a, sigma_s, phase, support=support)
+    return Volume(grid, phase=phase, **fields)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
@@ -222,7 +235,20 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
         peak=peak,
         seen=seen,
         support=volume.support,
+        emission=_find_emission(volume, absorption),
     )
+
+
+def _find_emission(volume: Volume, absorption: Coefficient) -> Tensor | None:
+    """j of E2.11: what is given, within the support, or kappa_a times a black body's radiance."""
+    given = volume.emission if volume.black_body is None else volume.black_body
+    if given is None:
+        return None
+    radiance = given if given.ndim == 4 else along_colors(given)
+    if volume.black_body is not None:
+        return absorption.value * radiance
+    emission = radiance.expand(-1, *volume.grid.shape)
+    return emission if volume.support is None else emission * volume.support
 
 
 def _find_coefficients(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
+from functools import partial
+
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.coefficients import Volume, put_volume
 from ddrecon.medium.mixture import mix_media
 
 
@@ -16,15 +19,11 @@ def volume_at_level(volume: Volume, grid: Grid) -> Volume:
         return mix_media(
             {name: volume_at_level(medium, grid) for name, medium in volume.media.items()}
         )
-    sigma_a, sigma_s = (
-        sigma if sigma.ndim == 1 else resample(sigma, grid)
-        for sigma in (volume.sigma_a, volume.sigma_s)
-    )
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(resample(phase.cells, grid))
-    density = volume.density if volume.support is None else volume.density * volume.support
-    return Volume(grid, resample(density, grid), sigma_a, sigma_s, phase)
+    support, volume = volume.support, copy(volume)
+    if support is not None:
+        volume.density, volume.support = volume.density * support, None
+        volume.emission = None if volume.emission is None else volume.emission * support
+    return put_volume(volume, grid, partial(resample, grid=grid))
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

@@ -202,7 +202,7 @@ class Reconstruction:
         for parameter in self.parameters:
             if parameter.grid != volume.grid:
                 parameter.refine(volume.grid)
-            if volume.support is not None and parameter.name == "density":
+            if volume.support is not None and parameter.name in ("density", "emission"):
                 parameter.restrict(volume.support)
 
     def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:

@@ -121,7 +121,8 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
         )
     if _is_dark(train, settings):
         raise SceneError(
-            "lights: none shines, and none is optimized: give one a brightness above 0"
+            "lights: none shines, and none is optimized: give one a brightness above 0,"
+            " or the volume an emission"
         )
     known = variable_names(train)
     problems = [
@@ -138,7 +139,10 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
 
 
 def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
-    """Whether there is nothing to be seen: no light that shines or is optimized, no background."""
+    """Whether there is nothing to be seen: nothing shines, glows or is optimized, no background."""
+    glows = (train.volume.emission, train.volume.black_body)
+    if "emission" in settings.parameters or any(x is not None and bool(x.any()) for x in glows):
+        return False
     has_light = any(
         all(bool(value.any()) for name, value in vars(light).items() if name in BRIGHTNESS)
         for light in train.lights

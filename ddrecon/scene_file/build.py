@@ -48,7 +48,7 @@ from ddrecon.scene_file.schema import (
     SceneTree,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
-from ddrecon.variables.kinds import PHASE, kind_of, split_name
+from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import component_names, name_each, value_of, variable_names
 
 MORE_ROUNDS = 0.3, 0.6
@@ -66,6 +66,8 @@ FLAT, BACKWARD = 0.5, 0.2
 side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
 that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
 """
+START_OF_EMISSION = 0.1
+"""Emission that is sought from nothing shows so many times the pictures' brightness."""
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
 
@@ -240,7 +242,9 @@ def needs_of_scene(
     """
     phase, parameters = _phase_of(media), optimize.parameters if optimize else {}
     first = next(iter(media.values()))
+    glows = [first.emission, first.black_body]
     colors = max(phase.colors, *(len(medium.sigma_a) for medium in media.values()))
+    colors = max(colors, *(len(one) for one in glows if one is not None), 1)
     is_directed = "g" in parameters or bool((phase.moments(3)[:, 1:] != 0).any())
     varied = [_varied(name, one, media, colors) for name, one in parameters.items()]
     z, y, x = first.grid.shape
@@ -272,6 +276,8 @@ def _varied(
     has_cells = any(sigma.ndim > 1 for sigma in sigmas.get(last, both))
     if not kind.is_color or last.startswith(PHASE):
         has_cells = volume.phase.cells is not None
+    if last == "emission" and volume.emission is not None:
+        has_cells = volume.emission.ndim > 1 or _is_dark(volume.emission)
     is_given = isinstance(settings.init, FieldFile) or has_cells
     is_field = is_given if settings.field is None else settings.field
     return is_field * (colors if kind.is_color else 1)
@@ -332,6 +338,10 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
             key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
         ) from None
     kind = kind_of(name)
+    if name == "emission" and _is_dark(value):
+        # As bright as the pictures, all over the box; cell by cell unless the scene says otherwise.
+        value = torch.full_like(value, START_OF_EMISSION * unit_of(scene, name))
+        settings = replace(settings, field=settings.field is not False)
     if isinstance(settings.init, FieldFile):
         if not kind.is_cellwise:
             raise scene_file.refused(f"{key}.init.file", f"{name} is not a field: give its numbers")
@@ -349,6 +359,10 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
             f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
         )
     return value
+
+
+def _is_dark(emission: Tensor) -> bool:
+    return not bool(emission.any())
 
 
 def _fill(

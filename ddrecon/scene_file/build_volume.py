@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
+from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mie import scatter_droplets
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
@@ -98,14 +99,23 @@ class _Medium:
             for sigma in sigmas
         )
         density = self.values("density").to(device, dtype)[0].expand(grid.shape)
-        return Volume(grid, density, sigma_a, sigma_s, phase)
+        emission = black_body = None
+        if getattr(self.section, "temperature", None) is not None:
+            black_body = black_body_radiance(self.values("temperature")[0]).to(device, dtype)
+        elif getattr(self.section, "emission", None) is not None:
+            emission = self.values("emission").to(device, dtype)
+        elif self.tree.may_change(self.prefix + "emission"):
+            emission = sigma_a.new_zeros(3)
+        medium = Volume(grid, density, sigma_a, sigma_s, phase)
+        return replace(medium, emission=emission, black_body=black_body)
 
 
 def _read_fields(
     scene_file: SceneFile, prefix: str, section: MediumSection
 ) -> dict[str, tuple[str, Field]]:
     """The quantities that files give cell by cell, by variable; and where the scene says so."""
-    given = {name: (name, getattr(section, name)) for name in FIELDS if hasattr(section, name)}
+    names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
+    given = {name: (name, getattr(section, name)) for name in names}
     if isinstance(section.phase, HenyeyGreensteinSection):
         given["g"] = "phase.g", section.phase.g
     elif isinstance(section.phase, TwoLobeSection):
@@ -114,7 +124,9 @@ def _read_fields(
     for variable, (name, value) in given.items():
         if isinstance(value, FieldFile):
             called = value.name or variable.removeprefix(PHASE)
-            read = partial(read_quantity, name=variable, called=called)
+            # A temperature is as a density: one number a cell, none below 0.
+            kind = "density" if variable == "temperature" else variable
+            read = partial(read_quantity, name=kind, called=called)
             with problems.collecting():
                 at = f"volume.{prefix}{name}.file"
                 found[variable] = at, read_referenced(scene_file, at, value.file, read)

@@ -161,10 +161,14 @@ def _read_text(node: Node, kinds: Sequence[Any], rule: Rule) -> str | Path:
 
 
 def _read_list(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
-    """As many entries as the tuple among `kinds` has, or any number: of others than numbers one."""
+    """As many entries as the tuple among `kinds` has, or any number.
+
+    Of others than numbers that is at least one, unless the field `may_be_empty`.
+    """
     entries = node.children()
     for arguments in (get_args(kind) for kind in kinds if get_origin(kind) is tuple):
-        is_open = arguments[-1] is Ellipsis and (entries or arguments[0] is float)
+        may_be_empty = arguments[0] is float or rule.limits.get("may_be_empty")
+        is_open = arguments[-1] is Ellipsis and (entries or may_be_empty)
         if is_open or len(entries) == len(arguments):
             values = read_each(entries, rule._replace(hint=arguments[0]))
             return _finish(node, (tuple, arguments[0]), values, rule)

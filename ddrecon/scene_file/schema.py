@@ -144,12 +144,16 @@ class VolumeSection(MediumSection):
 
     g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
     phase: PhaseSection | None = None  # type: ignore[assignment]
+    emission: Quantity | None = bounded(None, minimum=0)
+    temperature: Density | None = bounded(None, minimum=0)
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
+        if self.emission is not None and self.temperature is not None:
+            yield "temperature", "says what is emitted as well: give only one of it or emission"
         x, y, z = self.resolution or (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
@@ -450,7 +454,7 @@ class SceneTree:
     """A whole scene file: rings and such are the views they stand for, and paths are absolute."""
 
     volume: VolumeSection | MixtureSection
-    lights: tuple[LightSection, ...]
+    lights: tuple[LightSection, ...] = field(metadata={"may_be_empty": True})
     views: tuple[ViewSection, ...] = field(metadata={"also": (ViewSource,)})
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
@@ -480,7 +484,15 @@ class SceneTree:
         is_equal = isinstance(value, tuple) and len(value) == 3 and len(set(value)) == 1
         return value[0] if is_equal and not self.may_change(name) else value
 
+    @property
+    def glows(self) -> bool:
+        """Whether the volume emits light, or may come to."""
+        given = (getattr(self.volume, name, None) for name in ("emission", "temperature"))
+        return any(one is not None for one in given) or self.may_change("emission")
+
     def violations(self) -> Iterator[Violation]:
+        if not self.lights and not self.glows:
+            yield "lights", "there is none, and the volume has no emission"
         for name in self.optimize.parameters if self.optimize else ():
             medium, last = split_name(name)
             section = self.media.get(medium.removeprefix("media.").strip("."))

@@ -34,6 +34,8 @@ DENSITY_STEP = 1.7
 """Optical depth that one step may lay across the box's shortest side."""
 SOUGHT_DEPTH = 20.0
 """Optical depth that the densest medium may have across the box, where density is not known yet."""
+EMISSION_STEP = 5.0
+"""Brightness of the pictures that one step may add across the box's shortest side."""
 PIXELS = 0.25
 """Pixels by which one step of a camera's pose may move the image."""
 EXPOSURE_STEP = 0.05
@@ -90,7 +92,7 @@ def unit_of(scene: Scene, name: str) -> float:
 
     `name` is the variable's: a density counts by the mean extinction of its own medium, a cross
     section by the largest density of its own, or by `SOUGHT_DEPTH` where that is empty. 1 where
-    neither is known, and for other variables.
+    neither is known, and for other variables. An emission counts by the pictures' brightness.
     """
     volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
     if volume.media is not None and name.startswith("media."):
@@ -100,7 +102,19 @@ def unit_of(scene: Scene, name: str) -> float:
         unit = 1 / depth if depth > 0 else 1.0
         largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
         return unit if kind == "density" else 1 / (side * largest)
-    return 1.0
+    return shown_emission(scene) if kind == "emission" else 1.0
+
+
+def shown_emission(scene: Scene) -> float:
+    """The emission [radiance/u] that looks as bright as the pictures do, across the shortest side.
+
+    That is the mean of the training views' pictures, weighted by themselves, so that black around
+    what shines does not count; 1 where there are none.
+    """
+    shown = [view.image for view in scene.views if view.image is not None and not view.is_test]
+    total = sum(float(image.mean()) for image in shown)
+    squares = sum(float(image.square().mean()) for image in shown)
+    return (squares / total if total > 0 else 1.0) / _side(scene)
 
 
 def fixed_rate(rate: float) -> Rate:
@@ -163,6 +177,14 @@ KINDS: Mapping[str, Kind] = {
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
+    "emission": Kind(
+        lambda scene, name, start: EMISSION_STEP * unit_of(scene, name),
+        low=0,
+        is_color=True,
+        is_cellwise=True,
+        tv=3e-3,
+        is_compressed=True,
+    ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": _MEAN_COSINE,

@@ -1,9 +1,9 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
-`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
-`lights.0.irradiance` is any number of the first light; `ground.albedo` is the ground's;
-`views.front.camera` is the twist of a camera, `.focal`, `.principal_point` and `.distortion` are
-its lens. Vectors are (x, y, z), colors lead.
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g`, `phase.*` and, where it glows,
+`emission` are the volume's; `lights.0.irradiance` is any number of the first light;
+`ground.albedo` is the ground's; `views.front.camera` is the twist of a camera, `.focal`,
+`.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors lead.
 """
 
 from __future__ import annotations
@@ -256,6 +256,7 @@ def _volume_names(volume: Volume) -> list[str]:
             for name in _volume_names(part)
         ]
     known = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
+    known += ["emission"] if volume.emission is not None else []
     if isinstance(volume.phase, HenyeyGreenstein):
         return [*known, "g"]
     return [*known, *(PHASE + name for name in volume.phase.variables)]

@@ -268,9 +268,9 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
-    several = Layout(3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
-    steep = Layout(1, 1, 1, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
+    one = Layout(1, 1, 1, 0, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
+    several = Layout(3, 3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
+    steep = Layout(1, 1, 1, 0, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
     packets = [mark_kernel(32), integral_kernel(steep, False)]
     packets += [tangent_kernel(one, Case(False, True, True)), adjoint_kernel(several, Case(False))]
     assert_compiles(packets, tmp_path)

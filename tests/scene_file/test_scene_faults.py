@@ -56,7 +56,7 @@ volume.phase={{type: blend}} => blend went: write two media, volume.media
 {MEDIA}{{cloud: {MEDIUM}, air: {{density: 1}}}}}} => volume.media.air: missing sigma_a and sigma_s
 {MEDIA}{{a: {MEDIUM}, b: {MEDIUM[:-1]}, phase: {{type: two_lobe}}}}}}}} => expected one of henyey
 {MEDIA}{{a: {MEDIUM}, b: {MEDIUM[:-1]}, g: {{file: g.npz}}}}}}}} => media.b.g: expected a number
-lights=[] => lights: expected a list with at least one entry, found a list of 0
+lights=[] => lights: there is none, and the volume has no emission
 lights=[{{radiance: 1}}] => lights.0: missing key 'type', one of directional, ambient,
 lights=[{{type: ambien, radiance: 1}}] => found 'ambien'; did you mean 'ambient'?
 lights=[{{type: point, position: [0, 1], intensity: 1}}] => position: expected a list of 3 numbers

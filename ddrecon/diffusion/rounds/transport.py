@@ -21,7 +21,7 @@ from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
@@ -51,12 +51,27 @@ def run_rounds(
     if rounds == 0:
         return light
     medium, grid = problem.medium, problem.medium.grid
-    light = _renewed(light, grid)
+    light, emitted = _renewed(light, grid), _sweep_emission(medium, degree)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
-        made = _round(problem, light, solve, degree, round_index, cosine, factor)
+        made = _round(problem, light, emitted, solve, degree, round_index, cosine, factor)
         light = _renewed(made, grid)
     return light
+
+
+def _sweep_emission(medium: Medium, degree: int) -> Moments | None:
+    """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
+
+    It is the same in all rounds, and swept once: as light of mean 1 that `medium` would scatter
+    with the coefficient j. Like kappa_a, j is even within cells.
+    """
+    if medium.emission is None:
+        return None
+    emission = medium.emission
+    emitting = replace(medium, remaining=Coefficient(emission.new_ones(1, 1, 1, 1), emission))
+    nothing = torch.zeros_like(medium.extinction.value.detach() * emission.detach())
+    even = Moments(torch.ones_like(nothing))
+    return sweep_change(emitting, Moments(nothing), even, None, degree)
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -70,6 +85,7 @@ def _renewed(light: Moments, grid: Grid) -> Moments:
 def _round(
     problem: DiffusionProblem,
     light: Moments,
+    emitted: Moments | None,
     solve: SolverWithMemory,
     degree: int,
     round_index: int,
@@ -78,7 +94,7 @@ def _round(
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `cosine`: as of `_flux_factor`.
+    `emitted`: light as of `_sweep_emission`; `cosine`: as of `_flux_factor`.
     """
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
@@ -86,6 +102,7 @@ def _round(
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
     change = sweep_change(medium, light, problem.source, inflow, degree)
+    change = change if emitted is None else change.plus(emitted)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:

@@ -140,6 +140,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             const V scattering = node.v[s];
             v_bar[s] += w_bar[c] * node.v[d];
             v_bar[d] += w_bar[c] * scattering;
+            if constexpr (L::EMITTED > 0) v_bar[L::emitted(c)] += w_bar[c];
             m_bar[k] += u_bar[c] * this->number(c);
             number_bar[c] += u_bar[c] * P::narrow(m[k]);
         }

@@ -69,7 +69,7 @@ def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]
     [1 or C, R] (E2.2).
     """
     diffuse, *arriving = out.split(emission.colors)
-    scattered = diffuse * (emission.remaining or emission.scattering).scale.view(-1, 1)
+    scattered = diffuse * emission.diffuse_scale.view(-1, 1)
     for beam, light, factor in zip(emission.beams, arriving, factors, strict=True):
         weighted = light if factor is None else light * factor
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)

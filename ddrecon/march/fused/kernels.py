@@ -27,8 +27,9 @@ class Layout(NamedTuple):
 
     `colors` C leave the volume. A node holds the `extinction`'s field (K = 1 or C channels),
     `diffuse` light (1 or C), K masses for each beam, `scattering` (0: it is the extinction's field
-    again; else 1 or C), and `peak`: -1 without a forward peak, 0 where it is one number a color,
-    else 1 or C channels. `phases`: 1, or C where colors have phase functions of their own.
+    again; else 1 or C), what is `emitted` (0: nothing is; else 1 or C), and `peak`: -1 without a
+    forward peak, 0 where it is one number a color, else 1 or C channels. `phases`: 1, or C where
+    colors have phase functions of their own.
 
     Where the phase function differs from cell to cell, `form` is how it depends on the number that
     does (`bundle.py`): a node holds these `numbers` (1 or C), of which there are so many `tables`
@@ -40,6 +41,7 @@ class Layout(NamedTuple):
     extinction: int
     diffuse: int
     scattering: int
+    emitted: int
     peak: int
     phases: int
     form: str
@@ -62,6 +64,7 @@ class Layout(NamedTuple):
             counts["extinction"],
             counts["diffuse"],
             counts.get("scattering", 0),
+            counts.get("emitted", 0),
             -1 if emission.peak is None else counts.get("peak", 0),
             emission.seen.colors,
             form,
@@ -83,8 +86,8 @@ class Layout(NamedTuple):
     def channels(self) -> int:
         """All channels of a node."""
         masses = len(self.beams) * self.extinction
-        others = self.scattering + max(self.peak, 0) + self.numbers + self.remaining
-        return self.extinction + self.diffuse + masses + others
+        others = max(self.peak, 0) + self.numbers + self.remaining
+        return self.extinction + self.diffuse + masses + self.scattering + self.emitted + others
 
     @property
     def outputs(self) -> int:

@@ -11,10 +11,11 @@ enum Form { SAME, LINEAR, EVEN, STEEP };
 // Channels that colors share, of a kind with one, are those of each. Without a peak it has -1
 // channels; as a number for each color, 0.
 template <
-    int COLORS, int EXTINCTIONS, int DIFFUSES, int SCATTERINGS, int PEAKS, int PHASE_COUNT,
-    Form FORM, int NUMBERS, int TABLES, int REMAINING, bool... POINTS>
+    int COLORS, int EXTINCTIONS, int DIFFUSES, int SCATTERINGS, int EMITTEDS, int PEAKS,
+    int PHASE_COUNT, Form FORM, int NUMBERS, int TABLES, int REMAINING, bool... POINTS>
 struct Layout {
     static constexpr int C = COLORS, EXTINCTION = EXTINCTIONS, SCATTERING = SCATTERINGS;
+    static constexpr int EMITTED = EMITTEDS;
     static constexpr int BEAMS = sizeof...(POINTS), PHASES = PHASE_COUNT;
     static constexpr bool HAS_PEAK = PEAKS >= 0, IS_PEAK_FIELD = PEAKS > 0;
     static constexpr bool HAS_NUMBERS = FORM != SAME, IS_LINEAR = FORM == LINEAR;
@@ -23,7 +24,8 @@ struct Layout {
     // All outputs: of diffuse light, then of each beam.
     static constexpr int MASSES = BEAMS * EXTINCTION, OUT = (1 + BEAMS) * C;
     static constexpr int FIRST_MASS = EXTINCTION + DIFFUSES, AFTER_MASSES = FIRST_MASS + MASSES;
-    static constexpr int FIRST_PEAK = AFTER_MASSES + SCATTERING;
+    static constexpr int FIRST_EMITTED = AFTER_MASSES + SCATTERING;
+    static constexpr int FIRST_PEAK = FIRST_EMITTED + EMITTED;
     static constexpr int FIRST_NUMBER = FIRST_PEAK + (IS_PEAK_FIELD ? PEAKS : 0);
     static constexpr int FIRST_REMAINING = FIRST_NUMBER + NUMBERS;
     static constexpr int CHANNELS = FIRST_REMAINING + REMAINING;
@@ -45,6 +47,7 @@ struct Layout {
     static constexpr INLINE int scattering(int c) {
         return SCATTERING ? AFTER_MASSES + (SCATTERING > 1 ? c : 0) : extinction(c);
     }
+    static constexpr INLINE int emitted(int c) { return FIRST_EMITTED + (EMITTED > 1 ? c : 0); }
     static constexpr INLINE int mass(int b, int c) {
         return FIRST_MASS + b * EXTINCTION + extinction(c);
     }
@@ -266,7 +269,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         if (!IS_SLICED) node.z = at(0, given.depth);
         if (IS_SLICED) node.runs.find(node.y, node.x, lines);
         sample(node, n, 0, L::EXTINCTION);
-        if (L::SCATTERING) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
+        if (L::SCATTERING || L::EMITTED) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;
         for (int c = 0; c < L::FIRST_PEAK; ++c)
             if (c < L::EXTINCTION || c >= L::AFTER_MASSES)
@@ -433,6 +436,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         for (int c = 0; c < L::C; ++c) {
             const N scattering = node.v[L::diffusing(c)];
             node.w[c] = scattering * node.v[L::diffuse(c)];
+            if constexpr (L::EMITTED > 0) node.w[c] += node.v[L::emitted(c)];
             node.u[c] = number(c) * P::narrow(m[L::extinction(c)]);
         }
         for (int b = 0; b < L::BEAMS; ++b) {

@@ -1,0 +1,106 @@
+"""Media that emit light, against closed forms (E2.11)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from media import half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
+from ddrecon.grid import Grid
+from ddrecon.medium.black_body import WHITE, black_body_radiance
+from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.scene import Scene
+
+GRID = Grid((6, 5, 7), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
+COLORS = torch.tensor([0.7, 0.3, 0.1], dtype=torch.float64)
+ENGINES = ["torch", pytest.param("warp", marks=pytest.mark.slow)]
+
+
+def glowing(density: float | Tensor, emission: Tensor | None, **more: Any) -> Scene:
+    """Seen by parallel rays along z, whose way through the box is 1."""
+    camera = make_camera((0.0, 0.0, 2.5), (3, 3), 0.2, is_perspective=False)
+    if isinstance(density, float):
+        density = torch.full(GRID.shape, density, dtype=torch.float64)
+    settings = {"directional": None, "sigma_a": (2.0,), "sigma_s": (0.0,)} | more
+    return make_scene(density, grid=GRID, camera=camera, emission=emission, **settings)
+
+
+def use(engine: str) -> None:
+    if engine == "warp":
+        pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+    use_engine(engine)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("model", ["p1", "none"])
+@pytest.mark.parametrize("density", [0.0, 0.8])
+def test_an_even_box_shines_by_its_length(engine: str, model: str, density: float) -> None:
+    """(1 - exp(-kappa L)) j / kappa, or j L where it is empty."""
+    use(engine)
+    kappa = 2.0 * density
+    length = (1 - math.exp(-kappa)) / kappa if kappa else 1.0
+    image = render(glowing(density, COLORS, model=model))[0]
+    torch.testing.assert_close(image, (COLORS * length).view(3, 1, 1).expand_as(image))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"transport_rounds": 2},
+        {"transport_rounds": 2, "g": 0.5, "degree": 3},
+        {"model": "flux_limited"},
+        {"scheme": "printed"},
+    ],
+)
+def test_what_is_as_hot_as_its_surroundings_looks_like_them(
+    engine: str, more: dict[str, Any]
+) -> None:
+    """Thermal equilibrium: with j = kappa_a B, and B from everywhere, light is B everywhere."""
+    use(engine)
+    density = 0.2 + random_values(*GRID.shape)
+    scene = glowing(density, None, sigma_s=(5.0,), ambient=COLORS.tolist(), **more)
+    scene.volume.black_body = COLORS
+    found = solve_light(scene, SolveMemory()).diffuse.mean
+    torch.testing.assert_close(found, COLORS.view(3, 1, 1, 1).expand_as(found), rtol=1e-9, atol=0)
+    image = render(scene)[0]
+    torch.testing.assert_close(image, COLORS.view(3, 1, 1).expand_as(image), rtol=1e-9, atol=0)
+
+
+def test_an_image_is_the_sum_of_what_lamps_and_emission_show() -> None:
+    """Light is linear in its sources; and emission in other units of length is the same picture."""
+    density, emission = half_empty(*GRID.shape), half_empty(3, *GRID.shape, seed=1)
+    settings = {"sigma_s": (5.0,), "transport_rounds": 2}
+    lamp, glow, both = (
+        glowing(density, of_volume, **settings, directional=of_lamp)
+        for of_volume, of_lamp in ((None, (3.0,)), (emission, None), (emission, (3.0,)))
+    )
+    torch.testing.assert_close(render(lamp) + render(glow), render(both), rtol=1e-9, atol=1e-12)
+    parts = view_components(solve_light(both, SolveMemory()), both, both.views[0].camera)
+    black = glowing(density, emission, sigma_a=(7.0,))
+    torch.testing.assert_close(parts.reduced, render(black)[0])
+
+
+def test_a_black_body_follows_stefan_and_boltzmanns_kin() -> None:
+    """Luminance 1 at a flame's temperature; hotter is brighter and bluer, cold is dark.
+
+    By Wien's law luminance grows as exp(-c / T), c being h c / k over some 570 to 600 nm.
+    """
+    kelvin = torch.tensor([0.0, 1000.0, WHITE, 3000.0, 6500.0, 20000.0], dtype=torch.float64)
+    colors = black_body_radiance(kelvin)
+    luminance = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64) @ colors
+    assert colors.shape == (3, len(kelvin)) and bool((colors >= 0).all()) and not luminance[0]
+    assert bool((luminance.diff() > 0).all()) and bool(
+        (colors[2] / colors[0])[1:].diff().ge(0).all()
+    )
+    assert float(luminance[2]) == pytest.approx(1, abs=0.05)
+    rise = math.log(float(luminance[2] / luminance[1])) / (1 / 1000 - 1 / WHITE)
+    assert 1.4388e7 / 610 < rise < 1.4388e7 / 560
+    # daylight of 6500 K is nearly white
+    assert float(colors[:, 4].max() / colors[:, 4].min()) == pytest.approx(1, abs=0.1)
