@@ -1,31 +1,32 @@
 """Fields up to the faces of the box: what stands at cells' centers, and a layer more on each side.
 
 On a face matter is what it is at the outermost centers. Light is the line through the two outermost
-centers, and so is the mass to a light, which that changes by half an optical depth at most; but it
+centers, and so is the mass to a light, which that lowers by half an optical depth at most; but it
 is zero on faces through which the light shines.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
-from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.slabs.slab import Slab
 
 GRAZING = 0.1
 """Cosine from which on a beam shines fully through a face. Below, ever less: where it only grazes
 a face, what lies closely behind that is lit through others.
 """
-FACES_ONLY = -1
-"""In place of an axis: all layers are on faces."""
+Linear = Callable[[Tensor], Tensor]
 FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order in which layers are added."""
 
@@ -41,13 +42,15 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     ends = [_is_line(grid, *face) for face in FACES]
     extended = {}
     for name, field in emission.fields.items():
-        lit = bound = field.new_zeros(())
         is_mass = name.startswith("mass ")
+        lines = [(is_mass or name == "diffuse") and is_line for is_line in ends]
+        longer = _Linear.apply(partial(_add_faces, lines), partial(_take_faces, lines), field)
         if is_mass:
             lit = shine_through(emission.beams[int(name.split()[1])], grid)
-            bound = emission.extinction.mass_bound
-        lines = [(is_mass or name == "diffuse") and is_line for is_line in ends]
-        extended[name] = _Extend.apply(axis, lines, field, lit, bound)
+            longer = _limit(longer, field, emission.extinction.mass_bound)
+            longer = longer * _shade(grid, 1 - lit * lit.new_tensor(lines))
+        beyond = partial(_go_beyond, axis, lines), partial(_come_back, axis, lines)
+        extended[name] = _Linear.apply(*beyond, longer)
     return extended
 
 
@@ -70,110 +73,80 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     return (part * part * (3 - 2 * part)).flatten()
 
 
-class _Extend(torch.autograd.Function):
-    """`field` [K, z, y, x] with those layers across `axis` and the others.
+def _limit(longer: Tensor, field: Tensor, bound: Tensor) -> Tensor:
+    """`longer`, less than the nearest of `field` by 1 over `bound` at most."""
+    fall = (longer - pad(field[None], [1] * 6, mode="replicate")[0]).clamp(max=0)
+    return longer + fall * ((1 + (bound * fall) ** 2).rsqrt() - 1)
 
-    On faces where it is one of the `lines` these count as far as the face is not `lit` [6], and
-    change what is at the outermost centers by 1 over `bound` at most. Both are a zero where nothing
-    is lit. Differentiable in both modes with respect to the tensors.
-    """
+
+def _shade(grid: Grid, shares: Tensor) -> Tensor:
+    """The product, [z + 2, y + 2, x + 2], of the `shares` [6] on all faces that a place is on."""
+    z, y, x = (
+        torch.cat([low.view(1), shares.new_ones(count), high.view(1)])
+        for count, (low, high) in zip(grid.shape, shares.view(3, 2), strict=True)
+    )
+    return z[:, None, None] * y[:, None] * x
+
+
+class _Linear(torch.autograd.Function):
+    """A linear function of a field, differentiable in both modes; the second is its adjoint."""
 
     @staticmethod
-    def forward(
-        axis: int | None, lines: list[bool], field: Tensor, lit: Tensor, bound: Tensor
-    ) -> Tensor:
-        longer = _longer(field)
-        for k, face in enumerate(FACES):
-            layer, last, before = _layers(longer, face)
-            layer.copy_(_Line(last, before, lit, bound, k).value if lines[k] else last)
-        return _go_beyond(longer, axis, lines)
+    def forward(apply: Linear, adjoint: Linear, field: Tensor) -> Tensor:
+        return apply(field)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.axis, ctx.lines = inputs[:2]
-        keep(ctx, *inputs[2:])
+        ctx.functions = inputs[:2]
 
     @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, longer_bar: Tensor) -> tuple[None, None, Tensor, Tensor, Tensor]:
-        (field, lit, bound), longer_bar = ctx.saved_tensors, longer_bar.clone()
-        longer = _Extend.forward(FACES_ONLY, ctx.lines, field, lit, bound)
-        lit_bar, bound_bar = torch.zeros_like(lit), torch.zeros_like(bound)
-        for face, is_line in zip(FACES, ctx.lines, strict=True):
-            if is_line and face[0] != ctx.axis:
-                layer_bar, last_bar, _ = _layers(longer_bar, face, is_whole=True)
-                last_bar -= layer_bar
-                layer_bar *= 2
-        for k, face in reversed(list(enumerate(FACES))):
-            layer_bar, last_bar, before_bar = _layers(longer_bar, face)
-            if not ctx.lines[k]:
-                last_bar += layer_bar
-                continue
-            _, last, before = _layers(longer, face)
-            line = _Line(last, before, lit, bound, k)
-            if lit.ndim:
-                lit_bar[k] = (line.by_lit * layer_bar).sum()
-                bound_bar += (line.by_bound * layer_bar).sum()
-            last_bar += (line.shaded + line.by_rise) * layer_bar
-            before_bar -= line.by_rise * layer_bar
-        return None, None, _inner(longer_bar), lit_bar, bound_bar
+    def backward(ctx: Any, bar: Tensor) -> tuple[None, None, Tensor]:
+        apply, adjoint = ctx.functions
+        return None, None, _Linear.apply(adjoint, apply, bar)
 
     @staticmethod
-    def jvp(ctx: Any, _axis: None, _lines: None, *changes: Tensor | None) -> Any:
-        def change(
-            field: Tensor,
-            lit: Tensor,
-            bound: Tensor,
-            d_field: Tensor | None,
-            d_lit: Tensor | None,
-            d_bound: Tensor | None,
-        ) -> Any:
-            longer = _Extend.forward(FACES_ONLY, ctx.lines, field, lit, bound)
-            changed = _longer(torch.zeros_like(field) if d_field is None else d_field)
-            for k, face in enumerate(FACES):
-                layer, d_last, d_before = _layers(changed, face)
-                value = d_last
-                if ctx.lines[k]:
-                    _, last, before = _layers(longer, face)
-                    line = _Line(last, before, lit, bound, k)
-                    value = line.shaded * d_last + line.by_rise * (d_last - d_before)
-                    if d_lit is not None and lit.ndim:
-                        value = value + line.by_lit * d_lit[k]
-                    if d_bound is not None:
-                        value = value + line.by_bound * d_bound
-                layer.copy_(value)
-            return _go_beyond(changed, ctx.axis, ctx.lines)
-
-        return run_plainly(change, *ctx.saved_tensors, *changes)
+    def jvp(ctx: Any, _apply: None, _adjoint: None, change: Tensor) -> Tensor:
+        return ctx.functions[0](change)
 
 
-class _Line:
-    """On face number `k`: on from the last layer but one, `before`, through the `last`."""
-
-    def __init__(self, last: Tensor, before: Tensor, lit: Tensor, bound: Tensor, k: int):
-        rise = 0.5 * (last - before)
-        less = (1 + (bound * rise) ** 2).rsqrt()
-        line = last + rise * less
-        self.shaded = 1 - lit[k] if lit.ndim else 1 - lit
-        self.value = self.shaded * line
-        self.by_lit = -line
-        self.by_rise = 0.5 * self.shaded * less**3
-        self.by_bound = -self.shaded * bound * (rise * less) ** 3
-
-
-def _longer(field: Tensor) -> Tensor:
+def _add_faces(lines: list[bool], field: Tensor) -> Tensor:
+    """`field` and a layer on each face, of `lines` or of the outermost centers' values."""
     longer = field.new_empty(len(field), *(count + 2 for count in field.shape[1:]))
     _inner(longer).copy_(field)
+    for face, is_line in zip(FACES, lines, strict=True):
+        layer, last, before = _layers(longer, face)
+        layer.copy_(1.5 * last - 0.5 * before if is_line else last)
     return longer
 
 
-def _go_beyond(longer: Tensor, axis: int | None, lines: list[bool]) -> Tensor:
+def _take_faces(lines: list[bool], longer_bar: Tensor) -> Tensor:
+    longer_bar = longer_bar.clone()
+    for face, is_line in reversed(list(zip(FACES, lines, strict=True))):
+        layer_bar, last_bar, before_bar = _layers(longer_bar, face)
+        last_bar += 1.5 * layer_bar if is_line else layer_bar
+        if is_line:
+            before_bar -= 0.5 * layer_bar
+    return _inner(longer_bar)
+
+
+def _go_beyond(axis: int | None, lines: list[bool], longer: Tensor) -> Tensor:
     """From values on faces across other axes than `axis` to those half a cell beyond."""
+    longer = longer.clone()
     for face, is_line in zip(FACES, lines, strict=True):
-        if is_line and axis not in (face[0], FACES_ONLY):
+        if is_line and face[0] != axis:
             layer, last, _ = _layers(longer, face, is_whole=True)
             layer.mul_(2).sub_(last)
     return longer
+
+
+def _come_back(axis: int | None, lines: list[bool], longer_bar: Tensor) -> Tensor:
+    longer_bar = longer_bar.clone()
+    for face, is_line in reversed(list(zip(FACES, lines, strict=True))):
+        if is_line and face[0] != axis:
+            layer_bar, last_bar, _ = _layers(longer_bar, face, is_whole=True)
+            last_bar -= layer_bar
+            layer_bar *= 2
+    return longer_bar
 
 
 def _inner(longer: Tensor) -> Tensor:
