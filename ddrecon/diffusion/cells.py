@@ -14,14 +14,11 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import Medium, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab
-
-THIN = 1.5
-"""Optical depths of a cell up to which light is as good as straight in it."""
 
 
 def average_cells(medium: Medium) -> Medium:
@@ -60,10 +57,9 @@ def sharpen(cells: Medium, light: Moments) -> Moments:
     """The values at centers of light whose means in `cells` are `light` (E2.12).
 
     Of the mean L0 and the flux an eighth of the second differences along each axis is taken off,
-    and ever less where cells have more than `THIN` optical depths: there light bends within them.
+    and the less the thicker cells are (`thinness`): there light bends within them.
     """
-    spacing = (sum(width**-2 for width in cells.grid.spacing) / 3) ** -0.5
-    share = 0.125 / (1 + (spacing / THIN * cells.extinction.value) ** 4)
+    share = 0.125 * thinness(cells.grid, cells.extinction.value)
 
     def at_centers(means: Tensor) -> Tensor:
         return _whole(means - share * _bend(means), cells.grid)

@@ -1,8 +1,8 @@
 """Fields up to the faces of the box: what stands at cells' centers, and a layer more on each side.
 
 On a face matter is what it is at the outermost centers. Light is the line through the two outermost
-centers, and so is the mass to a light, which that lowers by half an optical depth at most; but it
-is zero on faces through which the light shines.
+centers, the less the thicker cells are (E2.12). So is the mass to a light, which that lowers by
+half an optical depth at most; but it is zero on faces through which the light shines.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
+from ddrecon.medium.coefficients import thinness
 from ddrecon.slabs.slab import Slab
 
 GRAZING = 0.1
@@ -40,6 +41,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     """
     grid = emission.grid
     ends = [_is_line(grid, *face) for face in FACES]
+    extinction = emission.extinction.value
     extended = {}
     for name, field in emission.fields.items():
         is_mass = name.startswith("mass ")
@@ -49,6 +51,9 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
             lit = shine_through(emission.beams[int(name.split()[1])], grid)
             longer = _limit(longer, field, emission.extinction.mass_bound)
             longer = longer * _shade(grid, 1 - lit * lit.new_tensor(lines))
+        elif name == "diffuse":
+            near, thin = _stay(field), _stay(thinness(grid, extinction[: len(field)]))
+            longer = near + thin * (longer - near)
         beyond = partial(_go_beyond, axis, lines), partial(_come_back, axis, lines)
         extended[name] = _Linear.apply(*beyond, longer)
     return extended
@@ -75,8 +80,13 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
 
 def _limit(longer: Tensor, field: Tensor, bound: Tensor) -> Tensor:
     """`longer`, less than the nearest of `field` by 1 over `bound` at most."""
-    fall = (longer - pad(field[None], [1] * 6, mode="replicate")[0]).clamp(max=0)
+    fall = (longer - _stay(field)).clamp(max=0)
     return longer + fall * ((1 + (bound * fall) ** 2).rsqrt() - 1)
+
+
+def _stay(field: Tensor) -> Tensor:
+    """`field` and a layer on each side, of what is next to it."""
+    return pad(field[None], [1] * 6, mode="replicate")[0]
 
 
 def _shade(grid: Grid, shares: Tensor) -> Tensor:

@@ -23,6 +23,8 @@ from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
 from ddrecon.slabs.slab import Slab, own_slab
 
+THIN = 1.5
+"""Optical depths of a cell up to which light is as good as straight in it."""
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
 
@@ -329,3 +331,9 @@ def along_colors(sigma: Tensor) -> Tensor:
     """Numbers of each color [C] as `[C, 1, 1, 1]`."""
     # A tensor of its own, not a view: what depends on it is remembered as well.
     return sigma.view(-1, 1, 1, 1) + 0
+
+
+def thinness(grid: Grid, extinction: Tensor) -> Tensor:
+    """From 1 where cells are thin to 0 where they are thick, [C, z, y, x]; 1/2 at `THIN`."""
+    width = (sum(width**-2 for width in grid.spacing) / 3) ** -0.5
+    return 1 / (1 + (width / THIN * extinction) ** 4)
