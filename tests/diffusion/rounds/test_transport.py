@@ -142,19 +142,7 @@ def test_what_is_left_shrinks_in_hard_volumes(
     assert all(after < 0.95 * before for before, after in pairwise(left)), left
 
 
-@pytest.mark.parametrize(
-    ("g", "thickness"),
-    [
-        (-0.8, 2.0),
-        (-0.8, 4.0),
-        (0.0, 2.0),
-        (0.0, 4.0),
-        (0.0, 6.0),
-        (0.8, 4.0),
-        (0.8, 8.0),
-        (0.8, 12.0),
-    ],
-)
+@pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 2.0), (0.8, 4.0)])
 def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
     g: float, thickness: float
 ):
