@@ -20,6 +20,9 @@ from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab
 
+THIN = 1.5
+"""Optical depths of a cell up to which light is as good as straight in it."""
+
 
 def average_cells(medium: Medium) -> Medium:
     """`medium` with cells' means of fields that are linear between their centers.
@@ -59,7 +62,7 @@ def sharpen(cells: Medium, light: Moments) -> Moments:
     Of the mean L0 and the flux an eighth of the second differences along each axis is taken off,
     and the less the thicker cells are (`thinness`): there light bends within them.
     """
-    share = 0.125 * thinness(cells.grid, cells.extinction.value)
+    share = 0.125 * thinness(cells.grid, cells.extinction.value, THIN)
 
     def at_centers(means: Tensor) -> Tensor:
         return _whole(means - share * _bend(means), cells.grid)

@@ -1,8 +1,8 @@
 """Fields up to the faces of the box: what stands at cells' centers, and a layer more on each side.
 
 On a face matter is what it is at the outermost centers. Light is the line through the two outermost
-centers, the less the thicker cells are (E2.12). So is the mass to a light, which that lowers by
-half an optical depth at most; but it is zero on faces through which the light shines.
+centers, but not where cells are opaque. So is the mass to a light, which that lowers by half an
+optical depth at most; but it is zero on faces through which the light shines.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ GRAZING = 0.1
 """Cosine from which on a beam shines fully through a face. Below, ever less: where it only grazes
 a face, what lies closely behind that is lit through others.
 """
+OPAQUE = 20.0
+"""Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
 Linear = Callable[[Tensor], Tensor]
 FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order in which layers are added."""
@@ -52,7 +54,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
             longer = _limit(longer, field, emission.extinction.mass_bound)
             longer = longer * _shade(grid, 1 - lit * lit.new_tensor(lines))
         elif name == "diffuse":
-            near, thin = _stay(field), _stay(thinness(grid, extinction[: len(field)]))
+            near, thin = _stay(field), _stay(thinness(grid, extinction[: len(field)], OPAQUE))
             longer = near + thin * (longer - near)
         beyond = partial(_go_beyond, axis, lines), partial(_come_back, axis, lines)
         extended[name] = _Linear.apply(*beyond, longer)

@@ -23,8 +23,6 @@ from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
 from ddrecon.slabs.slab import Slab, own_slab
 
-THIN = 1.5
-"""Optical depths of a cell up to which light is as good as straight in it."""
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
 
@@ -333,7 +331,7 @@ def along_colors(sigma: Tensor) -> Tensor:
     return sigma.view(-1, 1, 1, 1) + 0
 
 
-def thinness(grid: Grid, extinction: Tensor) -> Tensor:
-    """From 1 where cells are thin to 0 where they are thick, [C, z, y, x]; 1/2 at `THIN`."""
+def thinness(grid: Grid, extinction: Tensor, depth: float) -> Tensor:
+    """From 1 where cells are thin to 0 where they are thick, [C, z, y, x]; 1/2 at a `depth`."""
     width = (sum(width**-2 for width in grid.spacing) / 3) ** -0.5
-    return 1 / (1 + (width / THIN * extinction) ** 4)
+    return 1 / (1 + (width / depth * extinction) ** 4)
