@@ -31,28 +31,25 @@ def average_cells(medium: Medium) -> Medium:
     """
     names = "extinction", "scattering", "remaining", "absorption"
     fields = {name: getattr(medium, name).field for name in names}
-    means = {id(field): _whole(_average(field), medium.grid) for field in fields.values()}
+    means = {id(field): _whole(average(field), medium.grid) for field in fields.values()}
     coefficients = {
         name: replace(getattr(medium, name), field=means[id(field)])
         for name, field in fields.items()
     }
     emission = medium.emission
     if emission is not None:
-        emission = _whole(_average(emission), medium.grid)
+        emission = _whole(average(emission), medium.grid)
     return replace(medium, emission=emission, **coefficients)
 
 
-def _average(field: Tensor) -> Tensor:
+def average(field: Tensor) -> Tensor:
+    """The mean in each cell of `field`, linear between centers and even beyond the outermost."""
     if is_fused():
         from ddrecon.diffusion.rounds.fused.around import means_fused
 
         return means_fused(field)
-    return recompute(_plain_average, field)
-
-
-def _plain_average(field: Tensor) -> Tensor:
     for axis in AXES:
-        field = field + second_difference(field, axis) / 8
+        field = field + recompute(second_difference, field, axis) / 8
     return field
 
 
@@ -65,7 +62,7 @@ def sharpen(cells: Medium, light: Moments) -> Moments:
     share = 0.125 * thinness(cells.grid, cells.extinction.value, THIN)
 
     def at_centers(means: Tensor) -> Tensor:
-        return _whole(means - share * _bend(means), cells.grid)
+        return _whole(means - share * bend(means), cells.grid)
 
     light = replace(light, mean=at_centers(light.mean))
     if light.flux is None:
@@ -74,8 +71,12 @@ def sharpen(cells: Medium, light: Moments) -> Moments:
     return replace(light, flux=(z, y, x))
 
 
-def _bend(means: Tensor) -> Tensor:
+def bend(means: Tensor) -> Tensor:
     """The sum of second differences along all axes; at the ends of one it counts as 0."""
+    if is_fused():
+        from ddrecon.diffusion.rounds.fused.around import bends_fused
+
+        return bends_fused(means)
     bends = torch.zeros_like(means)
     for axis in AXES:
         if means.shape[axis] > 2:

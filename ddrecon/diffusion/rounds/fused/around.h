@@ -81,6 +81,38 @@ struct Means {
     }
 };
 
+// The sum of the second differences along all axes, without those of cells at the ends of an axis.
+struct Bends {
+    template <class F>
+    INLINE static void find(const Row& row, const Line3& line, const F* f, F* const* out) {
+        for (int i = 0; i < row.width; ++i) {
+            F sum = 0;
+            UNROLLED
+            for (int a = 0; a < 3; ++a) {
+                const long long low = line.next(a, -1, i), high = line.next(a, 1, i);
+                if (low && high) sum += f[i + low] - 2 * f[i] + f[i + high];
+            }
+            out[0][row.at + i] = sum;
+        }
+    }
+    template <class F> INLINE static void find_back(
+        const Row& row, const Line3& line, const F* const* bars, F* found) {
+        const F* const bar = bars[0] + row.at;
+        for (int i = 0; i < row.width; ++i) {
+            F sum = 0;
+            UNROLLED
+            for (int a = 0; a < 3; ++a) {
+                const long long low = line.next(a, -1, i), high = line.next(a, 1, i);
+                // Of the neighbors those count that are not at an end themselves.
+                if (low && line.place(a, i) > 1) sum += bar[i + low];
+                if (low && high) sum -= 2 * bar[i];
+                if (high && line.place(a, i) < line.count[a] - 2) sum += bar[i + high];
+            }
+            found[i] = sum;
+        }
+    }
+};
+
 template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const Line3& line, const int* channels, const F* const* fields,
     const F* const* d_fields, const F*, const F*, F* const* made) {

@@ -17,8 +17,13 @@ def rises_fused(q: Tensor) -> Tensor:
 
 
 def means_fused(field: Tensor) -> Tensor:
-    """As `cell_means`."""
+    """As `average`."""
     return _find("Means", field.shape, field)
+
+
+def bends_fused(field: Tensor) -> Tensor:
+    """As `bend`."""
+    return _find("Bends", field.shape, field)
 
 
 def _find(name: str, shape: Sequence[int], field: Tensor) -> Tensor:
