@@ -95,6 +95,8 @@ def test_values_are_within_bounds_and_stay_there_in_a_step(scene: Scene, pattern
     assert kind.low < kind.high and bool((value >= kind.low).all() and (value <= kind.high).all())
     rate = kind.rate(scene, name, value)
     assert bool((torch.as_tensor(rate) > 0).all())
+    if kind.low == 0 and not value.any():
+        value = value + rate
     for sign in (1, -1):
         parameter = Parameter(name, ParameterSettings(), rate, value, scene.volume.grid)
         for _ in range(20):
