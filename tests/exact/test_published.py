@@ -33,9 +33,9 @@ SLABS = {
 }
 """By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
 CLOUDS = {
-    StepCloud("overhead", 0.999999, 1.0): 6.0,
-    StepCloud("slanted", 0.999999, 0.5): 3.0,
-    StepCloud("absorbing", 0.99, 0.5): 3.5,
+    StepCloud("overhead", 0.999999, 1.0): 4.5,
+    StepCloud("slanted", 0.999999, 0.5): 6.0,
+    StepCloud("absorbing", 0.99, 0.5): 6.5,
 }
 
 
