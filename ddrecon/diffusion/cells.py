@@ -31,7 +31,8 @@ def average_cells(medium: Medium) -> Medium:
     """
     names = "extinction", "scattering", "remaining", "absorption"
     fields = {name: getattr(medium, name).field for name in names}
-    means = {id(field): _whole(average(field), medium.grid) for field in fields.values()}
+    different = {id(field): field for field in fields.values()}
+    means = {key: _whole(average(field), medium.grid) for key, field in different.items()}
     coefficients = {
         name: replace(getattr(medium, name), field=means[id(field)])
         for name, field in fields.items()
