@@ -71,8 +71,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     passing, unscattered = reduce(torch.add, leaves)
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
-    source = light_field.means.weighted(factors).plus(received)
-    rise = cell_gradient(light_field.means.mean + received.mean)
+    source = light_field.diffuse.weighted(factors).plus(received)
+    rise = cell_gradient(light_field.diffuse.mean + received.mean)
     scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles)
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid)

@@ -68,16 +68,16 @@ class LightField:
 
     `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `means` are those
-    of `diffuse` light in cells, and `received` is what cells receive of `beams`. `ground` is what
-    lies below, where there is any.
+    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `received` is
+    what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells, else values at
+    centers. `ground` is what lies below, where there is any.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
-    means: Moments
     received: Received
+    has_means: bool = False
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
@@ -189,13 +189,10 @@ def _find_light(
     outside = ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(cells, source, outside, settings, memory)
-    # Views see values at centers.
-    seen = sharpen(cells, diffuse) if settings.rounds else diffuse
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
-    seen, means = (one if sky is None else one.plus(sky) for one in (seen, diffuse))
-    return LightField(
-        medium, follow_lights(medium, lights), seen, means, received, turned=received.turned
-    )
+    light = diffuse if sky is None else diffuse.plus(sky)
+    beams, has_means = follow_lights(medium, lights), settings.rounds > 0
+    return LightField(medium, beams, light, received, has_means, turned=received.turned)
 
 
 def follow_unscattered_light(
@@ -211,10 +208,10 @@ def follow_unscattered_light(
         skies = (*skies, ambient_sky(ambient_radiance(lights, medium.g)))
     light = Moments(torch.zeros_like(medium.extinction.value)) if below is None else below
     if medium.is_anisotropic:
-        return LightField(medium, beams, light, light, received, skies)
+        return LightField(medium, beams, light, received, skies=skies)
     sky = sum_unscattered_sky(medium, skies, 0)
     light = light if sky is None else light.plus(sky)
-    return LightField(medium, beams, light, light, received)
+    return LightField(medium, beams, light, received)
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
@@ -228,7 +225,7 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 def fluence_of(light_field: LightField) -> Tensor:
     """The fluence [C, z, y, x] >= 0, averaged over each cell: of the whole grid, also in slabs."""
     medium = light_field.medium
-    mean = light_field.means.mean + light_field.received.mean
+    mean = light_field.diffuse.mean + light_field.received.mean
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
     mean = mean if sky is None else mean + sky.mean
     return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
@@ -399,6 +396,8 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
+    if light_field.has_means:
+        diffuse = sharpen(medium, diffuse).clamp(min=0)
     return Emission(
         medium.grid,
         medium.extinction,

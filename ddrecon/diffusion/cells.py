@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.third_order import second_difference
@@ -54,22 +53,14 @@ def average(field: Tensor) -> Tensor:
     return field
 
 
-def sharpen(cells: Medium, light: Moments) -> Moments:
-    """The values at centers of light whose means in `cells` are `light` (E2.12).
+def sharpen(medium: Medium, means: Tensor) -> Tensor:
+    """The values at centers of light whose `means` in the cells of `medium` are known (E2.12).
 
-    Of the mean L0 and the flux an eighth of the second differences along each axis is taken off,
-    and the less the thicker cells are (`thinness`): there light bends within them.
+    An eighth of the second differences along each axis is taken off, and the less the thicker
+    cells are (`thinness`): there light bends within them.
     """
-    share = 0.125 * thinness(cells.grid, cells.extinction.value, THIN)
-
-    def at_centers(means: Tensor) -> Tensor:
-        return _whole(means - share * bend(means), cells.grid)
-
-    light = replace(light, mean=at_centers(light.mean))
-    if light.flux is None:
-        return light
-    z, y, x = map(at_centers, light.flux)
-    return replace(light, flux=(z, y, x))
+    share = -0.125 * thinness(medium.grid, medium.extinction.value, THIN)
+    return _whole(torch.addcmul(means, share, bend(means)), medium.grid)
 
 
 def bend(means: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ def ball(cells: int = 12, radius: float = 0.35) -> Tensor:
 def light_after(scene: Scene, rounds: int) -> Tensor:
     """L0 after so many rounds."""
     scene = replace(scene, diffusion=replace(scene.diffusion, transport_rounds=rounds))
-    return solve_light(scene, SolveMemory()).means.mean
+    return solve_light(scene, SolveMemory()).diffuse.mean
 
 
 def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
