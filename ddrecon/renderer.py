@@ -397,7 +397,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
     if light_field.has_means:
-        diffuse = sharpen(medium, diffuse).clamp(min=0)
+        diffuse = sharpen(medium, diffuse)
     return Emission(
         medium.grid,
         medium.extinction,

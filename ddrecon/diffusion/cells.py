@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Medium, thinness
+from ddrecon.medium.coefficients import Medium, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
@@ -54,13 +54,25 @@ def average(field: Tensor) -> Tensor:
 
 
 def sharpen(medium: Medium, means: Tensor) -> Tensor:
-    """The values at centers of light whose `means` in the cells of `medium` are known (E2.12).
+    """The values >= 0 at centers of light with these `means` in the cells of `medium` (E2.12).
 
     An eighth of the second differences along each axis is taken off, and the less the thicker
     cells are (`thinness`): there light bends within them.
     """
-    share = -0.125 * thinness(medium.grid, medium.extinction.value, THIN)
-    return _whole(torch.addcmul(means, share, bend(means)), medium.grid)
+    grid, extinction = medium.grid, medium.extinction
+    if is_fused():
+        from ddrecon.kernels.cell_function import apply_cell
+
+        numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
+        given = "diffusion/fused/sharp.h", "Sharp", 1, numbers
+        (light,) = apply_cell(*given, means, bend(means), extinction.field)
+        return _whole(light, grid)
+
+    def find() -> Tensor:
+        share = thinness(grid, extinction.value, THIN) / 8
+        return (means - share * bend(means)).clamp(min=0)
+
+    return _whole(recompute(find), grid)
 
 
 def bend(means: Tensor) -> Tensor:

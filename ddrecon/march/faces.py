@@ -108,7 +108,8 @@ class _Outermost(torch.autograd.Function):
 def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     """`goal`, less than `layer` by 1 over `bound` at most."""
     fall = (goal - layer).clamp(max=0)
-    return goal + fall * ((1 + (bound * fall) ** 2).rsqrt() - 1)
+    # squared, which must not overflow
+    return goal + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1)
 
 
 def _go_on(face: tuple[int, int], last: Tensor, before: Tensor, lines: list[bool]) -> Tensor:

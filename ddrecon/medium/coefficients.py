@@ -333,5 +333,11 @@ def along_colors(sigma: Tensor) -> Tensor:
 
 def thinness(grid: Grid, extinction: Tensor, depth: float) -> Tensor:
     """From 1 where cells are thin to 0 where they are thick, [C, z, y, x]; 1/2 at a `depth`."""
-    width = (sum(width**-2 for width in grid.spacing) / 3) ** -0.5
-    return 1 / (1 + (width / depth * extinction) ** 4)
+    # to the fourth power, which must not overflow
+    given = mean_width(grid) / depth * extinction
+    return 1 / (1 + (given / (1 + 1e-6 * given)).square().square())
+
+
+def mean_width(grid: Grid) -> float:
+    """That of a cell by whose optical depth it is thin or thick [u]."""
+    return float((sum(width**-2 for width in grid.spacing) / 3) ** -0.5)

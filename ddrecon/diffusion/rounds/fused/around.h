@@ -67,11 +67,11 @@ struct Means {
             for (int k = 0; k < 9; ++k) {
                 const int z = k / 3 - 1, y = k % 3 - 1;
                 const F* row_of = f + (z ? line.next(0, z, 0) : 0) + (y ? line.next(1, y, 0) : 0);
-                sum +=
-                    F((z ? 1 : 6) * (y ? 1 : 6)) * (row_of[i + line.next(2, -1, i)] +
-                                                    6 * row_of[i] + row_of[i + line.next(2, 1, i)]);
+                sum += F((z ? 1 : 6) * (y ? 1 : 6) / 512.0) *
+                       (row_of[i + line.next(2, -1, i)] + 6 * row_of[i] +
+                        row_of[i + line.next(2, 1, i)]);
             }
-            out[0][row.at + i] = sum / 512;
+            out[0][row.at + i] = sum;
         }
     }
     template <class F> INLINE static void find_back(
