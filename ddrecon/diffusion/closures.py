@@ -136,18 +136,27 @@ def _even_potential(grid: Grid, dtype: torch.dtype, device: torch.device) -> Ten
 @functools.lru_cache(maxsize=8)
 @torch.inference_mode(False)
 def _spectrum(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The Fourier transform of 1 / distance in a box twice as wide."""
-    axes = [
-        torch.fft.fftfreq(2 * n, 1 / (2 * n * step), dtype=dtype, device=device)
-        for n, step in zip(grid.shape, grid.spacing, strict=True)
-    ]
-    z, y, x = torch.meshgrid(*axes, indexing="ij")
-    # 1 / distance; within a cell, its mean over the sphere of the cell's volume, 3 / (2 radius)
-    radius = (3 * math.prod(grid.spacing) / (4 * math.pi)) ** (1 / 3)
-    square = z * z + y * y + x * x
-    within = square == 0
-    kernel = torch.where(within, 1.5 / radius, torch.where(within, 1, square).rsqrt())
-    return torch.fft.rfftn(kernel)
+    """The Fourier transform of 1 / distance, averaged over cells, in a box twice as wide."""
+    # mean over a cell = sum over its corners, at x, y, z, of these terms (MacMillan 1930, ch. 2)
+    corners = []
+    for n, step in zip(grid.shape, grid.spacing, strict=True):
+        centers = torch.fft.fftfreq(2 * n, 1 / (2 * n * step), dtype=torch.float64)
+        corners.append(torch.stack([centers + step / 2, centers - step / 2]))
+    z, y, x = (_along(line, axis) for axis, line in enumerate(corners))
+    radius = (z * z + y * y + x * x).sqrt()
+    terms = torch.zeros_like(radius)
+    for one, two, three in ((z, y, x), (y, x, z), (x, z, y)):
+        terms += one * two * torch.asinh(three / torch.hypot(one, two))
+        terms -= one**2 / 2 * torch.atan(two * three / (one * radius))
+    kernel = -terms.diff(1, 0).diff(1, 2).diff(1, 4).squeeze((0, 2, 4)) / math.prod(grid.spacing)
+    return torch.fft.rfftn(kernel.to(device, dtype))
+
+
+def _along(line: Tensor, axis: int) -> Tensor:
+    """`line` [2, n] as a field [2, z, 2, y, 2, x] that varies along `axis` alone."""
+    shape = [1] * 6
+    shape[2 * axis : 2 * axis + 2] = line.shape
+    return line.view(shape)
 
 
 CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
@@ -56,18 +57,44 @@ def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
     )
 
 
+def mean_inverse_distance(grid: Grid, points: Tensor, part: float = 1.0) -> Tensor:
+    """That of the origin to a cell of `grid` at each of `points` [N, 3], by Gauss-Legendre.
+
+    `part`: of the widths of a cell.
+    """
+    nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(20))
+    size = part * torch.tensor(grid.spacing, dtype=torch.float64)
+    within = torch.cartesian_prod(nodes, nodes, nodes) / 2 * size
+    return (
+        (1 / (points[:, None] + within).norm(dim=-1))
+        @ torch.cartesian_prod(weights, weights, weights).prod(1)
+        / 8
+    )
+
+
 def test_distances_are_those_summed_cell_by_cell():
     grid = box_grid((3, 4, 2))
     weight: Tensor = half_empty(2, *grid.shape) + 0.03 / sum(grid.extent)
-    places = torch.stack([c.expand(grid.shape) for c in grid.centers(weight)]).flatten(1)
-    apart = (places[:, :, None] - places[:, None]).square().sum(0).sqrt()
-    apart.fill_diagonal_((3 * math.prod(grid.spacing) / (4 * math.pi)) ** (1 / 3) / 1.5)
-    expected = (weight.flatten(1) @ (1 / apart) / weight.flatten(1).sum(1, keepdim=True)).view_as(
+    places = torch.stack([c.expand(grid.shape) for c in grid.centers(weight)]).flatten(1).mT
+    inverse = mean_inverse_distance(grid, (places[:, None] - places).flatten(0, 1)).view(24, 24)
+    # of a cell to its own middle: its 27 parts, one of which is three times as near
+    thirds = torch.cartesian_prod(*[torch.tensor([-1.0, 0, 1]).double()] * 3)
+    thirds = thirds[thirds.abs().sum(1) > 0] / 3 * torch.tensor(grid.spacing)
+    inverse.fill_diagonal_(mean_inverse_distance(grid, thirds, 1 / 3).sum() / 24)
+    expected = (weight.flatten(1) @ inverse / weight.flatten(1).sum(1, keepdim=True)).view_as(
         weight
     )
     without_haze = Coefficient(torch.ones(()), weight - 0.03 / sum(grid.extent))
     found = inverse_distance([without_haze], grid)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=0)
+
+
+def test_flat_cells_have_distances_of_their_shape():
+    """A plate of 2 w by 2 w has the mean 1 / distance asinh(1) / (w / 2) to its middle."""
+    flat = Grid((4, 1, 1), (0.0, -1.0, -1.0), (4e-4, 1.0, 1.0))
+    found = inverse_distance([Coefficient(torch.ones(()), torch.ones(1, 4, 1, 1).double())], flat)
+    expected = torch.full_like(found, 2 * math.asinh(1))
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
 
 
 def sphere(grid: Grid, radius: float) -> tuple[Tensor, Tensor]:
