@@ -21,7 +21,7 @@ from ddrecon.cameras import Rays
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
-from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep_rule
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep_rule
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
@@ -55,7 +55,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     light that is scattered.
     """
     light_field = solve_light(scene, SolveMemory())
-    medium, angles = light_field.medium, scene.diffusion.angles
+    medium, directions = light_field.medium, DIRECTIONS[scene.diffusion.angles]
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, scene.diffusion):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
@@ -63,7 +63,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     enters, leaves = dict[str, Tensor](), list[Tensor]()
     for number, light in enumerate(scene.lights):
         parts = decompose_lights([light])
-        crossing = reduce(torch.add, (_cross_box(part, media, angles) for part in parts))
+        crossing = reduce(torch.add, (_cross_box(part, media, directions) for part in parts))
         enters[f"lights.{number}"] = crossing[0].sum(0)
         leaves.append(crossing[1:])
     if not any(bool((power > 0).any()) for power in enters.values()):
@@ -73,7 +73,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles)
+    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, directions)
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid)
     lost = average_cells(medium).absorption.value * fluence_of(light_field)
@@ -98,7 +98,7 @@ def _plain(values: Tensor) -> float | list[float]:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _cross_box(part: Source, media: Sequence[Medium], angles: int) -> Tensor:
+def _cross_box(part: Source, media: Sequence[Medium], directions: int) -> Tensor:
     """The power of `part` of a light that leaves by each of `FACES`, [1 + media, 6, C].
 
     First what would if the box were empty, then what does unscattered in each of the `media`.
@@ -108,7 +108,7 @@ def _cross_box(part: Source, media: Sequence[Medium], angles: int) -> Tensor:
         sides = [math.prod(grid.extent) / grid.extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
         empty = math.pi * torch.outer(radiance.new_tensor(sides), radiance).double()
         dark = Moments(torch.zeros_like(media[0].extinction.value))
-        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), angles
+        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), directions
         found = [empty, *(empty + _sweep_out(medium, *given) for medium in media)]
         return torch.stack(torch.broadcast_tensors(*found))
     if isinstance(part, Sky):
@@ -159,7 +159,7 @@ def _shine_on(
 
 
 def _sweep_out(
-    medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None, angles: int
+    medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None, directions: int
 ) -> Tensor:
     """The power [6, C] that leaves by each face, in one sweep, of light that `source` scatters.
 
@@ -167,9 +167,9 @@ def _sweep_out(
     empty box.
     """
     grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
-    directions, weights, values = sweep_rule(angles, len(moments))
+    courses, weights, values = sweep_rule(directions, len(moments))
     power = moments.new_zeros(6, 1, dtype=torch.float64)
-    for direction, weight, row in zip(directions, weights, values.to(moments), strict=True):
+    for direction, weight, row in zip(courses, weights, values.to(moments), strict=True):
         scatters = torch.tensordot(row, moments, 1)
         _, leaving = radiance_along(cells, scatters, rise, inflow, direction)
         course, left = Course.of(grid, direction), leaving.clone()

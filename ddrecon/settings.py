@@ -87,8 +87,7 @@ class DiffusionSettings:
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
-        "transport_directions": "directions follow from diffusion.degree: write degree: 3 for 26, "
-        "5 for 50 or 7 for 86"
+        "transport_directions": "directions follow from diffusion.transport_rounds and degree"
     }
     """Keys of old scene files, and what to write instead."""
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS
+from ddrecon.diffusion.rounds.sweep import count_directions
 from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
@@ -101,7 +101,7 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     terms.append(f"multiple scattering by {settings.model} diffusion, {method}")
     if settings.rounds:
         rounds = _count(settings.rounds, "transport round")
-        directions = DIRECTIONS[settings.angles]
+        directions = count_directions(settings.angles, settings.rounds)
         rounds += f" of sweeps along {directions} directions, each with a diffusion solve"
         if medium.degree > 1:
             left = remaining_moments(medium)[2].abs().max().item()

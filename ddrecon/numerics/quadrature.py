@@ -1,9 +1,11 @@
-"""Directions and weights that integrate over the sphere, by Lebedev's rules and one more.
+"""Directions and weights that integrate over the sphere, by Lebedev's rules and two more.
 
 They are exact for polynomials up to some degree, and symmetric under every rotation and reflection
 of the cube, so no axis of the grid is preferred. Sources: Lebedev 1975,
 doi:10.1016/0041-5553(75)90133-0, and 1976, doi:10.1016/0041-5553(76)90100-2. That of 18 points
-follows from the means of x^4 and of x^2 y^2 alone.
+follows from the means of x^4 and of x^2 y^2 alone. That of 44 points is exact for the flux through
+a face as well: the mean of |x|, of which Lebedev's rules lack 11, 8, 1 and 1 percent. It has the
+means of x^4, x^2 y^2 z^2 and |x|, and those of degree 8 and 10 within 0.4 and 1.3 percent.
 """
 
 from __future__ import annotations
@@ -18,6 +20,14 @@ _ORBITS = {
         ((0.0, 0.0, 1.0), 1 / 21),
         ((0.0, 0.5**0.5, 0.5**0.5), 4 / 105),
         ((3**-0.5, 3**-0.5, 3**-0.5), 9 / 280),
+    ),
+    44: (
+        ((0.0, 0.5**0.5, 0.5**0.5), 0.022379852539727116),
+        ((3**-0.5, 3**-0.5, 3**-0.5), 0.024345135271135538),
+        (
+            (0.2661197192863606, 0.2661197192863606, (1 - 2 * 0.2661197192863606**2) ** 0.5),
+            0.02236169530642458,
+        ),
     ),
     50: (
         ((0.0, 0.0, 1.0), 4 / 315),
@@ -40,7 +50,7 @@ _ORBITS = {
     ),
 }
 """By number of points, the coordinates of one of each orbit and its weight."""
-DEGREES = {18: 5, 26: 7, 50: 11, 86: 15}
+DEGREES = {18: 5, 26: 7, 44: 7, 50: 11, 86: 15}
 """The degree up to which the rule of so many points is exact."""
 
 

@@ -61,6 +61,10 @@ THICK = 1.5, 4.0
 """Where a cell has more optical depths than one of these, a round more: theta of E7.2 is less than
 1. Measured on half-spaces and slabs (docs/accuracy.md).
 """
+SOFT = 3.0
+"""Where no face is dense and a cell has more optical depths, one round: later ones darken soft
+edges. Measured on merged balls (docs/accuracy.md).
+"""
 FLAT, BACKWARD = 0.5, 0.2
 """A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
 side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
@@ -303,10 +307,12 @@ def choose_rounds(
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     has_density = not any(name.endswith("density") for name in optimized)
     is_flat &= has_density
-    depth = greatest_depth(volume) if is_flat and volume is not None else 0.0
+    depth = greatest_depth(volume) if has_density and volume is not None else 0.0
     if is_flat or _turns_back(phase):
         thick_rounds = sum(depth > bound for bound in THICK)
         rounds, degree = rounds + max(left > MORE_ROUNDS[1], thick_rounds), 5
+    elif depth > SOFT:
+        rounds = 1
     return replace(
         settings,
         transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,

@@ -51,6 +51,13 @@ def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count: 
     assert max(error(count, powers) for powers in monomials if sum(powers) == top) > 1e-5
 
 
+def test_the_flux_through_a_face_is_exact_with_44_directions():
+    """As half the sphere has it: the mean of |x| is 1/2."""
+    directions, weights = RULES[44]
+    flux = weights @ directions.abs()
+    torch.testing.assert_close(flux, torch.full_like(flux, 0.5), rtol=1e-14, atol=0)
+
+
 @each_rule
 def test_directions_are_unit_and_weights_are_positive_and_sum_to_one(count: int):
     directions, weights = RULES[count]

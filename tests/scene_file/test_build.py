@@ -65,6 +65,7 @@ def test_constants(write: Write):
         (0.3, 0.5, False, (1, 1)),
         (0.3, 0.5, True, (1, 5)),
         (0.8, 0.5, False, (3, 3)),
+        (0.8, 4, False, (1, 3)),
         (0.8, 0.5, True, (4, 5)),
         (0.8, 3, True, (4, 5)),
         (-0.8, 3, False, (4, 5)),

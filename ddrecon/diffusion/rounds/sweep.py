@@ -30,30 +30,34 @@ from ddrecon.ranks import own_rank, rank_count
 from ddrecon.slabs.exchange import add_halo, swap_layers
 from ddrecon.slabs.slab import Slab
 
-DIRECTIONS = {1: 18, 3: 26, 5: 50, 7: 86}
-"""By the degree to which angles are kept, directions of a rule that is exact to twice that.
+DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
+"""By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
+OF_ONE_ROUND = {1: 18, 3: 26}
+"""Fewer, where there is one round: what they lack is about what that has not yet brought back."""
 
-Of two moments 26 give no better images than 18; 14, along axes and corners of a cube, worse ones.
-"""
+
+def count_directions(degree: int, rounds: int) -> int:
+    """How many directions the sweeps of so many `rounds` have."""
+    return OF_ONE_ROUND.get(degree, DIRECTIONS[degree]) if rounds == 1 else DIRECTIONS[degree]
 
 
 def sweep(
-    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, degree: int
+    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, directions: int
 ) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `gradient` [3, C, z, y, x]:
     of the first, as of `cell_gradient`; `inflow`: light from
-    outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
+    outside, as of `radiance_along`; `directions`: how many (`count_directions`).
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
-    directions, weights, values = sweep_rule(degree, count)
+    courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
-    axis, shape, ways = 0, list(grid.shape), [0] * len(directions)
+    axis, shape, ways = 0, list(grid.shape), [0] * len(courses)
     nothing = source.new_zeros(())
     if isinstance(grid, Slab):
         axis, shape[grid.axis] = grid.axis, grid.size
-        ways = [Course.of(grid.whole, direction).way_along(axis) for direction in directions]
+        ways = [Course.of(grid.whole, direction).way_along(axis) for direction in courses]
         # It varies as light does: all layers are exchanged alike.
         nothing = torch.zeros_like(source[0].narrow(axis - 3, 0, 1)) + 0 * source.flatten()[0]
     moments = source.new_zeros(count, colors * math.prod(shape))
@@ -64,7 +68,7 @@ def sweep(
         def follow() -> tuple[Tensor, Tensor]:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            return radiance_along(medium, scatters, gradient, inflow, directions[number], entering)
+            return radiance_along(medium, scatters, gradient, inflow, courses[number], entering)
 
         radiance, leaving = recompute(follow)
         moments.addr_(weights[number] * row, radiance.flatten())
@@ -109,11 +113,12 @@ def _pass_on(
 
 
 def sweep_change(
-    medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, degree: int
+    medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, directions: int
 ) -> Moments:
     """By how much the first two moments of light change in a sweep, and those of higher degree.
 
-    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). `inflow` and `degree` as of `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). `inflow` and `directions` as of
+    `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
@@ -128,9 +133,9 @@ def sweep_change(
             # the kernels' factors are the same everywhere: what scatters is summed before
             source = light.weighted(factors).plus(source)
             factors = torch.zeros_like(factors[..., :1, :1, :1])
-        return sweep_fused(medium, light, factors, source, gradient, inflow, DIRECTIONS[degree])
+        return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    swept = Moments.of_harmonics(sweep(medium, scatters, gradient, inflow, degree))
+    swept = Moments.of_harmonics(sweep(medium, scatters, gradient, inflow, directions))
     return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
 
 
@@ -153,8 +158,8 @@ def cell_gradient(q: Tensor) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def sweep_rule(degree: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
-    """Directions, weights, and the first `count` harmonics [N, K] of each direction."""
-    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
-    values = harmonics(points, degree).T[:, :count].contiguous()
+def sweep_rule(directions: int, count: int) -> tuple[list[Direction], list[float], Tensor]:
+    """The directions of so many, weights, and the first `count` harmonics [N, K] of each."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
+    values = harmonics(points, math.isqrt(count - 1)).T[:, :count].contiguous()
     return [(z, y, x) for z, y, x in points.tolist()], weights.tolist(), values

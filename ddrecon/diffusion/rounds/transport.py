@@ -18,7 +18,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change
+from ddrecon.diffusion.rounds.sweep import count_directions, sweep_change
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Coefficient, Medium
@@ -51,15 +51,16 @@ def run_rounds(
     if rounds == 0:
         return light
     medium, grid = problem.medium, problem.medium.grid
-    light, emitted = _renewed(light, grid), _sweep_emission(medium, degree)
+    directions = count_directions(degree, rounds)
+    light, emitted = _renewed(light, grid), _sweep_emission(medium, directions)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
-        made = _round(problem, light, emitted, solve, degree, round_index, cosine, factor)
+        made = _round(problem, light, emitted, solve, directions, round_index, cosine, factor)
         light = _renewed(made, grid)
     return light
 
 
-def _sweep_emission(medium: Medium, degree: int) -> Moments | None:
+def _sweep_emission(medium: Medium, directions: int) -> Moments | None:
     """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
 
     It is the same in all rounds, and swept once: as light of mean 1 that `medium` would scatter
@@ -71,7 +72,7 @@ def _sweep_emission(medium: Medium, degree: int) -> Moments | None:
     emitting = replace(medium, remaining=Coefficient(emission.new_ones(1, 1, 1, 1), emission))
     nothing = torch.zeros_like(medium.extinction.value.detach() * emission.detach())
     even = Moments(torch.ones_like(nothing))
-    return sweep_change(emitting, Moments(nothing), even, None, degree)
+    return sweep_change(emitting, Moments(nothing), even, None, directions)
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -87,7 +88,7 @@ def _round(
     light: Moments,
     emitted: Moments | None,
     solve: SolverWithMemory,
-    degree: int,
+    directions: int,
     round_index: int,
     cosine: Tensor,
     factor: Tensor | None,
@@ -101,14 +102,14 @@ def _round(
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(medium, light, problem.source, inflow, degree)
+    change = sweep_change(medium, light, problem.source, inflow, directions)
     change = change if emitted is None else change.plus(emitted)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:
         imbalance = _imbalance(operator, right, light.mean)
         off = Moments(imbalance, problem.flux(light.mean, begun=light.flux, sign=-1))
-    gain, source, turned = _gain(medium, change, off, degree, cosine)
+    gain, source, turned = _gain(medium, change, off, directions, cosine)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
@@ -146,7 +147,7 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
 
 def _gain(
-    medium: Medium, change: Moments, off: Moments | None, degree: int, cosine: Tensor
+    medium: Medium, change: Moments, off: Moments | None, directions: int, cosine: Tensor
 ) -> tuple[Moments, Tensor, Vector | None]:
     """theta (L0' - L0) and theta (L1' - L1) + L1 - 3 F(L0) of E2.10, and what they add to S.
 
@@ -154,7 +155,7 @@ def _gain(
     the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and L1 -
     3 F(L0), None for zero.
     """
-    step = _mean_step(whole_of(medium.grid), degree)
+    step = _mean_step(whole_of(medium.grid), directions)
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
@@ -200,13 +201,13 @@ def _transport_share(medium: Medium, step: tuple[float, float]) -> Tensor:
 
 
 @functools.cache
-def _mean_step(grid: Grid, degree: int) -> tuple[float, float]:
+def _mean_step(grid: Grid, directions: int) -> tuple[float, float]:
     """The mean length of a step along the directions of the quadrature [u].
 
     And the part of it by whose depth light diffuses too much, along the worst axis, because it goes
     on to several cells (E7.2). Along an axis of one cell nothing varies: such steps do not count.
     """
-    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     total = weight_of_steps = 0.0
     shared = [0.0, 0.0, 0.0]
     for point, weight in zip(points.tolist(), weights.tolist(), strict=True):

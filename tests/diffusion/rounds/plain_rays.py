@@ -109,14 +109,14 @@ def mean_density(density: Tensor) -> Tensor:
     return found
 
 
-def share_by_loops(medium: Medium, degree: int) -> Tensor:
+def share_by_loops(medium: Medium, directions: int) -> Tensor:
     """theta = 1 / (1 + 0.7 rho kappa_tr / kappa_t), rho = (d/2) coth(d/2) - 1 of a mean step.
 
     And kappa_t 3/2 of the mean of t (1 - t) h^2 / step, along the axis where that is most.
     """
     length = weights = 0.0
     shared = [0.0, 0.0, 0.0]
-    for w, weight in quadrature({3: 26, 5: 50}[degree]):
+    for w, weight in quadrature(directions):
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
@@ -148,15 +148,21 @@ def factors_by_formula(g: float, rounds: int) -> list[float]:
 
 
 def round_by_loops(
-    problem: DiffusionProblem, swept: Medium, light: Moments, g: float, degree: int, is_last: bool
+    problem: DiffusionProblem,
+    swept: Medium,
+    light: Moments,
+    g: float,
+    degree: int,
+    directions: int,
+    is_last: bool,
 ) -> Moments:
     """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves.
 
     `swept` is the problem's medium with the means of cells.
     """
     operator, right = problem.system
-    directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
-    matrix, theta = dense_matrix(operator)[0], share_by_loops(swept, degree)
+    angles = degree if problem.has_flux else 0
+    matrix, theta = dense_matrix(operator)[0], share_by_loops(swept, directions)
     p = remaining_by_formula(g, angles)
     each = light.mean.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
     source = each.view(-1, 1, 1, 1, 1) * light.harmonics(angles) + problem.source.harmonics(angles)

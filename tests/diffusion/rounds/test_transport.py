@@ -17,7 +17,7 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep
+from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.grid import Grid, Triple
@@ -58,7 +58,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
     light = last + source.mean
-    swept = sweep(medium, light[None], cell_gradient(light), None, 3)[0]
+    swept = sweep(medium, light[None], cell_gradient(light), None, 44)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
@@ -217,27 +217,16 @@ def test_light_from_two_beams_is_the_sum_of_both():
     )
 
 
-def test_directions_agree_the_better_the_more_there_are():
-    scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
-    few, some, many = (
-        render(replace(scene, diffusion=replace(scene.diffusion, degree=degree)))
-        for degree in sorted(set(DIRECTIONS) - {1})
-    )
-    assert (
-        float((some - many).norm()) < 0.6 * float((few - many).norm()) < 0.02 * float(many.norm())
-    )
-
-
 def test_memory_does_not_grow_with_directions():
     """Arrays of cells that are kept for the backward pass of a sweep."""
 
-    def kept(degree: int) -> int:
+    def kept(directions: int) -> int:
         scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
         medium, source = scale_medium(scene.volume), torch.ones(1, 3, 10, 10, 10).double()
         found = []
         with saved_tensors_hooks(lambda one: found.append(one.detach()) or one, lambda one: one):
-            total = sweep(medium, source, cell_gradient(source[0]), None, degree).sum()
+            total = sweep(medium, source, cell_gradient(source[0]), None, directions).sum()
         assert total.requires_grad
         return len({one.data_ptr() for one in found if one.numel() >= 1000})
 
-    assert kept(7) == kept(5)
+    assert kept(86) == kept(44)
