@@ -310,7 +310,7 @@ def choose_rounds(
     depth = greatest_depth(volume) if has_density and volume is not None else 0.0
     if is_flat or _turns_back(phase):
         thick_rounds = sum(depth > bound for bound in THICK)
-        rounds, degree = rounds + max(left > MORE_ROUNDS[1], thick_rounds), 5
+        rounds, degree = rounds + max(left > MORE_ROUNDS[0], thick_rounds), 5
     elif depth > SOFT:
         rounds = 1
     return replace(

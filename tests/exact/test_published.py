@@ -21,21 +21,21 @@ FOUR_ROUNDS = "diffusion.degree=5", "diffusion.transport_rounds=4"
 """By default a cloud of one cell across is taken for one of thick cells."""
 
 # What is claimed of our defaults, in percent; of clouds, what four rounds of degree 5 come to.
-HALF_SPACE = {"R": 2.5, "up": 4.5}
-VAN_DE_HULST_SLAB = {"R": 2.5, "up": 9.0, "T": 1.0, "down": 2.5}
+HALF_SPACE = {"R": 0.2, "up": 1.2}
+VAN_DE_HULST_SLAB = {"R": 1.2, "up": 4.5, "T": 0.5, "down": 1.2}
 SLABS = {
-    ("Rayleigh", 1.0): {"R": 1.0, "up": 2.5, "T": 1.0, "down": 5.5},
-    ("Rayleigh", 8.0): {"R": 1.5, "up": 4.5, "T": 17.0, "down": 21.0},
-    ("g 0.75", 1.0): {"R": 7.0, "up": 12.5, "T": 0.5, "down": 2.5},
-    ("g 0.75", 8.0): {"R": 1.5, "up": 8.0, "T": 2.5, "down": 4.5},
-    ("haze", 1.0): {"R": 6.0, "up": 13.0, "T": 0.5, "down": 2.5},
-    ("haze", 8.0): {"R": 2.0, "up": 9.0, "T": 2.0, "down": 3.5},
+    ("Rayleigh", 1.0): {"R": 0.6, "up": 1.8, "T": 0.4, "down": 1.5},
+    ("Rayleigh", 8.0): {"R": 0.6, "up": 4.0, "T": 6.5, "down": 7.0},
+    ("g 0.75", 1.0): {"R": 0.7, "up": 5.0, "T": 0.2, "down": 1.0},
+    ("g 0.75", 8.0): {"R": 0.5, "up": 5.5, "T": 1.0, "down": 1.5},
+    ("haze", 1.0): {"R": 0.5, "up": 4.5, "T": 0.2, "down": 0.8},
+    ("haze", 8.0): {"R": 1.0, "up": 4.5, "T": 0.4, "down": 1.0},
 }
 """By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
 CLOUDS = {
-    StepCloud("overhead", 0.999999, 1.0): 4.5,
-    StepCloud("slanted", 0.999999, 0.5): 6.0,
-    StepCloud("absorbing", 0.99, 0.5): 6.5,
+    StepCloud("overhead", 0.999999, 1.0): 4.0,
+    StepCloud("slanted", 0.999999, 0.5): 7.5,
+    StepCloud("absorbing", 0.99, 0.5): 7.5,
 }
 
 
