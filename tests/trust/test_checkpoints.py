@@ -165,7 +165,7 @@ def test_an_empty_section_is_a_difference() -> None:
 
 
 def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:
-    assert run(*OPTIMIZE, "-D", "optimize.parameters.density.lr=1e38").exit_code == 4
+    assert run(*OPTIMIZE, "-D", "optimize.parameters.density.lr=3e38").exit_code == 4
     assert run(*RESUME, "-D", "optimize.parameters.density.lr=0.1").exit_code == 0
 
 
