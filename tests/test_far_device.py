@@ -1,7 +1,5 @@
 """What ddrecon does on a device of its own: all that CUDA would refuse, but no GPU is needed."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -121,8 +119,7 @@ def run(name: str, device: torch.device) -> Result:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "engine"),
-    [("plume", "warp"), ("capture", "torch"), ("capture", "warp")],
+    ("name", "engine"), [("plume", "warp"), ("capture", "torch"), ("capture", "warp")]
 )
 def test_iterations_there_find_what_they_find_on_the_processor(name: str, engine: str) -> None:
     if engine == "warp":

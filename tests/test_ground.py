@@ -1,7 +1,5 @@
 """A ground: closed forms, energy, derivatives and invariance."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

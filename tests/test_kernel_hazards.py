@@ -1,7 +1,5 @@
 """What could go wrong between kernels and tensors: layouts in memory, modes of torch, threads."""
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import threading

@@ -1,7 +1,5 @@
 """The renderer as a layer: networks train through it, and so do torch's function transforms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

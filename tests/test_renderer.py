@@ -1,7 +1,5 @@
 """The renderer as a whole: energy, symmetries and scalings of images, and their derivatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

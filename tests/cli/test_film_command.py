@@ -1,7 +1,5 @@
 """A film from the command line: each frame is a run, and nothing depends on when it was done."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

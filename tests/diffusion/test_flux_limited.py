@@ -1,7 +1,5 @@
 """Flux-limited diffusion: its limiters, its fixed point, the derivatives of that, and failures."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -3,8 +3,6 @@
 Values and cotangents, for coefficients that are constant or differ from cell to cell.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The fused kernels of multigrid compute what PyTorch's operations compute, as often as those."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

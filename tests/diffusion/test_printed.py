@@ -3,8 +3,6 @@
 And its Algorithm 3: where it stops, and what it says where it diverges.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -3,8 +3,6 @@
 In the order in which it stands there, on fewer cells, paths and samples.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable

@@ -5,8 +5,6 @@ I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance
 the light (Chandrasekhar, Radiative Transfer, 1950, chapter III).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

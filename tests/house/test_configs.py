@@ -1,7 +1,5 @@
 """Every scene under configs/ loads, and reconstructs on few cells from one picture."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import fields, replace
 from pathlib import Path

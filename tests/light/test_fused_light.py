@@ -3,8 +3,6 @@
 Values and derivatives, on grids and along directions where interpolation has kinks.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Light not yet scattered: its moments at cells, and ambient light by quadrature."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -12,11 +10,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import (
-    ambient_sky,
-    receive_light,
-    sum_unscattered_sky,
-)
+from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
 

@@ -1,7 +1,5 @@
 """Pixels between lattice rays by fused kernels are those by PyTorch's operations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Fields up to the faces of the box: light that is linear is so up to there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

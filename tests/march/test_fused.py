@@ -3,8 +3,6 @@
 Values, derivatives in reverse and in forward mode, for all that an emission can hold.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What a camera's rays meet is found once, anew where anything changed, and goes with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -3,8 +3,6 @@
 So are runs in slabs, and samples of a run that several share.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import os

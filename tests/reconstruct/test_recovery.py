@@ -2,8 +2,6 @@
 one kind or of all. By diffusion alone: the loop is tried here, not the rounds.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Reconstructions that share their numbers: copies of one agree with it, and all move as one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

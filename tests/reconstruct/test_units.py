@@ -1,7 +1,5 @@
 """A run does not depend on units: of density, as per km or per mm, or of length."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

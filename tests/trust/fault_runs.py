@@ -1,13 +1,11 @@
 """Runs that are killed, interrupted or out of disk space at random moments, until they are done all
 the same.
 
-    python fault_runs.py kill|full FOLDER COUNT
+    python fault_runs.py FOLDER SIGNALS SHORTAGES
 
 One process imports torch and forks a child for every fault, so that each costs a fraction of a
 second. Prints as JSON what happened.
 """
-
-from __future__ import annotations
 
 import json
 import os

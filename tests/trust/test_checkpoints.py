@@ -2,8 +2,6 @@
 goes on.
 """
 
-from __future__ import annotations
-
 import random
 import warnings
 from collections.abc import Callable, Iterator
@@ -19,13 +17,7 @@ from ddrecon.errors import DataWarning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
-from ddrecon.run.checkpoint import (
-    LAST,
-    PREVIOUS,
-    differences,
-    load_checkpoint,
-    save_checkpoint,
-)
+from ddrecon.run.checkpoint import LAST, PREVIOUS, differences, load_checkpoint, save_checkpoint
 
 pytestmark = pytest.mark.slow
 

@@ -2,8 +2,6 @@
 chunks; little on precision.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace

@@ -2,8 +2,6 @@
 bits of one left alone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -49,11 +49,7 @@ def test_every_parameter_passes(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
-    [
-        ("sigma_t", ()),
-        ("albedo", ()),
-        ("g", ("optimize.parameters.g={init: -0.6, field: true}",)),
-    ],
+    [("sigma_t", ()), ("albedo", ()), ("g", ("optimize.parameters.g={init: -0.6, field: true}",))],
 )
 def test_the_other_forms_of_a_parameter_pass(name: str, overrides: tuple[str, ...]) -> None:
     """The other pair of cross sections, and g of each cell."""

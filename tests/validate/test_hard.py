@@ -1,7 +1,5 @@
 """The hard cases keep their bounds, and whatever breaks a bound is told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module

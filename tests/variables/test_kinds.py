@@ -1,7 +1,5 @@
 """The table of variables: every kind can be set, differentiated and optimized as its row says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The fused kernels of a sweep compute what PyTorch's operations compute, derivatives included."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Sweeps and rounds are what loops over directions and cells make of E2.9 and E2.10."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
@@ -17,11 +15,7 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
-from ddrecon.diffusion.rounds.transport import (
-    _mean_step,
-    _transport_share,
-    run_rounds,
-)
+from ddrecon.diffusion.rounds.transport import _mean_step, _transport_share, run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium

@@ -1,7 +1,5 @@
 """Transport rounds: where they lead, how fast, in thick cells, and what derivatives cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -47,13 +45,7 @@ def light_after(scene: Scene, rounds: int) -> Tensor:
 
 
 def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
-    scene = make_scene(
-        ball(),
-        sigma_a=(0.0,),
-        sigma_s=(3.0,),
-        directional=(3.0,),
-        tolerance=1e-10,
-    )
+    scene = make_scene(ball(), sigma_a=(0.0,), sigma_s=(3.0,), directional=(3.0,), tolerance=1e-10)
     medium = average_cells(scale_medium(scene.volume))
     source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
