@@ -75,6 +75,26 @@ def test_layout_in_memory_changes_nothing(is_cellwise: bool):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
 
 
+@pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
+    is_cellwise: bool, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("ddrecon.diffusion.solvers.fused.hierarchy.SMALL", 0)
+    use_engine("warp")
+    scene, threads, runs = every_light(is_cellwise), torch.get_num_threads(), []
+    values = {name: value_of(scene, name).detach() for name in VARIED}
+    try:
+        for count in (2, 2, 1, 3, 16):
+            torch.set_num_threads(count)
+            runs.append(differentiate(scene, values))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(map(torch.equal, runs[0], runs[1]))
+    for other in runs[2:]:
+        for one, known in zip(other, runs[0], strict=True):
+            torch.testing.assert_close(one, known, rtol=0, atol=1e-11 * float(known.norm()))
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_second_derivatives_are_refused(engine: str):
     """Rather than that parts of them are missing, whether the cotangent varies or not."""

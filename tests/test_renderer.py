@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays
 from ddrecon.diffusion.cells import average_cells
+from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
@@ -128,6 +129,19 @@ def test_a_white_furnace_is_white(thickness: float, g: float):
     assert error < 1e-10 and (thickness > 0 or error == 0), (
         f"white furnace: {error:.1e} at optical thickness {thickness}, g = {g}"
     )
+
+
+OTHERS = [{"scheme": "printed"}, *({"model": "flux_limited", "limiter": n} for n in LIMITERS)]
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6])
+@pytest.mark.parametrize("model", OTHERS, ids=str)
+def test_a_white_furnace_of_another_model_has_its_color(model: dict[str, str], g: float):
+    color = (1.0, 2.0, 3.0)
+    medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "g": g, "directional": None}
+    image = render(make_scene(half_empty(*SHAPE), ambient=color, **medium, **model))
+    expected = torch.tensor(color).double().view(1, 3, 1, 1).expand_as(image)
+    torch.testing.assert_close(image, expected, rtol=1e-10, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.5, 0.9, -0.5])

@@ -87,26 +87,6 @@ def test_dense_media_diffuse_as_without_a_limit(limiter: str, make):
 
 
 @each_limiter
-@pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_white_furnace_is_white(limiter: str, g: float, make):
-    scene = make(
-        sigma_a=(0.0,),
-        sigma_s=(6.0,),
-        g=g,
-        directional=None,
-        ambient=(1.0, 2.0, 3.0),
-        limiter=limiter,
-    )
-    image = render(scene)
-    torch.testing.assert_close(
-        image,
-        torch.tensor([1.0, 2.0, 3.0]).double().view(1, 3, 1, 1).expand_as(image),
-        rtol=1e-10,
-        atol=0,
-    )
-
-
-@each_limiter
 def test_both_derivatives_agree_with_differences(limiter: str):
     shape = (2, 3, 2)
     inputs = [
