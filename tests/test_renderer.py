@@ -191,8 +191,9 @@ def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float):
 # --- scalings and symmetries ---
 
 
-def test_images_are_linear_in_light():
-    scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_images_are_linear_in_light(rounds: int):
+    scene = make_scene(half_empty(*SHAPE), g=0.4, transport_rounds=rounds, **BOTH)
     beam, ambient = scene.lights
     mixed = [
         DirectionalLight(beam.direction, 2.5 * beam.irradiance),

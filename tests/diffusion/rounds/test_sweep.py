@@ -54,16 +54,6 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
     torch.testing.assert_close(swept, expected, rtol=1e-11, atol=1e-13)
 
 
-def test_what_scatters_evenly_is_swept_alike_with_all_its_moments():
-    shape = (3, 2, 4)
-    medium, even = gray_medium(shape, 0.0), random_light(shape, 0)
-    one, many = (
-        sweep(medium, even.harmonics(degree), cell_gradient(even.mean), None, 5)
-        for degree in (0, 5)
-    )
-    torch.testing.assert_close(many[:1], one, rtol=1e-13, atol=0)
-
-
 @pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("shape", [(4, 3, 2), (1, 5, 4), (1, 1, 6), (1, 1, 1)], ids=str)
 def test_the_share_of_a_change_is_that_of_the_mean_step(shape: tuple[int, int, int], g: float):

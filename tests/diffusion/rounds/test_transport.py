@@ -199,16 +199,6 @@ def test_derivatives_by_g_pass_through_zero_smoothly():
     assert long == pytest.approx(short, rel=0.02)
 
 
-def test_light_from_two_beams_is_the_sum_of_both():
-    def lit(*lights: object) -> Tensor:
-        return light_after(replace(scene, lights=list(lights)), 2)
-
-    scene = make_scene(ball(8), directional=(3.0,), ambient=(0.5,), tolerance=1e-11)
-    torch.testing.assert_close(
-        lit(*scene.lights), lit(scene.lights[0]) + lit(scene.lights[1]), rtol=1e-8, atol=0
-    )
-
-
 def test_directions_agree_the_better_the_more_there_are():
     scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
     few, some, many = (
