@@ -58,7 +58,7 @@ def quick(command: str) -> list[str]:
         "optimize": lambda: ["--iterations", str(1 + ("--resume" in rest)), *fewer_cells(rest[0])],
         "render": lambda: ["--ring", "2"] if "--ring" in rest else [],
         "reference": lambda: ["--spp", "4"],
-        "gradcheck": lambda: ["--samples", "1", "-D", "ground=null", *FEW_PARAMETERS],
+        "gradcheck": lambda: ["--samples", "2", "-D", "ground=null", *FEW_PARAMETERS],
     }
     return [name, *rest, *(added[name]() if name in added else [])]
 

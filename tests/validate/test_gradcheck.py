@@ -30,17 +30,20 @@ NAMES = tuple(load_scene(CONFIG).starts)
 
 
 def check(name: str, samples: int = 0, overrides: tuple[str, ...] = ()) -> list[GradientCheck]:
-    """Of one view, and above a ground for its own number alone: all are in the check of all."""
+    """Of one view, above a ground for its own number alone, and under few lights where they are not
+    asked for: all are in the check of all.
+    """
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
     seen = name.split(".")[1] if name.startswith("views.") else "front"
     ground = scene.ground if name.startswith("ground.") else None
-    scene = replace(scene, views=[scene.view(seen)], ground=ground)
+    lights = scene.lights[:2] if ground or name.startswith("views.") else scene.lights
+    scene = replace(scene, views=[scene.view(seen)], ground=ground, lights=lights)
     known = variable_names(scene)
     scene.starts = {name: start for name, start in scene.starts.items() if name in known}
     return check_parameters(scene, (name,), samples, 0, lambda items, _: items)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "density"])
 def test_every_parameter_passes(name: str) -> None:
     (result,) = check(name)
     assert result.has_passed, result
@@ -73,8 +76,9 @@ def test_all_at_once_pass() -> None:
     assert result.has_passed, result
 
 
-def test_empty_cells_are_among_those_of_density() -> None:
+def test_density_passes_in_empty_cells_as_well() -> None:
     (result,) = check("density", samples=4)
+    assert result.has_passed, result
     values = [entry.value for entry in result.entries if entry.value is not None]
     assert {value == 0 for value in values} == {True, False}
 
