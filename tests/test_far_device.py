@@ -134,6 +134,7 @@ def test_iterations_there_find_what_they_find_on_the_processor(name: str, engine
         assert one.test_psnr == pytest.approx(other.test_psnr, abs=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["torch", "warp"])
 def test_every_kind_of_derivative_is_found_there(engine: str) -> None:
     if engine == "warp":
