@@ -3,8 +3,6 @@
 The torch engine runs unless a test, or the environment, asks for another.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """A deadline that a loaded machine does not shorten: seconds of this process's own time."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Fused kernels are compiled for graphics cards where there are none as well."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Images written by others than ddrecon, for tests to read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

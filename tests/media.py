@@ -3,8 +3,6 @@
 Every test states what matters to it and nothing else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -2,8 +2,6 @@
 Debian's python3-openvdb.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Why a data file is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cameras: rays go through the pixels they belong to, in array order."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The engine is chosen by name, by the environment, or by what is installed."""
 
-from __future__ import annotations
-
 import sys
 from importlib import metadata
 

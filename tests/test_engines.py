@@ -3,8 +3,6 @@
 Of every scene in configs/ in 64 bits, with fewer cells and pixels, and of scenes drawn at random.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 told which.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

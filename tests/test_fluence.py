@@ -1,7 +1,5 @@
 """Fluence and energy balance: closed forms, derivatives, and no light that is lost or made."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Tangents of whole renders by fused kernels: torch's, the transposes of adjoints, and slopes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The grid: (x, y, z) outside, [z, y, x] inside, and cell centers where the world says they are."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

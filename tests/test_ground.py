@@ -1,7 +1,5 @@
 """A ground: closed forms, energy, derivatives and invariance."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -17,7 +15,7 @@ from torch.autograd import forward_ad
 from ddrecon import renderer
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import ENGINES, use_engine
+from ddrecon.engine import use_engine
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
@@ -31,24 +29,16 @@ from ddrecon.variables.values import with_values
 
 CAMERA = (
     "{{name: {}, camera: {{type: perspective, origin: [{}, 1, {}], target: [0, 0, 0], fov: 40,"
-    " resolution: [12, 11]}}}}"
+    " resolution: [9, 8]}}}}"
 )
 PLACES = ("front", 0, 2.5), ("side", 2.5, 0), ("back", -1.8, -1.8)
 VIEWS = f"views=[{', '.join(CAMERA.format(*place) for place in PLACES)}]"
-SMALL = ["volume.resolution=[8, 8, 8]", "volume.density=0.5", "diffusion.transport_rounds=0"]
+SMALL = ["volume.resolution=[5, 5, 5]", "volume.density=0.5", "diffusion.transport_rounds=0"]
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 SHAPE = (6, 7, 5)
 ALBEDO, HEIGHT = (0.6, 0.4, 0.2), -0.8
 VIEW = {"eye": (0.5, 1.5, 2.5), "size": (6, 7), "half_width": 0.5}
 """Most of its picture is ground."""
-pytestmark = pytest.mark.parametrize("engine", ENGINES)
-
-
-@pytest.fixture(autouse=True)
-def _engine(engine: str) -> None:
-    if engine == "warp":
-        pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-    use_engine(engine)
 
 
 def tensor(*values: float) -> Tensor:
@@ -116,13 +106,13 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
 @pytest.mark.parametrize("kind", ["p1", "coarse", "environment"])
 def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if kind == "coarse":
-        monkeypatch.setattr(renderer, "MOST_CELLS", 5)
+        monkeypatch.setattr(renderer, "MOST_CELLS", 4)
     model = {"transport_rounds": 1, "degree": 3}
-    density = 0.2 + random_values(*SHAPE)
-    scene = on_ground(density, g=0.3, ambient=(0.3,), **model)
+    density = 0.2 + random_values(4, 5, 3)
+    scene = on_ground(density, g=0.3, ambient=(0.3,), travel=(-2.0, -2.2, -1.0), **model)
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
     if kind == "environment":
-        sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 8)
+        sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 3)
         scene.lights.append(sky)
     values = {
         "density": density,
@@ -134,22 +124,25 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
     }
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     weights = random_values(1, 3, 6, 7, seed=3)
-    total = (weights * render(with_values(scene, leaves))).sum()
-    bars = dict(zip(leaves, torch.autograd.grad(total, [*leaves.values()]), strict=True))
-    for seed, (name, value) in enumerate(values.items()):
-        way = random_values(*value.shape, seed=seed) - 0.5
 
-        def along(step: float, name: str = name, value: Tensor = value, way: Tensor = way) -> float:
-            changed = with_values(scene, {name: value + step * way})
-            return float((weights * render(changed)).sum())
+    def total(changed: dict[str, Tensor]) -> Tensor:
+        return (weights * render(with_values(scene, changed))).sum()
 
-        with forward_ad.dual_level():
-            dual = with_values(scene, {name: forward_ad.make_dual(value, way)})
-            tangent = float((weights * forward_ad.unpack_dual(render(dual)).tangent).sum())
-        adjoint = float((bars[name] * way).sum())
-        assert tangent == pytest.approx(adjoint, rel=1e-9)
-        difference = (along(1e-5) - along(-1e-5)) / 2e-5
-        assert difference == pytest.approx(adjoint, rel=2e-4, abs=1e-6), name
+    bars = torch.autograd.grad(total(leaves), [*leaves.values()])
+    # Each changes the total alike: none can hide behind the others.
+    ways = {}
+    for seed, (name, bar) in enumerate(zip(values, bars, strict=True)):
+        way = random_values(*bar.shape, seed=seed) * bar.sign()
+        ways[name] = way / (bar * way).sum()
+    with forward_ad.dual_level():
+        duals = {name: forward_ad.make_dual(value, ways[name]) for name, value in values.items()}
+        tangent = forward_ad.unpack_dual(total(duals)).tangent
+    assert float(tangent) == pytest.approx(len(values), rel=1e-9)
+    up, down = (
+        total({name: value + step * ways[name] for name, value in values.items()})
+        for step in (1e-5, -1e-5)
+    )
+    assert float(up - down) / 2e-5 == pytest.approx(len(values), rel=1e-4)
 
 
 def test_parts_sum_to_the_picture() -> None:
@@ -236,13 +229,14 @@ def test_a_ground_that_cannot_be_is_refused(overrides: list[str], what: str) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", [("ground.albedo",), ("density", "ground.albedo")])
-def test_its_albedo_is_found(names: tuple[str, ...]) -> None:
+def test_its_albedo_is_found_beside_the_density() -> None:
+    pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+    use_engine("warp")
     small = [GROUND, VIEWS, *SMALL]
     known = load_scene(BALL, overrides=[*small, "optimize=null", "ground.albedo=0.6"])
     views = [replace(view, image=render(known, view.name)[0]) for view in known.views]
-    parameters = ", ".join(f"{name}: {{}}" for name in names)
-    optimized = f"optimize={{iterations: 25, refine_at: [], parameters: {{{parameters}}}}}"
+    sought = "{density: {}, ground.albedo: {}}"
+    optimized = f"optimize={{iterations: 25, refine_at: [], parameters: {sought}}}"
     scene = load_scene(BALL, overrides=[*small, optimized])
     found = optimize(replace(scene, views=views)).scene.ground
     assert found is not None and float(found.albedo) == pytest.approx(0.6, abs=0.01)

@@ -1,7 +1,5 @@
 """What could go wrong between kernels and tensors: layouts in memory, modes of torch, threads."""
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import threading
@@ -75,6 +73,28 @@ def test_layout_in_memory_changes_nothing(is_cellwise: bool):
     found = differentiate(scene, {name: reorder(value) for name, value in values.items()})
     for one, other in zip(found, known, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
+
+
+@pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
+    is_cellwise: bool, monkeypatch: pytest.MonkeyPatch
+):
+    # However few cells and pixels there are, threads share them.
+    monkeypatch.setattr("ddrecon.diffusion.solvers.fused.hierarchy.SMALL", 0)
+    monkeypatch.setattr("ddrecon.march.fused.between.LENGTH", 16)
+    use_engine("warp")
+    scene, threads, runs = every_light(is_cellwise), torch.get_num_threads(), []
+    values = {name: value_of(scene, name).detach() for name in VARIED}
+    try:
+        for count in (2, 2, 1, 3, 16):
+            torch.set_num_threads(count)
+            runs.append(differentiate(scene, values))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(map(torch.equal, runs[0], runs[1]))
+    for other in runs[2:]:
+        for one, known in zip(other, runs[0], strict=True):
+            torch.testing.assert_close(one, known, rtol=0, atol=1e-11 * float(known.norm()))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -1,7 +1,5 @@
 """The renderer as a layer: networks train through it, and so do torch's function transforms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from media import box_grid, make_scene, random_values
+from media import make_scene, random_values
 from torch import Tensor
 
 import ddrecon
@@ -20,32 +18,6 @@ from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
-
-
-def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
-    torch.manual_seed(0)
-    grid = box_grid(SHAPE)
-    z, y, x = torch.broadcast_tensors(*grid.centers(torch.zeros(())))
-    truth = torch.nn.functional.softplus(3 * x - 2 * y + z)
-    layer = VolumeRenderer(make_scene(truth, ambient=(0.2,), tolerance=1e-5))
-    target = layer(density=truth)
-    network = torch.nn.Sequential(
-        torch.nn.Linear(3, 16), torch.nn.Tanh(), torch.nn.Linear(16, 1), torch.nn.Softplus()
-    )
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.05)
-    losses = []
-    for _ in range(80):
-        density = network(torch.stack([x, y, z], -1))[..., 0]
-        loss = (layer(density=density) - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert all(
-        parameter.grad is not None and bool(torch.isfinite(parameter.grad).all())
-        for parameter in network.parameters()
-    )
-    assert losses[-1] < 0.05 * losses[0]
 
 
 LIGHTS = ["lights.0.irradiance", "lights.0.direction", "lights.1.radiance"]

@@ -1,7 +1,5 @@
 """Lenses: rays go where OpenCV's formulas take them, and derivatives are those of the inverse."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

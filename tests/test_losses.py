@@ -5,14 +5,7 @@ import pytest
 import torch
 
 from ddrecon.grid import Grid
-from ddrecon.losses import (
-    HUBER,
-    LOSSES,
-    Target,
-    compress,
-    compressed_slope,
-    total_variation,
-)
+from ddrecon.losses import HUBER, LOSSES, Target, compress, compressed_slope, total_variation
 from ddrecon.pictures import srgb
 from ddrecon.pictures.noise import Noise
 

@@ -6,8 +6,6 @@ its standard error. That estimator sees no empty cells, so blocks of a mean dens
 left out.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

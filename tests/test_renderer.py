@@ -1,7 +1,5 @@
 """The renderer as a whole: energy, symmetries and scalings of images, and their derivatives."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays
 from ddrecon.diffusion.cells import average_cells
+from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
@@ -132,6 +131,19 @@ def test_a_white_furnace_is_white(thickness: float, g: float):
     )
 
 
+OTHERS = [{"scheme": "printed"}, *({"model": "flux_limited", "limiter": n} for n in LIMITERS)]
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6])
+@pytest.mark.parametrize("model", OTHERS, ids=str)
+def test_a_white_furnace_of_another_model_has_its_color(model: dict[str, str], g: float):
+    color = (1.0, 2.0, 3.0)
+    medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "g": g, "directional": None}
+    image = render(make_scene(half_empty(*SHAPE), ambient=color, **medium, **model))
+    expected = torch.tensor(color).double().view(1, 3, 1, 1).expand_as(image)
+    torch.testing.assert_close(image, expected, rtol=1e-10, atol=0)
+
+
 @pytest.mark.parametrize("g", [0.5, 0.9, -0.5])
 def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float):
     """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a
@@ -179,8 +191,9 @@ def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float):
 # --- scalings and symmetries ---
 
 
-def test_images_are_linear_in_light():
-    scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_images_are_linear_in_light(rounds: int):
+    scene = make_scene(half_empty(*SHAPE), g=0.4, transport_rounds=rounds, **BOTH)
     beam, ambient = scene.lights
     mixed = [
         DirectionalLight(beam.direction, 2.5 * beam.irradiance),

@@ -1,7 +1,5 @@
 """What a scene can ask for is what there is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import fields
 

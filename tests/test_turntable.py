@@ -1,7 +1,5 @@
 """Cameras around a volume keep their distance, their tilt and their axis."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """What a camera does to radiance: exposure, offset and background (E9.1)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -3,8 +3,6 @@
 That is most of the time of small scenes. C++ knows sums and products as well.
 """
 
-from __future__ import annotations
-
 import torch
 
 _KEY = torch._C.DispatchKey.Meta

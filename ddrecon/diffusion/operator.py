@@ -158,7 +158,9 @@ def harmonic_mean(u: Tensor, axis: int) -> Tensor:
     `u`: `[C, z, y, x]`, > 0, in any unit; the result has that unit, and one entry less along
     `axis`.
     """
-    return 2 / (1 / lower_cells(u, axis) + 1 / upper_cells(u, axis))
+    # Not by reciprocals: the derivative of 1 / a overflows where u is small, and opaque cells are.
+    a, b = lower_cells(u, axis), upper_cells(u, axis)
+    return 2 * a * (b / (a + b))
 
 
 def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
@@ -218,7 +220,7 @@ def cell_average(faces: Tensor, axis: int) -> Tensor:
 
 def escape(diffusion: Tensor, step: float) -> Tensor:
     """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E2.6)."""
-    return 1 / (2 + step / (2 * diffusion))
+    return diffusion / (2 * diffusion + step / 2)
 
 
 def _first(u: Tensor, axis: int) -> Tensor:

@@ -171,23 +171,23 @@ def integrate_segments(
     scattering = extinction if scattering is None else scattering
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
-    mass = nodes.integral(extinction)
-    own = end = mass.cumsum(0)
-    if front is not None:
-        end = end + front
-    begin = end - mass
+    own = nodes.integral(extinction).cumsum(0)
+    first = torch.zeros_like(own[:1]) if front is None else front[None]
+    passed = torch.cat([first, first + own])
+    begin, end = passed[:-1], passed[1:]
     # E2.3, E2.11: the integral of tau (kappa_s (L0 + g L1 . w) + j).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
     diffuse = diffuse + at_nodes["emitted"] if "emitted" in at_nodes else diffuse
     scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
     scattered = scattered * emission.diffuse_scale.view(-1, 1)
-    passed = torch.cat([begin[:1], end])
     seen: SeenPhase | SeenNodes = emission.seen
     if "number" in at_nodes:
         seen = SeenNodes(seen.phase, at_nodes["number"], seen.degree)
     for index, beam in enumerate(emission.beams):
         # E8.7: the depth of the forward peak, from where the light enters to the camera.
-        to_light, depth = at_nodes[f"mass {index}"], None
+        # On faces that are lit it is 0 but for rounding, whose exponential may overflow.
+        least = -4 / emission.extinction.mass_bound.detach()
+        to_light, depth = torch.maximum(at_nodes[f"mass {index}"], least), None
         if emission.peak is not None:
             peak = at_nodes["peak"] if "peak" in at_nodes else emission.peak.view(-1, 1)
             depth = peak * (passed + to_light)

@@ -39,7 +39,7 @@ class Parameter:
         self.name, self.rate, self.grid = name, rate, grid
         self.low = kind.low if settings.min is None else settings.min
         self.high = kind.high if settings.max is None else settings.max
-        self.release = kind.release
+        self.release, self.rise = kind.release, kind.rise
         owner, _, self.key = name.rpartition(".")
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
@@ -77,7 +77,7 @@ class Parameter:
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
         before, warm_up = self.value.detach(), min(self.steps / tuning.WARM_UP, 1.0)
-        rate *= warm_up * self.largest_rate
+        rate *= warm_up**self.rise * self.largest_rate
         keep, weights = tuning.BETAS, [1 - beta ** float(self.steps) for beta in tuning.BETAS]
         # The mean of the new second moments, before there are any; a tensor, so that no device has
         # to be waited for. Squares of less than the last term are none.

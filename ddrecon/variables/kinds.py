@@ -143,7 +143,7 @@ class Kind:
     variation, taken of what `losses.compress` makes of one that `is_compressed`;
     `difference_steps` are those of finite differences. `release` is the part of a run after which
     the variable begins to move where fields are optimized, of which a lamp would learn wrong things
-    while they are empty.
+    while they are empty. Its rate rises over a warm-up by the power `rise`.
     """
 
     rate: Rate
@@ -157,6 +157,7 @@ class Kind:
     is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
     release: float = 0.0
+    rise: float = 1.0
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
@@ -184,6 +185,8 @@ KINDS: Mapping[str, Kind] = {
         is_cellwise=True,
         tv=3e-3,
         is_compressed=True,
+        # A first step lights all cells, and they shine together: it must not outshine the pictures.
+        rise=3.0,
     ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),

@@ -1,7 +1,5 @@
 """What a bench measures, and what it makes of its measurements."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A small legal scene in a folder of its own, and commands run on it in this process."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path

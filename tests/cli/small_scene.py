@@ -1,7 +1,5 @@
 """A small legal scene without transport rounds, which take long; and what is in a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 SCENE = """\

@@ -1,7 +1,5 @@
 """`ddrecon bench` prints and writes its tables; `--hard` fails where a case does."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`ddrecon check` says what a scene is and what physics it needs, and writes nothing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

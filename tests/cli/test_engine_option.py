@@ -1,7 +1,5 @@
 """`--engine` reaches what a command records, and compilations are announced."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Commands on a device of its own, from reading to reports: no GPU is needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

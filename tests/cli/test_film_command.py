@@ -1,7 +1,5 @@
 """A film from the command line: each frame is a run, and nothing depends on when it was done."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -149,6 +147,7 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return arm
 
 
+@pytest.mark.slow
 def test_killed_anywhere_and_resumed_to_the_same_bits(
     film: Path, succeed: Run, run: Run, killed_at: Callable[[int], None]
 ) -> None:
@@ -164,6 +163,7 @@ def test_killed_anywhere_and_resumed_to_the_same_bits(
     assert shared[0] == shared[1]
 
 
+@pytest.mark.slow
 def test_a_calibration_that_diverges_goes_on_before_its_last_step(
     film: Path, succeed: Run, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +185,7 @@ def test_a_calibration_that_diverges_goes_on_before_its_last_step(
     assert volumes("parts") == volumes("whole")
 
 
+@pytest.mark.slow
 def test_parts_joined_are_the_whole(film: Path, succeed: Run) -> None:
     succeed(*optimize("-o", "whole"))
     for part in ("0:1", "2:2", "3:"):
@@ -195,6 +196,7 @@ def test_parts_joined_are_the_whole(film: Path, succeed: Run) -> None:
     assert psnrs[0] == psnrs[1]
 
 
+@pytest.mark.slow
 def test_from_python(film: Path, succeed: Run) -> None:
     succeed(*optimize("-o", "out"))
     sizes = ["frames.last=1", "frames.calibrate=0"]

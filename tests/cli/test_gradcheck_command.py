@@ -1,7 +1,5 @@
 """`ddrecon gradcheck` passes for the program, and fails where a derivative is wrong."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

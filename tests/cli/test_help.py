@@ -1,7 +1,5 @@
 """Help answers at once, because torch is imported inside commands."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What `ddrecon info` says of volumes and images."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

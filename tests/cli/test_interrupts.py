@@ -1,7 +1,5 @@
 """Ctrl-C ends the program with one line and the exit code 130, whatever it does at that moment."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """`--json` prints a command's report, and `--json FILE.json` writes it, alike in all commands."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

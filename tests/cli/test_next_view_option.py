@@ -1,7 +1,5 @@
 """`ddrecon uncertainty --next-view`: what it ranks, also where it goes on after a stop."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

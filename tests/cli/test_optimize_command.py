@@ -1,7 +1,5 @@
 """What `ddrecon optimize` writes, and that what it writes can be used again."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

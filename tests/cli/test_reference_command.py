@@ -1,7 +1,5 @@
 """What `ddrecon reference` writes and says."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a user can get wrong: one line a problem, the exit code of its kind, and nothing written."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What `ddrecon render` writes and says."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Runs that stop and go on: an interrupt loses nothing, and resuming changes no bit."""
 
-from __future__ import annotations
-
 import csv
 import signal
 import subprocess

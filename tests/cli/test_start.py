@@ -1,7 +1,5 @@
 """What is wrong with a scene file is told at once: torch and numpy are not loaded to say so."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `ddrecon uncertainty` writes and says."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

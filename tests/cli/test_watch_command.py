@@ -1,7 +1,5 @@
 """The page of a run while it goes on: what it shows, when it is done, and who may see it."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import pty

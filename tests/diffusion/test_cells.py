@@ -1,7 +1,5 @@
 """Means in cells and values at centers (E2.12)."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

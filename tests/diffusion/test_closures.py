@@ -1,7 +1,5 @@
 """Closures: D of dense media, and what replaces its infinity in empty space."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

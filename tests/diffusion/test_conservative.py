@@ -1,7 +1,5 @@
 """The conservative scheme: its system and its flux are those put together face by face."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

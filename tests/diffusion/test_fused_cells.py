@@ -3,8 +3,6 @@
 Values and cotangents, for coefficients that are constant or differ from cell to cell.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -114,19 +112,6 @@ def test_systems_and_fluxes_are_those_of_torch(shape: Shape, colors: tuple[int, 
     for kind in itertools.product((False, True), repeat=2):
         assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float64), 1e-12)
     assert_equal(lambda e: problem_of(e, shape, colors, (False, True), torch.float32), 1e-5)
-
-
-def test_threads_change_no_bit():
-    """Every item writes to cells of its own."""
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        two = problem_of("warp", (5, 7, 19), (1, 3), (False, True), torch.float64)
-        torch.set_num_threads(1)
-        one = problem_of("warp", (5, 7, 19), (1, 3), (False, True), torch.float64)
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(two[0] + two[1], one[0] + one[1], strict=True))
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

@@ -1,26 +1,18 @@
 """The fused kernels of multigrid compute what PyTorch's operations compute, as often as those."""
 
-from __future__ import annotations
-
-import math
-
 import pytest
 import torch
 from media import random_values
-from test_multigrid import FORMS, operator_of, patchy, patchy_box, uneven
+from test_multigrid import FORMS, patchy, patchy_box, uneven
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
 from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.engine import use_engine
-from ddrecon.errors import SolveError
-from ddrecon.grid import Grid
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.solvers.fused import hierarchy
 from ddrecon.diffusion.solvers.fused import multigrid as fused
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
 
@@ -101,48 +93,3 @@ def test_colors_share_conductances(losses: int):
     found, known = (solve(engine, shared, source, 1e-10) for engine in ("warp", "torch"))
     assert found.iterations == known.iterations
     assert_near(found.value, known.value, 1e-8)
-
-
-def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(hierarchy, "SMALL", 0)
-    operator, source = uneven((9, 14, 11)), random_values(3, 9, 14, 11)
-    operator = Operator(tuple(c[:1] for c in operator.conductances), operator.loss[:1])
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        first, again = (solve("warp", operator, source, 1e-8) for _ in range(2))
-        torch.set_num_threads(1)
-        alone = solve("warp", operator, source, 1e-8)
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(first.value, again.value) and first.iterations == alone.iterations
-    assert_near(first.value, alone.value, 1e-12)
-
-
-def test_derivatives_of_a_solve():
-    """Adjoint and tangent by the fused solver are transposes of each other."""
-    shape = (4, 5, 3)
-    operator = operator_of(0.1 + random_values(2, *shape), Grid(shape, (0.0,) * 3, (1.0,) * 3))
-    leaves = [operator.loss + 0.1, *operator.conductances]
-    changes = [random_values(*leaf.shape, seed=9) for leaf in leaves]
-    weights, source = random_values(2, *shape, seed=8), random_values(2, *shape, seed=7)
-    use_engine("warp")
-
-    def light(loss: Tensor, *conductances: Tensor) -> Tensor:
-        solver = SolverWithMemory(multigrid, 1e-13, SolveMemory())
-        return solve_diffusion(solver, Operator(conductances, loss), source)
-
-    _, tangent = torch.func.jvp(light, tuple(leaves), tuple(changes))
-    varied = [leaf.clone().requires_grad_() for leaf in leaves]
-    bars = torch.autograd.grad((light(*varied) * weights).sum(), varied)
-    along = sum(float((bar * change).sum()) for bar, change in zip(bars, changes, strict=True))
-    assert along == pytest.approx(float((tangent * weights).sum()), rel=1e-10)
-
-
-def test_what_is_not_finite_is_an_error():
-    operator, source = patchy_box((7, 6, 5)), random_values(2, 7, 6, 5)
-    operator.loss[0, 0, 0, 0] = math.nan
-    with pytest.raises(SolveError, match="multigrid"):
-        solve("warp", operator, source, 1e-8)

@@ -1,7 +1,5 @@
 """Derivatives of a solve agree with differences and with each other; solves are remembered."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

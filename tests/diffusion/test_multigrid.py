@@ -1,7 +1,5 @@
 """Multigrid's preconditioner is symmetric positive definite, and as fast on many cells."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The diffusion operator: a symmetric M-matrix that keeps energy, of second order."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

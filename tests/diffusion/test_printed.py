@@ -3,8 +3,6 @@
 And its Algorithm 3: where it stops, and what it says where it diverges.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re
@@ -14,9 +12,8 @@ from typing import Any
 
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_scene, random_values
+from media import box_grid, convergence_order, make_scene, random_values
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ddrecon.diffusion import printed
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
@@ -29,7 +26,6 @@ from ddrecon.diffusion.printed import (
     extend,
     iterate_jacobi,
     solve_printed,
-    solve_printed_system,
 )
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
@@ -223,26 +219,6 @@ def test_a_manufactured_solution_is_approached_at_second_order():
     assert convergence_order([1 / cells for cells in counts], fluxes) >= 1.4, fluxes
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5])
-def test_a_white_furnace_is_white(g: float):
-    scene = make_scene(
-        half_empty(5, 4, 6),
-        sigma_a=(0.0,),
-        sigma_s=(6.0,),
-        g=g,
-        directional=None,
-        ambient=(1.0, 2.0, 3.0),
-        scheme="printed",
-    )
-    image = render(scene)
-    torch.testing.assert_close(
-        image,
-        torch.tensor([1.0, 2, 3], dtype=image.dtype).view(3, 1, 1).expand_as(image[0])[None],
-        rtol=1e-10,
-        atol=0,
-    )
-
-
 def test_light_scales_with_its_source():
     """However dim: the stop is relative, in float32, too."""
     light = solve_light(smooth_scene(), SolveMemory()).diffuse.mean
@@ -254,37 +230,6 @@ def test_light_scales_with_its_source():
         torch.testing.assert_close(
             solve_light(dim, SolveMemory()).diffuse.mean / scale, light, rtol=1e-10, atol=0
         )
-
-
-@pytest.fixture
-def inputs() -> Callable[..., tuple[Stencils, list[Tensor]]]:
-    """Stencils, and source, diagonal, coefficients and echo of a small system of two colors, or of
-    a gray one under a colored source.
-    """
-
-    def make(shape: tuple[int, int, int], colors: int = 2) -> tuple[Stencils, list[Tensor]]:
-        operator = make_printed(box_grid(shape), colors=colors)
-        return operator.stencils, [
-            random_values(2, *shape) - 0.5,
-            operator.diagonal,
-            operator.coefficients,
-            operator.echo,
-        ]
-
-    return make
-
-
-@pytest.mark.parametrize(("colors", "shape"), [(1, (2, 1, 2)), (2, (1, 2, 1))])
-def test_both_derivatives_of_a_solve_agree_with_differences(
-    colors: int, shape: tuple[int, int, int], inputs
-):
-    stencils, arguments = inputs(shape, colors)
-    arguments = [argument.clone().requires_grad_() for argument in arguments]
-
-    def solution(source: Tensor, *parts: Tensor) -> Tensor:
-        return solve_printed_system(solving(), PrintedOperator(stencils, *parts), source)
-
-    assert torch.autograd.gradcheck(solution, arguments, **TO_ROUNDING)
 
 
 @pytest.mark.parametrize("name", ["density", "sigma_s", "g", "lights.0.irradiance"])
@@ -344,34 +289,6 @@ def test_a_color_without_source_stays_dark(has_guess: bool):
         operator, source, random_values(2, 4, 5, 3) if has_guess else None, 1e-8
     ).value
     assert not value[0].any() and bool(value[1].any())
-
-
-def test_a_random_start_is_the_same_in_every_run():
-    first, second = (SolveMemory(is_warm=False) for _ in range(2))
-    assert torch.equal(render(smooth_scene(), memory=first), render(smooth_scene(), memory=second))
-    torch.manual_seed(5)
-    render(smooth_scene(), memory=first)
-    assert (
-        first.records[0].iterations == first.records[1].iterations == second.records[0].iterations
-    )
-
-
-def test_a_warm_start_takes_fewer_iterations():
-    """All three kinds are recorded; tangents, which have nothing in common, start anew."""
-    scene, memory = smooth_scene(tolerance=1e-6), SolveMemory()
-    for step in (0.0, 1e-3):
-        density = (scene.volume.density * (1 + step)).requires_grad_()
-        moved = replace(scene, volume=replace(scene.volume, density=density))
-        render(moved, memory=memory).sum().backward()
-    with forward_ad.dual_level():
-        density = forward_ad.make_dual(scene.volume.density, scene.volume.density)
-        render(replace(scene, volume=replace(scene.volume, density=density)), memory=memory)
-    assert [record.kind for record in memory.records] == ["forward", "adjoint"] * 2 + [
-        "forward",
-        "tangent",
-    ]
-    cold, warm = memory.records[:2], memory.records[2:4]
-    assert all(b.iterations < 0.7 * a.iterations for a, b in zip(cold, warm, strict=True))
 
 
 @pytest.fixture

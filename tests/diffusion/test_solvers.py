@@ -1,7 +1,5 @@
 """Every solver reaches its tolerance, agrees with a dense solve, and says where it cannot."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

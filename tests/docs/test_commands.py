@@ -3,8 +3,6 @@
 In the order in which it stands there, on fewer cells, paths and samples.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable
@@ -50,6 +48,9 @@ def fewer_cells(scene: str) -> list[str]:
     )
 
 
+FEW_PARAMETERS = "-D", "optimize={parameters: {density: {}, lights.0.direction: {}}}"
+
+
 def quick(command: str) -> list[str]:
     """The arguments of `command`, and those that make it quick."""
     _, name, *rest = shlex.split(command, comments=True)
@@ -57,7 +58,7 @@ def quick(command: str) -> list[str]:
         "optimize": lambda: ["--iterations", str(1 + ("--resume" in rest)), *fewer_cells(rest[0])],
         "render": lambda: ["--ring", "2"] if "--ring" in rest else [],
         "reference": lambda: ["--spp", "4"],
-        "gradcheck": lambda: ["--samples", "2"],
+        "gradcheck": lambda: ["--samples", "2", "-D", "ground=null", *FEW_PARAMETERS],
     }
     return [name, *rest, *(added[name]() if name in added else [])]
 

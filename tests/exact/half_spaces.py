@@ -6,8 +6,6 @@ a cell at the surface to hundreds at the bottom. The closure's floor is set to n
 compared is P1 itself, or what transport rounds make of it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

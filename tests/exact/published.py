@@ -9,8 +9,6 @@ Half-spaces that scatter isotropically are known by Ambartsumian's H, the others
 ordinates (PythonicDISORT), the cloud by the consensus of many codes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tempfile

@@ -1,7 +1,5 @@
 """Media that emit light, against closed forms (E2.11)."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

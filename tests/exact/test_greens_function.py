@@ -1,7 +1,5 @@
 """Light from a point of an infinite medium: exp(-r / L) / (4 pi D r), L = sqrt(D / kappa_a)."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

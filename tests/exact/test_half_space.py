@@ -5,8 +5,6 @@ I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance
 the light (Chandrasekhar, Radiative Transfer, 1950, chapter III).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -14,9 +12,6 @@ import pytest
 from half_spaces import IRRADIANCE, VIEWS, half_space, relative_rms, seen
 from media import convergence_order
 from published import PHASES, Layer, h_function, ordinates
-
-from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import solve_light, view_components
 
 pytestmark = pytest.mark.slow
 
@@ -49,15 +44,6 @@ def p1_multiple(albedo: float, sun: float, view: float) -> float:
     a = albedo * IRRADIANCE / (4 * math.pi) / ((1 - albedo) - 1 / (3 * sun**2))
     b = -a * (1 / 2 + 1 / (3 * sun)) / (1 / 2 + decay / 3)
     return albedo * (a * sun / (view + sun) + b / (1 + decay * view))
-
-
-@each_albedo
-@pytest.mark.parametrize("sun", SUNS)
-def test_light_scattered_once_is_the_closed_form(albedo: float, sun: float):
-    scene = half_space(albedo, sun)
-    field = solve_light(scene, SolveMemory())
-    found = [float(view_components(field, scene, view.camera).single[0]) for view in scene.views]
-    assert found == pytest.approx([single(albedo, sun, view) for view in VIEWS], rel=1e-3)
 
 
 @each_albedo

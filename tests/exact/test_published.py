@@ -1,7 +1,5 @@
 """Our default settings against what is published of layers without end and of a cloud."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

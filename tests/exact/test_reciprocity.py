@@ -2,8 +2,6 @@
 order of the discretization.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The notebooks in examples/ run from top to bottom, and what they show can be shown."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every scene under configs/ loads, and reconstructs on few cells from one picture."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import fields, replace
 from pathlib import Path
@@ -76,8 +74,7 @@ def test_a_config_runs_small(config: Path) -> None:
     result = optimize(scene)
     density = result.scene.volume.density
     assert [row.iteration for row in result.rows] == [1, 2]
-    # A fire that is sought from nothing is too bright at first.
-    assert config.stem == "fire" or result.rows[1].psnr > result.rows[0].psnr
+    assert result.rows[1].psnr > result.rows[0].psnr
     assert (
         torch.isfinite(density).all()
         and density.min() >= 0

@@ -1,7 +1,5 @@
 """Equations are stated once, in docs/theory.md, and cited by tag where the code computes them."""
 
-from __future__ import annotations
-
 import re
 from itertools import groupby
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pages quote what `benchmarks/figures.py` measured, and nothing else."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from pathlib import Path

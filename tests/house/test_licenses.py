@@ -1,7 +1,5 @@
 """Every package that pyproject.toml asks for is in the table of licenses."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

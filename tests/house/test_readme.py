@@ -4,8 +4,6 @@ pages are legal.
 (The commands on the pages are run by tests/docs.)
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The manual of scene files says what the schema says, of every key."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import fields, is_dataclass
 from pathlib import Path

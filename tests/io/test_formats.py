@@ -4,8 +4,6 @@ What is written comes back in its place. What strangers made is legal or refused
 its path, at once; pickles are never loaded.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

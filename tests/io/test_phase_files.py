@@ -1,7 +1,5 @@
 """Tables of phase functions: what is read, and one line for what cannot be."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

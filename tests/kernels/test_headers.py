@@ -1,7 +1,5 @@
 """Functions of the shared headers, in double precision: closed forms, and slopes by differences."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

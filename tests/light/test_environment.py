@@ -1,7 +1,5 @@
 """Environment maps: where their pixels lie, and the integrals of what lies between them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 Values and derivatives, on grids and along directions where interpolation has kinks.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -176,13 +174,6 @@ def test_point_lights_are_those_of_torch(kind: str, place: str):
         assert_near(one, other, 1e-11)
 
 
-def test_the_density_alone():
-    scene = scene_of("colors")
-    found, known = (gradients(scene, ["density"], engine, 1) for engine in ("warp", "torch"))
-    for one, other in zip(found, known, strict=True):
-        assert_near(one, other, 1e-11)
-
-
 def test_single_precision():
     scene = scene_of("fields", torch.float32)
     found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
@@ -229,20 +220,6 @@ def test_opaque_and_empty_media_have_finite_derivatives():
             assert bool(torch.isfinite(one).all())
             assert_near(one, other, 1e-10)
         scene = scene_of("colors")
-
-
-def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
-    scene, threads = scene_of("colors"), torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        first, again = (gradients(scene, NUMBERS, "warp", 1) for _ in range(2))
-        torch.set_num_threads(1)
-        alone = gradients(scene, NUMBERS, "warp", 1)
-    finally:
-        torch.set_num_threads(threads)
-    for one, same, other in zip(first, again, alone, strict=True):
-        assert torch.equal(one, same)
-        assert_near(one, other, 1e-12)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

@@ -1,7 +1,5 @@
 """The fused kernels of E2.3 towards a camera compute what PyTorch's operations compute."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

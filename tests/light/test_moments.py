@@ -1,7 +1,5 @@
 """Light to first order in angle, held at zero."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Beams in pairs: what a light along an axis brings into a column is all found again."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

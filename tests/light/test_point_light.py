@@ -2,8 +2,6 @@
 at the light itself.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

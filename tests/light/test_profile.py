@@ -1,7 +1,5 @@
 """Gaussian beams: their power, their limits, and how view rays see them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Light not yet scattered: its moments at cells, and ambient light by quadrature."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -12,11 +10,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.reduced import (
-    ambient_sky,
-    receive_light,
-    sum_unscattered_sky,
-)
+from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
 
@@ -91,19 +85,3 @@ def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
             mean, flux = mean + weight * average, flux + 3 * weight * cosine * average
         assert light.mean[0, cell, 4, 4].item() == pytest.approx(mean, rel=1e-12)
         assert light.flux[0][0, cell, 4, 4].item() == pytest.approx(flux, rel=1e-10, abs=1e-14)
-
-
-def test_beams_add_up():
-    grid, density = box_grid((3, 4, 2)), random_values(3, 4, 2)
-    ways, colors = ([1.0, -2.0, 0.5], [-0.3, 0.1, 1.0]), ([2.0, 1.0], [0.5])
-    lights = [
-        DirectionalLight(density.new_tensor(way), density.new_tensor(color))
-        for way, color in zip(ways, colors, strict=True)
-    ]
-    together, parts = (
-        received(grid, density, lights),
-        [received(grid, density, [light]) for light in lights],
-    )
-    torch.testing.assert_close(together.mean, sum(part.mean for part in parts), rtol=1e-14, atol=0)
-    expected = sum(torch.stack(part.flux) for part in parts)
-    torch.testing.assert_close(torch.stack(together.flux), expected, rtol=1e-12, atol=1e-15)

@@ -1,7 +1,5 @@
 """The mass that a beam passes, against a slow twin that follows one ray a cell in plain Python."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -2,8 +2,6 @@
 the simpler lights it can stand for.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -27,11 +25,7 @@ SHAPE = (5, 4, 6)
 
 
 def light_of(
-    radiance: Tensor,
-    scale: float = 1.0,
-    rotation: float = 0.0,
-    directions: int = 48,
-    up: str = "y",
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48, up: str = "y"
 ) -> EnvironmentLight:
     numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
     return EnvironmentLight(radiance, *numbers, directions, up)

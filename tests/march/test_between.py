@@ -1,7 +1,5 @@
 """Pixels between lattice rays by fused kernels are those by PyTorch's operations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -77,23 +75,6 @@ def test_tangents_agree_and_are_the_adjoint(shape):
     torch.testing.assert_close(
         (bar * change).sum(), (tangents[1] * weight).sum(), rtol=1e-10, atol=0
     )
-
-
-def test_two_threads_find_the_same_and_always_the_same_bits(monkeypatch):
-    from ddrecon.march.fused import between
-
-    values, *pixels = case(SHAPES[1], torch.float32)
-    monkeypatch.setattr(between, "LENGTH", 64)
-    bars = []
-    for threads in (1, 2, 2):
-        torch.set_num_threads(threads)
-        try:
-            leaf = values.clone().requires_grad_()
-            bars.append(torch.autograd.grad(fused(leaf, *pixels).square().sum(), leaf)[0])
-        finally:
-            torch.set_num_threads(1)
-    assert torch.equal(bars[1], bars[2])
-    torch.testing.assert_close(bars[0], bars[1], rtol=1e-5, atol=1e-5)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

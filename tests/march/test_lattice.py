@@ -1,7 +1,5 @@
 """Pixels interpolated between the rays of a lattice, against rays of their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

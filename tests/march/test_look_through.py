@@ -1,7 +1,5 @@
 """What a camera's rays meet is found once, anew where anything changed, and goes with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -80,13 +78,3 @@ def test_a_camera_that_varies_is_seen_anew():
     for _ in range(2):
         image = render(with_values(scene, {"views.view.camera": twist}))
         assert bool((torch.autograd.grad(image.sum(), twist)[0] != 0).any())
-
-
-def test_what_was_found_in_inference_mode_serves_derivatives():
-    camera = camera_of()
-    scene = scene_of(camera)
-    with torch.inference_mode():
-        render(scene)
-    density = scene.volume.density.clone().requires_grad_()
-    render(with_values(scene, {"density": density})).sum().backward()
-    assert bool(density.grad.isfinite().all())

@@ -1,7 +1,5 @@
 """View rays: what the box lets through and scatters towards the camera, by closed forms."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

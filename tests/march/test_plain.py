@@ -3,8 +3,6 @@
 Both are of second order in the length of a step, so what they differ by is too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Outside of a volume's support nothing is walked, and inside nothing else changes (E10.4)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

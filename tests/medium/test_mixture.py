@@ -1,7 +1,5 @@
 """Two media in the same place, against either alone and against what they are by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

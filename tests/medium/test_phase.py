@@ -1,7 +1,5 @@
 """Phase functions and the scaling of their peak, checked by their moments over the sphere."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Phase functions that differ from cell to cell, by what they must do whatever the cells hold."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

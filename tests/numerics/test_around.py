@@ -1,7 +1,5 @@
 """Means over the cells around each, cell by cell."""
 
-from __future__ import annotations
-
 import torch
 from media import random_values
 

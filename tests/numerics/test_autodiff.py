@@ -1,7 +1,5 @@
 """What is computed again in the backward pass has the same derivatives, and is not kept."""
 
-from __future__ import annotations
-
 import weakref
 
 import pytest

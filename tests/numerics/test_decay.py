@@ -1,7 +1,5 @@
 """Exponential decay over a segment: closed forms, quadrature, and rounding at every depth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

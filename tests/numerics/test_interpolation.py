@@ -1,7 +1,5 @@
 """Interpolation: the same as explicit index arithmetic, its order, and both derivatives."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from contextlib import nullcontext

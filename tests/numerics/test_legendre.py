@@ -1,19 +1,12 @@
 """Legendre polynomials, their sums and Gauss's rule; tables over the angle."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import torch
 
 from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
-from ddrecon.numerics.legendre import (
-    even_angles,
-    gauss_legendre,
-    legendre,
-    legendre_at_even_angles,
-)
+from ddrecon.numerics.legendre import even_angles, gauss_legendre, legendre, legendre_at_even_angles
 
 
 def test_a_long_rule_is_exact_to_twice_its_length():

@@ -1,7 +1,5 @@
 """The sphere rule: exact for every monomial up to its degree, and as symmetric as the cube."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Slices lie across the axis that light crosses fastest, in the order in which it meets them."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

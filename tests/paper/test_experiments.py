@@ -2,8 +2,6 @@
 closer to its pictures and to the truth.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

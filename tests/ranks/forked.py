@@ -8,8 +8,6 @@ job. "failing" [rank, iteration, how] ends a rank before that iteration: "killed
 With "seeds": true each rank has its own.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

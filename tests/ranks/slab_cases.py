@@ -6,8 +6,6 @@ FILE gets, by engine, by case and by what was compared, the largest difference o
 value. What slabs find by fused kernels, torch's operations find alone.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os
@@ -21,14 +19,7 @@ from typing import Any
 
 import torch
 import torch._dynamo  # once, before there are several: forward mode needs it
-from media import (
-    box_grid,
-    half_empty,
-    make_camera,
-    make_operator,
-    make_scene,
-    random_values,
-)
+from media import box_grid, half_empty, make_camera, make_operator, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 from zero_tangents import ask_python
@@ -45,13 +36,7 @@ from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.exchange import (
-    add_halo,
-    gather_slabs,
-    sum_before,
-    sum_slabs,
-    swap_layers,
-)
+from ddrecon.slabs.exchange import add_halo, gather_slabs, sum_before, sum_slabs, swap_layers
 from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values

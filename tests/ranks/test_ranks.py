@@ -1,7 +1,5 @@
 """What one rank does without others."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Cells in slabs: what ranks find together is what one finds alone, to rounding."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

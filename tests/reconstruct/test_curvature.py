@@ -1,7 +1,5 @@
 """Products with J^T W J + R, against the matrix itself, column by column."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -76,9 +74,7 @@ def test_a_product_is_that_with_the_matrix_of_differences() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(
-    loss: str,
-) -> None:
+def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(loss: str) -> None:
     target = Target.of(0.8 * random_values(3, 4, 5), random_values(4, 5, seed=1).round(), loss)
     image = target.image + 0.4 * (random_values(3, 4, 5, seed=3) - 0.5)
     weights = target.weights_at(image)

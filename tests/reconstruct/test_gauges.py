@@ -1,7 +1,5 @@
 """Gauges: what no picture shows is not changed; and how a calibration errs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

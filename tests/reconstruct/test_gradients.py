@@ -2,8 +2,6 @@
 of views.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

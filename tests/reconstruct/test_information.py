@@ -1,7 +1,5 @@
 """What pictures say of all cells, roughly, where it is known what they say."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

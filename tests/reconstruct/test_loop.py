@@ -2,13 +2,14 @@
 never stopped.
 """
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from ddrecon.errors import FormatError, SceneError, SolveError
+from ddrecon.errors import DivergenceError, FormatError, SceneError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint, save_checkpoint
@@ -89,18 +90,23 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
         load_checkpoint(tmp_path, {})
 
 
-def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
-    assert ball_scene.optimize is not None
-    run = Reconstruction(
-        replace(
-            ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
-        )
-    )
+@pytest.mark.parametrize("flaw", ["loss of view", "derivative of the loss"])
+def test_divergence_keeps_the_last_good_state(
+    ball_scene: Scene, flaw: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
+    run = Reconstruction(replace(ball_scene, optimize=settings))
     run.step()
     good = run.parameters[0].value.detach().clone()
     run.step()
-    run.level.train.views[0].image[0, 3, 4] = float("inf")
-    with pytest.raises(SolveError, match="not finite"):
+    if flaw == "loss of view":
+        run.level.train.views[0].image[0, 3, 4] = math.inf
+    else:
+        gradients = {"density": torch.full_like(good, math.nan)}
+        monkeypatch.setattr(
+            "ddrecon.reconstruct.loop.add_penalties", lambda found, *_: (found.loss, gradients)
+        )
+    with pytest.raises(DivergenceError, match=f"{flaw} .* is not finite"):
         run.step()
     assert torch.equal(run.parameters[0].value, good)
     assert run.iteration == 1

@@ -1,7 +1,5 @@
 """Which picture next: the ensemble's promise against dense algebra, and without its bias."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What pictures say of single numbers, against products with the whole matrix."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

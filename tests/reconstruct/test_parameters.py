@@ -1,7 +1,5 @@
 """Steps of fields: closed forms, units, stability, and a new beginning at each resolution."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from media import box_grid, random_values

@@ -1,7 +1,5 @@
 """Samples of the posterior, against the covariance written as a matrix on a grid of 6^3 cells."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -2,8 +2,6 @@
 one kind or of all. By diffusion alone: the loop is tried here, not the rounds.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -119,7 +117,7 @@ STARTS: dict[str, Tensor] = {
 
 @pytest.mark.parametrize("name", STARTS)
 def test_a_number_alone_comes_back(name: str) -> None:
-    scene = photographed(scene_of(cloud(12), 3, 16))
+    scene = photographed(scene_of(cloud(9), 3, 10))
     truth, start = value_of(scene, name), STARTS[name]
     result = recovered(scene, {name: start}, 40)
     found = value_of(result, name)
@@ -138,7 +136,7 @@ def pose_of(scene: Scene) -> Tensor:
 
 def test_all_together_render_as_the_truth() -> None:
     """Also with the density, which then has light and medium to share its level with."""
-    scene = photographed(scene_of(cloud(12), 3, 12))
+    scene = photographed(scene_of(cloud(9), 3, 10))
     starts = STARTS | {"density": 0.5 * scene.volume.density + 0.1}
     found = recovered(scene, starts, 80, density=ParameterSettings(tv=0.0))
     assert image_error(with_values(scene, starts), scene) > 0.5

@@ -1,7 +1,5 @@
 """When a run ends by itself: at rest, or at the most, and the same when resumed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict

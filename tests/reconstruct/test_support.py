@@ -1,7 +1,5 @@
 """Support: no medium where a view that sees a cell sees nothing, and none comes back there."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

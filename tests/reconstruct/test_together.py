@@ -1,7 +1,5 @@
 """Reconstructions that share their numbers: copies of one agree with it, and all move as one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -21,7 +19,7 @@ def still() -> Scene:
 
     Cameras are left out: what is known of them beforehand counts less where more pictures are.
     """
-    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=6", "optimize.refine_at=[]"]
+    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=4", "optimize.refine_at=[]"]
     sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
     return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
 
@@ -31,10 +29,10 @@ def values(run: Reconstruction) -> dict[str, Tensor]:
 
 
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
-    single, together = Reconstruction(still), Together([still, still, still])
+    single, together = Reconstruction(still), Together([still, still])
     while not single.is_done:
         row, rows = single.step(), together.step()
-        assert [other.loss for other in rows] == pytest.approx([row.loss] * 3, rel=1e-6)
+        assert [other.loss for other in rows] == pytest.approx([row.loss] * 2, rel=1e-6)
     assert together.is_done
     for run in together.runs:
         torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)

@@ -1,7 +1,5 @@
 """Solves are no more exact than the gradient needs, and the gradient is as exact as promised."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

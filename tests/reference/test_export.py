@@ -1,7 +1,5 @@
 """Exported scenes are those that Mitsuba is given directly."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

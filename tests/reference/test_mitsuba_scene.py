@@ -1,7 +1,5 @@
 """A scene in Mitsuba's words says the same as the scene; nothing here needs Mitsuba."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise from passes, and errors less noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

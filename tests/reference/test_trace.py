@@ -1,7 +1,5 @@
 """Mitsuba's images of our scenes: closed forms, places, and our images of light scattered once."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

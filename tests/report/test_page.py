@@ -2,8 +2,6 @@
 volumes are shown cell for cell, in notebooks too.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import html

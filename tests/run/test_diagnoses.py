@@ -1,7 +1,5 @@
 """Each diagnosis is made of a scene that has the fault, and of none of the others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading scene text, and the problems found in it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

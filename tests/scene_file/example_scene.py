@@ -1,7 +1,5 @@
 """A small legal scene to break in one place at a time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import yaml

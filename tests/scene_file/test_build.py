@@ -1,7 +1,5 @@
 """Scenes as tensors: shapes and values, and files that do not fit the scene or cannot be used."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """COLMAP's models: rays as its manual has them, text and binary alike, and refusals in one line."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Equal colors are one channel of light, but for those that are optimized."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

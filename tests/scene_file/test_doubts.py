@@ -1,7 +1,5 @@
 """What can hardly be meant is told, and what can is not."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

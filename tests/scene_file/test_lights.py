@@ -1,7 +1,5 @@
 """Environment maps and point lights in scene files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scene files as records: each rule of the schema, told with line, column and key."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The section volume.media: what it becomes, what is written back, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

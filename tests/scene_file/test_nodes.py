@@ -1,7 +1,5 @@
 """Strict YAML: what a scalar means, and what text is refused, with its line and column."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Rings of cameras: where they stand, and which images are theirs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

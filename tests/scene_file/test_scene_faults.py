@@ -1,7 +1,5 @@
 """What is wrong with a scene is one line: the place, the key, what to do; one table of it all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether cameras see the volume's box, and why they do not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

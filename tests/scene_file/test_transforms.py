@@ -2,8 +2,6 @@
 back, and refused by key.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A tiny scene in a folder of its own, and commands run on it in this process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,13 +1,11 @@
 """Runs that are killed, interrupted or out of disk space at random moments, until they are done all
 the same.
 
-    python fault_runs.py kill|full FOLDER COUNT
+    python fault_runs.py FOLDER SIGNALS SHORTAGES
 
 One process imports torch and forks a child for every fault, so that each costs a fraction of a
 second. Prints as JSON what happened.
 """
-
-from __future__ import annotations
 
 import json
 import os
@@ -28,7 +26,7 @@ from tiny_scene import write_scene
 from ddrecon.cli.commands import main
 from ddrecon.run import run_folder
 
-SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
+SIGNALS = [*[signal.SIGKILL] * 4, signal.SIGTERM, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
 """What click says of an interrupt before the command has begun."""
 EXPECTED = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 130, signal.SIGINT: 130}
@@ -130,11 +128,11 @@ def kill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
     return {"faults": faults, "finished": finished, "wrong": wrong}
 
 
-def fill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
+def fill(folder: Path, count: int, whole: dict[str, object]) -> dict[str, object]:
     """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints
     are the largest of them.
     """
-    out, wrong, faults = folder / "out_0", list[str](), 0
+    out, wrong, faults = folder / "full", list[str](), 0
     largest = (folder / "whole" / "checkpoints" / "last.pt").stat().st_size
     for _ in range(count):
         most = int(random.uniform(0.02, 1.0) * largest)
@@ -155,29 +153,23 @@ def fill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
         wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")
     elif result_of(out) != whole:
         wrong.append("differs")
-    return {"faults": faults, "finished": 1, "wrong": wrong}
+    return {"faults": faults, "wrong": wrong}
 
 
-def run(kind: str, folder: Path, count: int) -> None:
+def run(folder: Path, signals: int, shortages: int) -> None:
     torch.set_num_threads(1)
     random.seed(0)
     run_folder.CHECKPOINT_SECONDS, run_folder.CHECKPOINT_SHARE = 0.0, 1e9
     write_scene(folder)
-    with (
-        suppress(SystemExit),
-        redirect_stdout(StringIO()),
-    ):  # here, so that what is imported on the way is imported once
+    # Here, so that what is imported on the way is imported once.
+    with suppress(SystemExit), redirect_stdout(StringIO()):
         optimize(folder, folder / "whole")
     begin = time.monotonic()
     ended(start(folder, folder / "again", nothing))
-    duration = time.monotonic() - begin
-    faulty = kill if kind == "kill" else fill
-    sys.stdout.write(
-        json.dumps(
-            faulty(folder, count, result_of(folder / "whole"), duration) | {"seconds": duration}
-        )
-    )
+    duration, whole = time.monotonic() - begin, result_of(folder / "whole")
+    reports = kill(folder, signals, whole, duration), fill(folder, shortages, whole)
+    sys.stdout.write(json.dumps(reports))
 
 
 if __name__ == "__main__":
-    run(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))
+    run(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))

@@ -1,7 +1,5 @@
 """What is in a folder, without opening what is no file."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

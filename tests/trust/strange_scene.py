@@ -4,8 +4,6 @@ scene.
 
 # ruff: noqa: RUF001, SIM905
 
-from __future__ import annotations
-
 from typing import Any
 
 import yaml

@@ -2,10 +2,6 @@
 chunks; little on precision.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +11,6 @@ from tiny_scene import write_scene
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.march import integral as march
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene import Scene, View
@@ -82,16 +77,6 @@ def distance(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     )
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def test_same_seed_same_bits(path: Path) -> None:
     scene, runs = load_scene(path, overrides=["optimize.iterations=5"]), []
     for seed in (3, 3, 4):
@@ -108,15 +93,6 @@ def test_same_seed_same_bits(path: Path) -> None:
     assert not torch.equal(runs[0][0], runs[2][0])
 
 
-def test_the_number_of_threads_changes_nothing_much(path: Path) -> None:
-    scene = cloud(path, cells="[24, 20, 20]")
-    with threads(1):
-        one = found(scene)
-    with threads(2):
-        two = found(scene)
-    assert distance(two, one) < EQUAL
-
-
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
     scene = load_scene(
         path,
@@ -129,15 +105,6 @@ def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
     assert torch.allclose(one.density, other.density, rtol=EQUAL) and torch.allclose(
         one.g, other.g, rtol=EQUAL
     )
-
-
-def test_the_size_of_chunks_changes_nothing_much(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = cloud(path)
-    whole = found(scene)
-    monkeypatch.setattr(march, "CHUNK_NODES", 100)
-    assert distance(found(scene), whole) < EQUAL
 
 
 @pytest.mark.parametrize("model", ["flux_limited", "p1"])

@@ -2,8 +2,6 @@
 bits of one left alone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -17,19 +15,15 @@ pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parent / "fault_runs.py"
 
 
-@pytest.mark.parametrize(("kind", "count"), [("kill", 12), ("full", 3)])
-def test_no_fault_loses_anything(tmp_path: Path, kind: str, count: int) -> None:
-    """Of 12 signals 10 are SIGKILL, one SIGTERM and one Ctrl-C."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+def test_no_fault_loses_anything(tmp_path: Path) -> None:
+    """Of 6 signals 4 are SIGKILL, one SIGTERM and one Ctrl-C; twice there is no space."""
     found = subprocess.run(
-        [sys.executable, SCRIPT, kind, tmp_path, str(count)],
-        env=environment,
+        [sys.executable, SCRIPT, tmp_path, "6", "2"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
     )
     assert found.returncode == 0, found.stderr
-    report = json.loads(found.stdout)
-    assert report["wrong"] == []
-    assert report["finished"] >= 1 and (
-        report["faults"] == count or (kind == "full" and report["faults"] >= count // 2)
-    )
+    killed, full = json.loads(found.stdout)
+    assert killed["wrong"] == [] == full["wrong"]
+    assert killed["faults"] == 6 and killed["finished"] >= 1 and full["faults"] >= 1

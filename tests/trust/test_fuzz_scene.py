@@ -2,8 +2,6 @@
 name the place, at once.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 import re

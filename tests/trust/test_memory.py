@@ -3,8 +3,6 @@
 Too much is refused with what would fit, and a shortage is one line.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

@@ -2,8 +2,6 @@
 iteration, three kinds of parameters.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,6 +2,7 @@
 derivative that is wrong.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from ddrecon.diffusion import implicit
 from ddrecon.errors import UsageError
 from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
+from ddrecon.variables.values import variable_names
 
 pytestmark = pytest.mark.slow
 
@@ -22,17 +24,26 @@ SMALL = [
     "views.1.camera.resolution=[6, 5]",
     "views.2.camera.resolution=[5, 6]",
     "views.3.camera.resolution=[6, 5]",
-    "lights.2.directions=6",
+    "lights.2.directions=3",
 ]
 NAMES = tuple(load_scene(CONFIG).starts)
 
 
-def check(*names: str, samples: int = 0, overrides: tuple[str, ...] = ()) -> list[GradientCheck]:
+def check(name: str, samples: int = 0, overrides: tuple[str, ...] = ()) -> list[GradientCheck]:
+    """Of one view, above a ground for its own number alone, and under few lights where they are not
+    asked for: all are in the check of all.
+    """
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
-    return check_parameters(scene, names, samples, 0, lambda items, _: items)
+    seen = name.split(".")[1] if name.startswith("views.") else "front"
+    ground = scene.ground if name.startswith("ground.") else None
+    lights = scene.lights[:2] if ground or name.startswith("views.") else scene.lights
+    scene = replace(scene, views=[scene.view(seen)], ground=ground, lights=lights)
+    known = variable_names(scene)
+    scene.starts = {name: start for name, start in scene.starts.items() if name in known}
+    return check_parameters(scene, (name,), samples, 0, lambda items, _: items)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "density"])
 def test_every_parameter_passes(name: str) -> None:
     (result,) = check(name)
     assert result.has_passed, result
@@ -41,11 +52,7 @@ def test_every_parameter_passes(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "overrides"),
-    [
-        ("sigma_t", ()),
-        ("albedo", ()),
-        ("g", ("optimize.parameters.g={init: -0.6, field: true}",)),
-    ],
+    [("sigma_t", ()), ("albedo", ()), ("g", ("optimize.parameters.g={init: -0.6, field: true}",))],
 )
 def test_the_other_forms_of_a_parameter_pass(name: str, overrides: tuple[str, ...]) -> None:
     """The other pair of cross sections, and g of each cell."""
@@ -69,12 +76,11 @@ def test_all_at_once_pass() -> None:
     assert result.has_passed, result
 
 
-def test_empty_cells_are_among_those_of_density() -> None:
+def test_density_passes_in_empty_cells_as_well() -> None:
     (result,) = check("density", samples=4)
-    assert {entry.value == 0 for entry in result.entries if entry.value is not None} == {
-        True,
-        False,
-    }
+    assert result.has_passed, result
+    values = [entry.value for entry in result.entries if entry.value is not None]
+    assert {value == 0 for value in values} == {True, False}
 
 
 @pytest.mark.parametrize("g", ["0.8", "-0.6"])

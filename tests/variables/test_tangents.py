@@ -2,8 +2,6 @@
 closed forms say.
 """
 
-from __future__ import annotations
-
 import pytest
 import torch
 from media import make_scene, random_values, render_tangent

@@ -1,7 +1,5 @@
 """Variables by name: read out, put back, and nothing else touched."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -12,12 +10,7 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.errors import UsageError
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
-from ddrecon.variables.values import (
-    name_each,
-    value_of,
-    variable_names,
-    with_values,
-)
+from ddrecon.variables.values import name_each, value_of, variable_names, with_values
 
 SHAPE = (4, 3, 5)
 

@@ -430,7 +430,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         if (L::FIRST_PEAK < L::CHANNELS) sample(node, n, L::FIRST_PEAK, L::CHANNELS);
         for (int k = 0; k < L::MASSES; ++k) {
             const N off = number(2 * L::C) * node.bend[k], limit = F(1) / P::root(F(1) + off * off);
-            node.v[L::FIRST_MASS + k] -= node.bend[k] * limit;
+            // On faces that are lit it is 0 but for rounding, whose exponential may overflow.
+            const N corrected = node.v[L::FIRST_MASS + k] - node.bend[k] * limit;
+            node.v[L::FIRST_MASS + k] = P::most(corrected, F(-4) / number(2 * L::C));
             node.limit[k] = value_of(limit);
         }
         for (int c = 0; c < L::C; ++c) {

@@ -1,7 +1,5 @@
 """Slow twins of a sweep and of a transport round: loops over directions, slices and cells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Radiance along one direction: closed forms, energy, a slow twin, reversal, derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -146,10 +144,7 @@ def test_turning_grid_and_direction_around_turns_the_radiance(direction):
     back, turned = tuple(-c for c in direction), scatters.flip(1, 2, 3)
     found, other = (
         radiance_along(medium_of(one, grid), q, cell_gradient(q), None, way)[0]
-        for one, q, way in (
-            (density, scatters, direction),
-            (density.flip(0, 1, 2), turned, back),
-        )
+        for one, q, way in ((density, scatters, direction), (density.flip(0, 1, 2), turned, back))
     )
     torch.testing.assert_close(other.flip(1, 2, 3), found, rtol=1e-13, atol=0)
 

@@ -1,13 +1,10 @@
 """The fused kernels of a sweep compute what PyTorch's operations compute, derivatives included."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
-import torch.autograd.forward_ad as forward
 from media import half_empty, random_values
 from torch import Tensor
 
@@ -170,34 +167,3 @@ def test_single_precision(spacing: tuple[float, float, float]):
 def test_some_derivatives_are_asked_for(varied: list[str]):
     one, other = (gradients(Case(), engine, varied) for engine in ("warp", "torch"))
     assert_same(one, other, 1e-12)
-
-
-@pytest.mark.parametrize("name", ["beam", "fields"])
-def test_the_adjoint_is_the_transpose_of_the_tangent(name: str):
-    """<J v, w> = <v, J^T w>."""
-    case = CASES[name]
-    _, found = gradients(case, "warp")
-    values = case.values()
-    changes = {n: random_values(*v.shape, seed=30).to(v) for n, v in values.items()}
-    with forward.dual_level():
-        duals = {n: forward.make_dual(v, changes[n]) for n, v in values.items()}
-        tangent = forward.unpack_dual(moments_of(case, duals, "warp")).tangent
-    along = float((tangent * random_values(*tangent.shape, seed=9)).sum())
-    back = sum(float((found[n] * changes[n]).sum()) for n in values)
-    assert along == pytest.approx(back, rel=1e-10)
-
-
-def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
-    case, threads = Case(directions=44), torch.get_num_threads()
-    runs = []
-    try:
-        for count in (2, 2, 1, 3, 16):
-            torch.set_num_threads(count)
-            runs.append(gradients(case, "warp"))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(runs[0][0], runs[1][0])
-    for name, one in runs[0][1].items():
-        assert torch.equal(one, runs[1][1][name])
-    for other in runs[2:]:
-        assert_same(other, runs[0], 1e-13)

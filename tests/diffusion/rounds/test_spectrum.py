@@ -1,7 +1,5 @@
 """Rounds shrink what is left, of any wave: a Fourier analysis, and what the real code does."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any
 

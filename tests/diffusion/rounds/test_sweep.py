@@ -1,7 +1,5 @@
 """Sweeps and rounds are what loops over directions and cells make of E2.9 and E2.10."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
@@ -17,11 +15,7 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
-from ddrecon.diffusion.rounds.transport import (
-    _mean_step,
-    _transport_share,
-    run_rounds,
-)
+from ddrecon.diffusion.rounds.transport import _mean_step, _transport_share, run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
@@ -58,16 +52,6 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
     swept = sweep(medium, source, cell_gradient(source[0]), inflow, 26)
     expected = sweep_by_loops(medium, source, source[0, 0], 0.3, 26)
     torch.testing.assert_close(swept, expected, rtol=1e-11, atol=1e-13)
-
-
-def test_what_scatters_evenly_is_swept_alike_with_all_its_moments():
-    shape = (3, 2, 4)
-    medium, even = gray_medium(shape, 0.0), random_light(shape, 0)
-    one, many = (
-        sweep(medium, even.harmonics(degree), cell_gradient(even.mean), None, 44)
-        for degree in (0, 5)
-    )
-    torch.testing.assert_close(many[:1], one, rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6])

@@ -1,7 +1,5 @@
 """Transport rounds: where they lead, how fast, in thick cells, and what derivatives cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -47,13 +45,7 @@ def light_after(scene: Scene, rounds: int) -> Tensor:
 
 
 def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
-    scene = make_scene(
-        ball(),
-        sigma_a=(0.0,),
-        sigma_s=(3.0,),
-        directional=(3.0,),
-        tolerance=1e-10,
-    )
+    scene = make_scene(ball(), sigma_a=(0.0,), sigma_s=(3.0,), directional=(3.0,), tolerance=1e-10)
     medium = average_cells(scale_medium(scene.volume))
     source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
@@ -205,16 +197,6 @@ def test_derivatives_by_g_pass_through_zero_smoothly():
 
     long, short = ((slope(-step) - 2 * slope(0.0) + slope(step)) / step**2 for step in (1e-2, 1e-3))
     assert long == pytest.approx(short, rel=0.02)
-
-
-def test_light_from_two_beams_is_the_sum_of_both():
-    def lit(*lights: object) -> Tensor:
-        return light_after(replace(scene, lights=list(lights)), 2)
-
-    scene = make_scene(ball(8), directional=(3.0,), ambient=(0.5,), tolerance=1e-11)
-    torch.testing.assert_close(
-        lit(*scene.lights), lit(scene.lights[0]) + lit(scene.lights[1]), rtol=1e-8, atol=0
-    )
 
 
 def test_memory_does_not_grow_with_directions():

@@ -1,7 +1,5 @@
 """Writing leaves the whole new file or the untouched old one."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

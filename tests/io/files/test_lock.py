@@ -2,8 +2,6 @@
 where nothing is, unless it may be replaced, and only into existing folders.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Radiance pictures: flat and run-length encoded they come back to rounding; others are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images: linear round trips, sRGB decoding, alpha, and refusals that say where the flaw is."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """TIFF: what others write is read, and what holds no floats is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 does not fit is refused with advice.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """OpenVDB files: what OpenVDB's own tools find in ours, and how those of others become fields."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
