@@ -57,9 +57,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "bounds": (
                 "The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's "
-                "file where left out."
+                "file where left out. `auto`: what fits the pictures."
             ),
-            "resolution": "Cells along x, y and z; those of the field's file where left out.",
+            "resolution": (
+                "Cells along x, y and z; those of the field's file where left out. `auto`: two "
+                "pixels wide."
+            ),
             "up": "The axis that the height of a `ground` is measured along.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",

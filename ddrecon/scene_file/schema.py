@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from ddrecon.grid import Triple
 from ddrecon.settings import (
@@ -31,6 +31,7 @@ from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
 Color = float | Triple
 Count = tuple[int, int, int]
+Auto = Literal["auto"]
 Size = tuple[int, int]
 Pair = tuple[float, float]
 Row = tuple[float, float, float, float]
@@ -140,21 +141,24 @@ class MediumSection:
 
 @dataclass(frozen=True)
 class VolumeSection(MediumSection):
-    """`bounds` and `resolution` may be left out where a field's file has them."""
+    """`bounds` and `resolution` may be left out where a field's file has them.
+
+    With `auto` they are what fits the pictures (`scene_file.box`).
+    """
 
     g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
     phase: PhaseSection | None = None  # type: ignore[assignment]
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
-    bounds: Bounds | None = None
-    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    bounds: Bounds | Auto | None = None
+    resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
         if self.emission is not None and self.temperature is not None:
             yield "temperature", "says what is emitted as well: give only one of it or emission"
-        x, y, z = self.resolution or (1, 1, 1)
+        x, y, z = self.resolution if isinstance(self.resolution, tuple) else (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
 
@@ -164,8 +168,8 @@ class MixtureSection:
     """Two media in the same box, by name; `bounds` and `resolution` as of `VolumeSection`."""
 
     media: Mapping[str, MediumSection]
-    bounds: Bounds | None = None
-    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    bounds: Bounds | Auto | None = None
+    resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
