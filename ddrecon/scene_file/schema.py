@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from ddrecon.grid import Triple
+from ddrecon.io.images.films import FILMS
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -350,7 +351,8 @@ CameraSection = PerspectiveSection | OrthographicSection
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
-    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    `frame`: which one of films is taken, or with `frames`, which number the scene's frame 0 has
+    here. `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
     `offset`; `background` is what it shows where the volume is empty.
     """
 
@@ -358,6 +360,7 @@ class ViewSection:
     camera: CameraSection
     image: Path | None = None
     mask: Path | None = None
+    frame: int = 0
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0, expert=True)
     exposure: Color = bounded(1.0, minimum=1e-3)
@@ -432,7 +435,7 @@ class ViewSource:
 
 @dataclass(frozen=True)
 class FramesSection:
-    """A film: pictures and masks have `{frame:04d}` in their names, from `first` to `last`.
+    """A film: pictures and masks are films, or have `{frame:04d}` in their names.
 
     `calibrate`: how many frames, spread along it, find together what does not change; with 0 each
     frame finds its own.
@@ -509,5 +512,6 @@ class SceneTree:
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:
             yield "views", f"{counted[0]} is of a film; say which frames: {{first: 0, last: 99}}"
-        if self.frames is not None and not counted:
-            yield "frames", "no picture changes: put {frame:04d} into the names of pictures"
+        films = [name for name in named if name.lower().endswith(tuple(FILMS))]
+        if self.frames is not None and not counted and not films:
+            yield "frames", "no picture changes: name films, or put {frame:04d} into names"
