@@ -106,6 +106,13 @@ class Rays:
         return z / distance, y / distance, x / distance
 
 
+def pixel_width(camera: Camera, place: Tensor) -> float:
+    """How wide [u] a pixel of `camera` is at `place` (x, y, z)."""
+    width = 2 * float(camera.half_width) / camera.size[1]
+    distance = float(camera.pose[:, 3].cpu().dist(place.to(camera.pose.dtype)))
+    return width * distance if camera.is_perspective else width
+
+
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world matrix `[3, 4]` of a camera at `origin` that looks at `target`.
 

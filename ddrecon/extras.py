@@ -19,6 +19,7 @@ EXTRAS = {
     "mitsuba": "reference",
     "warp": "fast",
     "miepython": "mie",
+    "imageio_ffmpeg": "film",
 }
 """Which extra of ddrecon brings which package."""
 

@@ -57,9 +57,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "bounds": (
                 "The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's "
-                "file where left out."
+                "file where left out. `auto`: what fits the pictures."
             ),
-            "resolution": "Cells along x, y and z; those of the field's file where left out.",
+            "resolution": (
+                "Cells along x, y and z; those of the field's file where left out. `auto`: two "
+                "pixels wide."
+            ),
             "up": "The axis that the height of a `ground` is measured along.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
@@ -242,10 +245,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "name": "Files of the view have this name.",
             "camera": "Where it is seen from; see below.",
             "image": (
-                "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg and .webp "
-                "are decoded from sRGB; alpha 0 is empty."
+                "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg, .webp and "
+                "films (.mp4, .mov, .mkv, .webm) are decoded from sRGB; alpha 0 is empty."
             ),
             "mask": "A picture of the same size, black where pixels are ignored.",
+            "frame": (
+                "Of a film, which frame is taken, counted from 0. With `frames`, the one that the "
+                "scene's frame 0 is."
+            ),
             "split": "`test` views are never optimized on, and always reported.",
             "weight": "How much a training view counts.",
             "exposure": (
@@ -339,8 +346,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "frames",
         schema.FramesSection,
-        "A [film](films.md): pictures and masks have the number of a frame in their names, "
-        "`front_{frame:04d}.png`.\nOther commands than `optimize` take its first frame.",
+        "A [film](films.md): pictures and masks are films, or have the number of a frame in "
+        "their names, `front_{frame:04d}.png`.\n"
+        "Other commands than `optimize` take its first frame.",
         {
             "first": "Number of the first frame.",
             "last": "Number of the last frame.",

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 from typing import Any
 
-from ddrecon.cameras import Camera
+import torch
+
+from ddrecon.cameras import pixel_width
 from ddrecon.engine import name_engines
-from ddrecon.grid import Grid
+from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
@@ -16,6 +20,7 @@ from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
+from ddrecon.settings import AUTO
 from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.variables.values import with_values
 
@@ -31,9 +36,18 @@ def memory_estimate(scene: Scene) -> int:
 
 
 def supports_of(frames: Iterable[Scene]) -> list[Support]:
-    """Where density may be in each of `frames`, of one scene or of a film, by their pictures."""
-    trained = ((select_views(scene, is_test=False), scene.optimize) for scene in frames)
-    found = [find_support(train, settings) for train, settings in trained if settings is not None]
+    """Where density may be in each of `frames`, of one scene or of a film, by their pictures.
+
+    Where it has no support it is as by `support: auto`, if pictures tell.
+    """
+    found = list[Support | None]()
+    for scene in frames:
+        train, settings = select_views(scene, is_test=False), scene.optimize
+        density = settings.parameters.get("density") if settings is not None else None
+        if settings is not None and density is not None:
+            auto = replace(density, support=density.support or AUTO)
+            with nullcontext() if density.support else suppress(SceneError):
+                found.append(find_support(train, replace(settings, parameters={"density": auto})))
     return [support for support in found if support is not None]
 
 
@@ -48,6 +62,7 @@ def describe(
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
     low, high = grid.bounds_xyz
+    middle = torch.tensor(grid.center_xyz)
     loss = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
@@ -63,7 +78,7 @@ def describe(
                 "height": view.camera.size[0],
                 "split": "test" if view.is_test else "train",
                 "has_image": view.image is not None,
-                "cell": cell_in_pixels(view.camera, grid),
+                "cell": min(grid.spacing) / pixel_width(view.camera, middle),
             }
             for view in scene.views
         ],
@@ -76,14 +91,6 @@ def describe(
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }
-
-
-def cell_in_pixels(camera: Camera, grid: Grid) -> float:
-    """How many pixels of `camera` a cell in the middle of `grid` is wide."""
-    pixel = 2 * float(camera.half_width) / camera.size[1]
-    if camera.is_perspective:
-        pixel *= float(camera.pose[:, 3].dist(camera.pose.new_tensor(grid.center_xyz)))
-    return min(grid.spacing) / pixel
 
 
 def lines(report: dict[str, Any]) -> list[str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 
 from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, SolveError
 from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
@@ -88,7 +89,9 @@ def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
     A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
     again, its error is raised when all others are done.
     """
-    calibrate(film)
+    # Parts that begin together wait for the one that calibrates.
+    with FileLock(film.path / f"{SHARED}.lock", fallback_to_soft=False):
+        calibrate(film)
     failed = dict[int, DdreconError]()
     for is_second in (False, True):
         for number in [*failed] if is_second else numbers:

@@ -39,7 +39,7 @@ SEQUENCE = "sequence"
 """The folder of exported volumes, `film_0000.vdb` and so on."""
 FILM_FILES = (
     *("scene.yaml", "film.json", "report.html", "movie.png"),
-    *(SHARED, "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
+    *(SHARED, f"{SHARED}.lock", "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
     *("calibration/checkpoints/*.pt", "calibration/[0-9]*/volumes/*.npz"),
     *("frames/[0-9]*/start/volumes/*.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
 )

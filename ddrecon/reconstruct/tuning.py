@@ -60,9 +60,3 @@ GRADIENT_ERROR = 0.01
 """The relative error that each of the two solves may make in the gradient."""
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""
-
-# Support by pictures (`support`). Chosen on the capture.
-DARKEST = 0.1
-"""So much of each picture, at least, is background."""
-DEVIATIONS = 4.0
-"""Black is less than so many deviations of noise above it."""

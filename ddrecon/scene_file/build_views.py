@@ -18,10 +18,10 @@ from ddrecon.lenses import distort, ray_through
 from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
-from ddrecon.scene_file.load import SceneFile, read_referenced
+from ddrecon.scene_file.load import SceneFile, require
 from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
 
-READERS: Mapping[str, Callable[[Path], Image]] = {
+READERS: Mapping[str, Callable[[Path, int], Image]] = {
     "image": read_image,
     "background": read_image,
     "mask": read_mask,
@@ -65,7 +65,8 @@ def _build_view(
     for name, read in READERS.items():
         if isinstance(path := getattr(section, name), Path):
             with problems.collecting():
-                stored = read_referenced(scene_file, f"{key}.{name}", path, read)
+                require(scene_file, f"{key}.{name}", path)
+                stored = read(path, 0 if name == "background" else section.frame)
                 pixels = torch.from_numpy(stored.pixels).permute(2, 0, 1).contiguous()
                 pictures[name] = pixels.to(device, dtype)
                 step = stored.step if name == "image" else step

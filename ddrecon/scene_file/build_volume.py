@@ -27,6 +27,7 @@ from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.schema import (
+    Bounds,
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
@@ -166,10 +167,10 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
     Raises SceneError with all that do not agree, or where nothing says what the grid is.
     """
     section, problems = scene_file.tree.volume, Problems()
-    box = None
-    if section.bounds is not None:
+    box, size = None, section.resolution if isinstance(section.resolution, tuple) else None
+    if isinstance(section.bounds, Bounds):
         box = np.array([section.bounds.min, section.bounds.max])
-    sizes = {"volume.resolution": section.resolution} | {k: f.resolution for k, f in fields.items()}
+    sizes = {"volume.resolution": size} | {key: field.resolution for key, field in fields.items()}
     boxes = {"volume.bounds": box} | {key: field.bounds for key, field in fields.items()}
     for what, given in (("resolution", sizes), ("bounds", boxes)):
         known = {key: np.array(value) for key, value in given.items() if value is not None}

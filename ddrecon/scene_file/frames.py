@@ -6,19 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 
 from ddrecon.errors import Problems
+from ddrecon.io.images.films import FILMS
+from ddrecon.io.images.table import read_image
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.schema import FRAME
+from ddrecon.scene_file.schema import FRAME, ViewSection
 
 
 def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
     """The scene of the frame `number` of a film."""
 
-    def name(path: Path | None) -> Path | None:
-        return path and Path(FRAME.sub(lambda field: field[0].format(frame=number), str(path)))
+    def own(view: ViewSection) -> ViewSection:
+        frame = number + view.frame
+
+        def name(path: Path | None) -> Path | None:
+            return path and Path(FRAME.sub(lambda field: field[0].format(frame=frame), str(path)))
+
+        return replace(view, image=name(view.image), mask=name(view.mask), frame=frame)
 
     tree = scene_file.tree
-    views = tuple(replace(v, image=name(v.image), mask=name(v.mask)) for v in tree.views)
-    return replace(scene_file, tree=replace(tree, views=views, frames=None))
+    return replace(scene_file, tree=replace(tree, views=tuple(map(own, tree.views)), frames=None))
 
 
 def each_frame(scene_file: SceneFile) -> list[SceneFile]:
@@ -28,12 +34,14 @@ def each_frame(scene_file: SceneFile) -> list[SceneFile]:
 
 
 def require_frames(scene_file: SceneFile) -> None:
-    """Raises SceneError unless all pictures of the film are there."""
-    problems = Problems()
-    for one in each_frame(scene_file):
+    """Raises SceneError unless all pictures are there, FormatError for films that end before."""
+    problems, frames = Problems(), each_frame(scene_file)
+    for one in frames:
         for index, view in enumerate(one.tree.views):
             for key, path in (("image", view.image), ("mask", view.mask)):
                 if path is not None and not problems.are_many:
                     with problems.collecting():
                         require(one, f"views.{index}.{key}", path)
+                        if one is frames[-1] and path.suffix.lower() in FILMS:
+                            read_image(path, view.frame)
     problems.raise_any()

@@ -19,7 +19,7 @@ from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import node_of
 from ddrecon.scene_file.view_sources import name_listed, views_of
-from ddrecon.settings import ParameterSettings, Violation
+from ddrecon.settings import AUTO, ParameterSettings, Violation
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -60,7 +60,7 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
-    """The scene file at `path` with `overrides` (`key.path=value`) put in.
+    """The scene file at `path` with `overrides` (`key.path=value`) put in, its box in numbers.
 
     Raises SceneError with one line per problem.
     """
@@ -76,6 +76,10 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         found = _scene_of(root, path)
     problems.raise_any()
     assert found is not None
+    if AUTO in (found.tree.volume.bounds, found.tree.volume.resolution):
+        from ddrecon.scene_file.box import fit_volume  # here, as it loads torch
+
+        return fit_volume(found)
     return found
 
 

@@ -14,9 +14,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from ddrecon.grid import Triple
+from ddrecon.io.images.films import FILMS
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -31,6 +32,7 @@ from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
 Color = float | Triple
 Count = tuple[int, int, int]
+Auto = Literal["auto"]
 Size = tuple[int, int]
 Pair = tuple[float, float]
 Row = tuple[float, float, float, float]
@@ -140,21 +142,24 @@ class MediumSection:
 
 @dataclass(frozen=True)
 class VolumeSection(MediumSection):
-    """`bounds` and `resolution` may be left out where a field's file has them."""
+    """`bounds` and `resolution` may be left out where a field's file has them.
+
+    With `auto` they are what fits the pictures (`scene_file.box`).
+    """
 
     g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
     phase: PhaseSection | None = None  # type: ignore[assignment]
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
-    bounds: Bounds | None = None
-    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    bounds: Bounds | Auto | None = None
+    resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
         if self.emission is not None and self.temperature is not None:
             yield "temperature", "says what is emitted as well: give only one of it or emission"
-        x, y, z = self.resolution or (1, 1, 1)
+        x, y, z = self.resolution if isinstance(self.resolution, tuple) else (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
 
@@ -164,8 +169,8 @@ class MixtureSection:
     """Two media in the same box, by name; `bounds` and `resolution` as of `VolumeSection`."""
 
     media: Mapping[str, MediumSection]
-    bounds: Bounds | None = None
-    resolution: Count | None = bounded(None, minimum=1, maximum=4096)
+    bounds: Bounds | Auto | None = None
+    resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
@@ -346,7 +351,8 @@ CameraSection = PerspectiveSection | OrthographicSection
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
-    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    `frame`: which one of films is taken, or with `frames`, which number the scene's frame 0 has
+    here. `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
     `offset`; `background` is what it shows where the volume is empty.
     """
 
@@ -354,6 +360,7 @@ class ViewSection:
     camera: CameraSection
     image: Path | None = None
     mask: Path | None = None
+    frame: int = 0
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0, expert=True)
     exposure: Color = bounded(1.0, minimum=1e-3)
@@ -428,7 +435,7 @@ class ViewSource:
 
 @dataclass(frozen=True)
 class FramesSection:
-    """A film: pictures and masks have `{frame:04d}` in their names, from `first` to `last`.
+    """A film: pictures and masks are films, or have `{frame:04d}` in their names.
 
     `calibrate`: how many frames, spread along it, find together what does not change; with 0 each
     frame finds its own.
@@ -505,5 +512,6 @@ class SceneTree:
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:
             yield "views", f"{counted[0]} is of a film; say which frames: {{first: 0, last: 99}}"
-        if self.frames is not None and not counted:
-            yield "frames", "no picture changes: put {frame:04d} into the names of pictures"
+        films = [name for name in named if name.lower().endswith(tuple(FILMS))]
+        if self.frames is not None and not counted and not films:
+            yield "frames", "no picture changes: name films, or put {frame:04d} into names"

@@ -167,7 +167,8 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
         )
     if image is not None and image.suffix.lower() not in READERS:
         image = image.with_name(f"{image.name}.png")
-    return ViewSection(camera=camera, image=image, mask=mask)
+    number = read_as(own["frame"], int, folder) if "frame" in own else 0
+    return ViewSection(camera=camera, image=image, mask=mask, frame=number)
 
 
 def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
@@ -267,7 +268,7 @@ def export_transforms(
             for key, file in files.items()
             if file is not None
         }
-        frames.append(names | _camera(view))
+        frames.append(names | {"frame": section.frame} | _camera(view))
         for name in LISTS[1:] if view.is_test else LISTS[:1]:
             splits[name] += [names["file_path"]] if "file_path" in names else []
     models = {frame["camera_model"] for frame in frames}

@@ -2,10 +2,13 @@
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -18,6 +21,9 @@ from ddrecon.io.volumes.table import field_names, read_field, write_field
 from ddrecon.reconstruct.divergence import NotFiniteError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
+from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.frames import at_frame
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -183,6 +189,44 @@ def test_a_calibration_that_diverges_goes_on_before_its_last_step(
     assert failed.exit_code == 4 and f"{kept}: go on from it with --resume" in failed.stderr
     succeed(*optimize("-o", "parts", "--resume"))
     assert volumes("parts") == volumes("whole")
+
+
+@pytest.mark.slow
+def test_parts_that_begin_together_calibrate_once(film: Path) -> None:
+    """The second waits, and takes what the first has found."""
+    parts = [
+        [sys.executable, "-m", "ddrecon", *optimize("-o", "out", "--resume")] for _ in range(2)
+    ]
+    running = [subprocess.Popen([*p, "--frames", f"{3 * i}:{3 * i}"]) for i, p in enumerate(parts)]
+    assert [one.wait(timeout=100) for one in running] == [0, 0]
+    found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 3)]
+    assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
+
+
+def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:
+    """Each camera by its own count; a scene says which frame is its, and is read again as such."""
+    pytest.importorskip("imageio_ffmpeg", reason="films are an extra")
+    text = Path("film.yaml").read_text()
+    for ahead, name in enumerate(VIEWS):
+        noise = np.random.default_rng(ahead).integers(0, 255, (FRAMES + ahead, 12, 12, 3), np.uint8)
+        for number in range(FRAMES):
+            iio.imwrite(f"{name}_{number:02d}.png", noise[number + ahead])
+        exact = {"codec": "libx264rgb", "output_params": ["-crf", "0"], "macro_block_size": 1}
+        iio.imwrite(f"{name}.mp4", noise, pixelformat="rgb24", quality=None, **exact)
+        text = text.replace(f"'{name}_{{frame:02d}}.npy'", f"{name}.mp4, frame: {ahead}")
+    Path("mp4.yaml").write_text(text)
+    Path("png.yaml").write_text(Path("film.yaml").read_text().replace(".npy", ".png"))
+    for number in range(FRAMES):
+        one, other = (at_frame(read_scene(name), number) for name in ("mp4.yaml", "png.yaml"))
+        dump_scene(describe(one), Path("again.yaml"))
+        for scene in (build_scene(one), load_scene("again.yaml")):
+            for view, picture in zip(scene.views, build_scene(other).views, strict=True):
+                assert torch.equal(view.image, picture.image) and view.step == picture.step
+    (line, *_) = refuse(3, "optimize", "mp4.yaml", "-o", "out", "-D", "frames.last=4")
+    assert "front.mp4: has no frame 4, counted from 0: it has" in line
+    Path("front.mp4").write_bytes(Path("front.mp4").read_bytes()[:-600])
+    (line,) = refuse(3, "check", "mp4.yaml")
+    assert line.endswith("front.mp4: is damaged, or no film")
 
 
 @pytest.mark.slow

@@ -29,7 +29,8 @@ from refusals import image_refusal, refusal
 
 from ddrecon.cli.commands import main
 from ddrecon.errors import FormatError, MissingExtraError
-from ddrecon.extras import advice
+from ddrecon.extras import advice, load_for_file
+from ddrecon.io.images.films import FILMS
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.images.table import READERS, read_image
 from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
@@ -73,7 +74,13 @@ def write_volume(path: Path) -> None:
 
 
 def write_encoded(path: Path, pixels: np.ndarray) -> None:
-    iio.imwrite(path, (255 * pixels).astype(np.uint8))
+    image, form = (255 * pixels).astype(np.uint8), dict[str, Any]()
+    if path.suffix in FILMS:
+        load_for_file("imageio_ffmpeg", path)
+        image = np.stack([image] * 3)
+        codec = "libvpx-vp9" if path.suffix == ".webm" else "libx264"
+        form = {"codec": codec, "macro_block_size": 1, "pixelformat": "yuv444p"}
+    iio.imwrite(path, image, **form)
 
 
 WRITERS: dict[str, Callable[[Path, np.ndarray], object]] = {

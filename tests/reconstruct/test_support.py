@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +12,8 @@ from media import box_grid, make_camera
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
-from ddrecon.grid import Grid
+from ddrecon.hull import brightest_black, hull_of
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.support import brightest_black, describe_support, hull_of
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 
@@ -65,11 +63,12 @@ def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> None:
     """Every ray of a pixel that shows something passes only through cells of the hull; with nothing
-    shown, only cells stay that are not seen.
+    shown none stays, with everything all do.
     """
     camera, grid = CAMERAS[name], box_grid((7, 6, 8))
     shown = torch.rand(camera.size, generator=torch.Generator().manual_seed(1)) > 0.995
-    hull, _ = hull_of(camera, shown, grid, 0.0)
+    held, seen = hull_of(camera, shown, grid, 0.0)
+    hull = held | ~seen
     rays = cast_rays(camera)
     low, high = (torch.tensor(corner).double() for corner in (grid.lower, grid.upper))
     for index in shown.flatten().nonzero()[:, 0].tolist():
@@ -79,12 +78,13 @@ def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> 
         cells = ((inside - low) / torch.tensor(grid.spacing).double()).long()
         assert bool(hull[tuple(cells.unbind(1))].all())
     assert not bool(hull.all())
-    nothing, is_seen = hull_of(camera, torch.zeros_like(shown), grid, 0.0)
+    assert not hull_of(camera, torch.zeros_like(shown), grid, 0.0)[0].any()
+    everything, is_seen = hull_of(camera, torch.ones_like(shown), grid, 0.0)
     z, y, x = torch.meshgrid(*(c.flatten() for c in grid.centers(camera.pose)), indexing="ij")
     places, _ = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
     size = torch.tensor([camera.size[1], camera.size[0]])
     seen = ((places >= 0) & (places < size)).all(1)
-    assert torch.equal(nothing.flatten(), ~seen) and torch.equal(is_seen, ~nothing)
+    assert bool(everything.all()) and torch.equal(is_seen.flatten(), seen)
 
 
 def test_a_hull_grows_with_margin_and_with_cells() -> None:
@@ -163,22 +163,3 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
 def test_what_is_no_support_is_refused() -> None:
     with pytest.raises(SceneError, match=r"g\.support: 'masks' is for density alone"):
         ball("optimize.parameters.g={support: masks}")
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_box_of_several_frames_is_the_tightest_that_holds_them(seed: int) -> None:
-    """Of random cells, in the corner of a box of unequal sides."""
-    grid = Grid((7, 8, 9), (-1.0, 0.5, 2.0), (2.0, 1.5, 2.5))
-    generator = torch.Generator().manual_seed(seed)
-    frames = [torch.rand(grid.shape, generator=generator) > 0.99 for _ in range(3)]
-    supports = [SimpleNamespace(on=lambda _, cells=cells: cells) for cells in frames]
-    told = describe_support(supports, grid)  # type: ignore[arg-type]
-    kept = torch.stack(frames).any(0)
-    assert told is not None and told["cells"] == pytest.approx(float(kept.double().mean()))
-    lines = grid.centers(torch.zeros(()).double())
-    for line, cell, low, high in zip(
-        lines, grid.spacing, told["box"][0][::-1], told["box"][1][::-1], strict=True
-    ):
-        places = line.expand(grid.shape)[kept]
-        assert float(places.min()) - cell / 2 == pytest.approx(low)
-        assert float(places.max()) + cell / 2 == pytest.approx(high)

@@ -1,8 +1,8 @@
 """Images by suffix, in linear radiance. Row 0 is the top.
 
 Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and
-16-bit ones (.png, .jpg, .webp) are decoded from sRGB and multiplied by their alpha. Either way a
-pixel of alpha 0 is empty: black. Previews have exposure 1.
+16-bit ones (.png, .jpg, .webp, frames of films) are decoded from sRGB and multiplied by their
+alpha. Either way a pixel of alpha 0 is empty: black. Previews have exposure 1.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ddrecon.extras import is_there
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images.films import FILMS, read_frame
 from ddrecon.io.images.oiio import (
     PACKAGE,
     opened,
@@ -61,15 +62,18 @@ class Image:
         return self.pixels.shape[0], self.pixels.shape[1]
 
 
-def read_image(path: Path) -> Image:
-    """The image at `path`; raises FormatError where it is unknown, damaged, or not finite."""
+def read_image(path: Path, frame: int = 0) -> Image:
+    """The image at `path`, of a film the one of this number.
+
+    Raises FormatError where it is unknown, damaged, or not finite.
+    """
     reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
         known = ", ".join(READERS)
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {known}")
     with guard_reading(path):
-        values = reader(path)
-        if reader is _read_encoded:
+        values = read_frame(path, frame) if reader is read_frame else reader(path)
+        if reader in (read_frame, _read_encoded):
             step = 1 / 65535 if values.dtype == np.uint16 else 1 / 255
             values = _decode(values)
     if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,), (4,)) or not values.size:
@@ -92,9 +96,9 @@ def read_image(path: Path) -> Image:
     return Image(pixels, coverage, step)
 
 
-def read_mask(path: Path) -> Image:
+def read_mask(path: Path, frame: int = 0) -> Image:
     """The mask at `path`: 0 where its image is black or empty, and ignored, else 1."""
-    return Image(as_float32(read_image(path).pixels.max(axis=2, keepdims=True) > 0))
+    return Image(as_float32(read_image(path, frame).pixels.max(axis=2, keepdims=True) > 0))
 
 
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
@@ -194,4 +198,5 @@ READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".tif": read_tiff,
     ".tiff": read_tiff,
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp"), _read_encoded),
+    **dict.fromkeys(FILMS, read_frame),
 }

@@ -1,0 +1,174 @@
+"""Visual hulls: where there may be smoke, by what views show, and the box around it.
+
+A place is left out where any view that sees it sees nothing there (Laurentini 1994,
+doi:10.1109/34.273735). Pictures are taken at full resolution, whatever the grid's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_max_pool2d, avg_pool2d, max_pool2d, normalize, pad
+
+from ddrecon.cameras import Camera, cast_rays, project
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid, array_order
+from ddrecon.pictures.noise import estimate_noise
+from ddrecon.scene import View
+from ddrecon.settings import AUTO, MASKS
+
+DARKEST = 0.1
+"""So much of each picture, at least, is background. Chosen on the capture, as what follows."""
+DEVIATIONS = 4.0
+"""Black is less than so many deviations of noise above it."""
+MOST_PIXELS = 256
+"""For a box, pictures of more pixels along a side are made smaller."""
+BOX_CELLS, SHRINKS = 48, 0.97
+"""A box is cut to the cells that are left of so many along each side, again and again until no side
+shrinks below this part of itself."""
+
+
+class HullError(SceneError):
+    """Pictures that do not tell where there is smoke."""
+
+
+def find_shown(view: View, support: str) -> Tensor:
+    """Which pixels of `view`, which has an image, show something: bool [h, w].
+
+    By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
+    with `auto`, where the brightest color is above black, or differs from the view's background
+    by more than noise, or is not known. Raises HullError where that is most of its edges.
+    """
+    assert view.image is not None
+    if support == MASKS and view.mask is not None:
+        return view.mask > 0
+    image, behind = view.image, view.background
+    if support == AUTO and behind is not None:
+        # A background that is a picture errs as well.
+        noise = estimate_noise(image, view.step).deviation(behind) * math.sqrt(2)
+        differs = ((image - behind).abs() / noise).amax(0)
+        shown = differs > _darkest(differs) + DEVIATIONS
+    else:
+        shown = image.amax(0) > (brightest_black(image, view.step) if support == AUTO else 0.0)
+    shown = shown if view.mask is None else shown | (view.mask == 0)
+    edges = torch.cat([shown[[0, -1]].flatten(), shown[:, [0, -1]].flatten()])
+    if support == AUTO and float(edges.float().mean()) > 0.5:
+        raise HullError(
+            f"view {view.name!r} shows something along most of its edges, so its background is not "
+            "known: give background (a picture without smoke, or a color), or masks with "
+            "support: masks"
+        )
+    return shown
+
+
+def brightest_black(image: Tensor, step: float) -> float:
+    """The radiance up to which a picture `image` [3, h, w] may be black, by its own noise.
+
+    Its black is what the darkest part of its pixels, `DARKEST`, does not exceed; what is brighter
+    than that by `DEVIATIONS` of the noise there (E9.2) shows something.
+    """
+    black = _darkest(image.amax(0))
+    return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
+
+
+def _darkest(values: Tensor) -> Tensor:
+    """What the part `DARKEST` of `values` does not exceed."""
+    return values.flatten().kthvalue(max(1, round(DARKEST * values.numel()))).values
+
+
+def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
+    """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
+
+    `shown` [h, w] is whether a pixel shows something; a cell may hold it where a pixel does within
+    `margin` pixels of those that the cell covers. Beyond its image, a camera shows what the nearest
+    pixel does.
+    """
+    z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
+    places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
+    height, width = camera.size
+    # The pixels that a cell covers lie within its half diagonal of its center; nearer cells cover
+    # more, and one that the camera may be inside of covers any.
+    half = math.hypot(*grid.spacing) / 2
+    pixel = 2 * float(camera.half_width) / width
+    near = distance.min() - half if camera.is_perspective else distance.new_ones(())
+    reach = math.inf if float(near) <= 0 else half / (float(near) * pixel) + margin
+    around = math.ceil(min(reach, max(height, width)))
+    wide = _widen(shown, around)
+    column, row = places.nan_to_num(-1.0).floor().unbind(-1)
+    is_seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = (
+        (place + around).clamp(0, count + 2 * around - 1).long()
+        for place, count in ((column, width), (row, height))
+    )
+    return wide[row, column].view(grid.shape), is_seen.view(grid.shape)
+
+
+def _widen(shown: Tensor, reach: int) -> Tensor:
+    """Where any pixel of `shown` [h, w] within `reach` rows and columns is true.
+
+    Also so far beyond its edges, [h + 2 reach, w + 2 reach]: there it goes on as it ends.
+    """
+    pixels = pad(shown.float()[None, None], [2 * reach] * 4, "replicate")
+    side = 2 * reach + 1
+    return max_pool2d(max_pool2d(pixels, (side, 1), 1), (1, side), 1)[0, 0] > 0
+
+
+def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
+    """The corners [2, 3] (x, y, z) [u] of the box around all that the views of `frames` may show.
+
+    By the pixels [h, w] that each shows, single ones left out, widened by `margin`. A frame of
+    which a view shows nothing has no smoke yet. Raises HullError where the views leave no place,
+    or any.
+    """
+    boxes = []
+    for views, pixels in frames:
+        shown = [avg_pool2d(each.float()[None], 3, 1, 1)[0] > 0.5 for each in pixels]
+        if shown and all(bool(each.any()) for each in shown):
+            boxes.append(_bound_frame([view.camera for view in views], shown, margin))
+    if not boxes:
+        raise HullError(
+            "no training views all show something: give background where smoke is dark before it"
+        )
+    corners = torch.stack(boxes)
+    return torch.stack([corners[:, 0].amin(0), corners[:, 1].amax(0)])
+
+
+def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: float) -> Tensor:
+    """The box of `bound_smoke` of one frame."""
+    factors = [math.ceil(max(camera.size) / MOST_PIXELS) for camera in cameras]
+    cameras = [camera.resize(factor) for camera, factor in zip(cameras, factors, strict=True)]
+    shown = [
+        adaptive_max_pool2d(each.float()[None], camera.size)[0] > 0
+        for camera, each in zip(cameras, shown, strict=True)
+    ]
+    seen = [cast_rays(c).select(each.flatten()) for c, each in zip(cameras, shown, strict=True)]
+    origins = array_order(torch.stack([rays.origin.mean(0) for rays in seen])).double().cpu()
+    ways = array_order(torch.stack([rays.direction.mean(0) for rays in seen])).double().cpu()
+    ways = normalize(ways)
+    # The place nearest to the middle of what each shows, and a cube about it that holds no camera.
+    across = torch.eye(3).double() - ways[:, :, None] * ways[:, None]
+    middle = torch.linalg.lstsq(across.sum(0), (across @ origins[..., None]).sum(0)).solution[:, 0]
+    reach = min(
+        float((origin - middle).norm()) / 2 if c.is_perspective else 1.5 * float(c.half_width)
+        for c, origin in zip(cameras, origins, strict=True)
+    )
+    box, sides = torch.stack([middle - reach, middle + reach]), torch.zeros(3)
+    cube = box
+    while bool((sides < SHRINKS).any()):
+        grid = Grid.from_xyz((BOX_CELLS,) * 3, *map(tuple, box.tolist()))
+        hulls = [
+            hull_of(camera, each, grid, margin / factor)[0]
+            for camera, each, factor in zip(cameras, shown, factors, strict=True)
+        ]
+        places = array_order(torch.stack(hulls).all(0).nonzero()).cpu()
+        if not len(places):
+            raise HullError("of each place some view shows nothing; check the cameras")
+        ends = torch.stack([places.amin(0), places.amax(0) + 1])
+        sides = (ends[1] - ends[0]) / BOX_CELLS
+        box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
+    if bool((box == cube).any()):
+        raise HullError("the views leave it open; more from other sides may close it")
+    return box

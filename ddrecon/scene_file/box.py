@@ -1,0 +1,72 @@
+"""What `auto` stands for in a scene's volume: a box and cells that fit its pictures, in numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from statistics import mean
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import pixel_width
+from ddrecon.hull import HullError, bound_smoke, find_shown
+from ddrecon.scene import View
+from ddrecon.scene_file.build_views import build_views
+from ddrecon.scene_file.frames import each_frame
+from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.schema import Bounds
+from ddrecon.settings import AUTO, ParameterSettings
+
+CELL = 2.0
+"""How many pixels wide a cell is."""
+
+
+def fit_volume(scene_file: SceneFile) -> SceneFile:
+    """`scene_file` with its box and resolution in numbers; those of a film fit all of its frames.
+
+    Raises SceneError where the pictures do not tell, and what reading them raises.
+    """
+    tree = scene_file.tree
+    bounds, resolution = tree.volume.bounds, tree.volume.resolution
+    if bounds is None:
+        what = "auto takes volume.bounds, a box in numbers or auto as well"
+        raise scene_file.refused("volume.resolution", what)
+    if isinstance(bounds, Bounds):
+        corners = torch.tensor([bounds.min, bounds.max], dtype=torch.float64)
+    else:
+        corners = _find_box(scene_file)
+    middle, sides = corners.mean(0), corners[1] - corners[0]
+    if isinstance(resolution, str):
+        views = build_views(each_frame(scene_file)[0], None, torch.float32, torch.device("cpu"))
+        cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
+        x, y, z = (max(1, math.ceil(side / cell)) for side in sides.tolist())
+        resolution = x, y, z
+        sides = cell * sides.new_tensor(resolution)
+    if not isinstance(bounds, Bounds):
+        digits = 3 - math.floor(math.log10(float(sides.max())))
+        low, high = (
+            [round(x, digits) for x in (middle + end * sides).tolist()] for end in (-0.5, 0.5)
+        )
+        bounds = Bounds((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    volume = replace(tree.volume, bounds=bounds, resolution=resolution)
+    return replace(scene_file, tree=replace(tree, volume=volume))
+
+
+def _find_box(scene_file: SceneFile) -> Tensor:
+    """The corners [2, 3] of the box around all that the pictures may show."""
+    parameters = scene_file.tree.optimize.parameters if scene_file.tree.optimize else {}
+    density = parameters.get("density", ParameterSettings())
+
+    def frames() -> Iterator[tuple[Sequence[View], Sequence[Tensor]]]:
+        for one in each_frame(scene_file):
+            built = build_views(one, None, torch.float32, torch.device("cpu"))
+            views = [view for view in built if view.image is not None and not view.is_test]
+            yield views, [find_shown(view, density.support or AUTO) for view in views]
+
+    try:
+        return bound_smoke(frames(), density.support_margin)
+    except HullError as error:
+        what = f"auto: {error}; or give min and max in numbers"
+        raise scene_file.refused("volume.bounds", what) from error

@@ -1,0 +1,141 @@
+"""`volume: {bounds: auto, resolution: auto}`: what pictures leave room for, in numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+
+from ddrecon.cameras import cast_rays, pixel_width
+from ddrecon.scene_file.build import load_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
+
+RADIUS, CENTERS = 0.2, ((0.1, 0.3, -0.2), (0.1, 0.5, -0.2))
+SCENE = """\
+frames: {first: 0, last: 1}
+volume: {bounds: auto, resolution: auto, density: 0, sigma_t: 8, albedo: 0.9}
+lights: [{type: directional, direction: [-1, -2, -1], irradiance: 2.5}]
+optimize: {parameters: {density: {init: 0}}}
+views:
+"""
+LENSES = {
+    "pinhole": "type: perspective, fov: 40",
+    "parallel": "type: orthographic, width: 1.8",
+    "opencv": "type: perspective, fov: 40, distortion: {type: opencv, k1: -0.2, p1: 0.002}",
+}
+PLACES = ((0, 0.3, 2.5), (-2.2, 0.9, 1.0), (2.3, 0.1, 0.5))
+
+
+@pytest.fixture
+def scene(folder: Path) -> Callable[..., Path]:
+    """Writes a film of a ball in two places, before what pictures show without it."""
+
+    def write(
+        lens: str = "pinhole",
+        behind: float = 0.0,
+        ball: float = 0.5,
+        more: str = "",
+        radius: float = RADIUS,
+    ) -> Path:
+        views = [
+            f"  - {{name: v{i}, image: 'v{i}_{{frame}}.npy', {more} camera: {{{LENSES[lens]}, "
+            f"origin: {list(place)}, target: [0, 0.3, 0], resolution: [90, 70]}}}}"
+            for i, place in enumerate(PLACES)
+        ]
+        path = folder / "auto.yaml"
+        path.write_text(SCENE + "\n".join(views) + "\n")
+        generator = np.random.default_rng(1)
+        for frame, center in enumerate(CENTERS):
+            for i in range(len(PLACES)):
+                np.save(f"v{i}_{frame}.npy", np.zeros((70, 90, 3), np.float32))
+            sizes = [
+                "volume.bounds={min: [-1, -1, -1], max: [1, 1, 1]}",
+                "volume.resolution=[4, 4, 4]",
+            ]
+            for i, view in enumerate(load_scene(path, overrides=sizes).views):
+                rays = cast_rays(view.camera)
+                away = torch.tensor(center[::-1]) - rays.origin
+                along = (away * rays.direction).sum(1, keepdim=True)
+                hits = (away - along * rays.direction).norm(dim=1) < radius
+                picture = torch.where(hits, ball, behind).view(70, 90, 1).expand(-1, -1, 3).numpy()
+                picture = picture + 0.002 * generator.standard_normal(picture.shape)
+                np.save(f"v{i}_{frame}.npy", picture.astype(np.float32))
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], lens: str) -> None:
+    """In all frames; and scenes with what was found are as any."""
+    path = scene(lens)
+    found = read_scene(path)
+    volume, views = found.tree.volume, load_scene(path).views
+    pixel = float(np.mean([pixel_width(view.camera, torch.tensor(CENTERS[0])) for view in views]))
+    for axis in range(3):
+        low, high = (end([c[axis] for c in CENTERS]) for end in (min, max))
+        # Two pixels on each side are asked for, and the ball seen through a cell is in all of it.
+        for side in (
+            low - RADIUS - volume.bounds.min[axis],
+            volume.bounds.max[axis] - RADIUS - high,
+        ):
+            assert pixel < side < 9 * pixel
+    cells = np.subtract(volume.bounds.max, volume.bounds.min) / volume.resolution
+    np.testing.assert_allclose(cells, 2 * pixel, rtol=0.05)
+    dump_scene(describe(found), Path("plain.yaml"))
+    assert "auto" not in Path("plain.yaml").read_text()
+    assert read_scene("plain.yaml").tree == found.tree
+
+
+def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
+    scene: Callable[..., Path], run: Callable[..., Result]
+) -> None:
+    bright = read_scene(scene()).tree.volume
+    dark = scene(behind=0.9, ball=0.4, more="background: 0.9,")
+    assert read_scene(dark).tree.volume == bright
+    np.save("empty.npy", np.full((70, 90, 3), 0.9, np.float32))
+    assert (
+        read_scene(scene(behind=0.9, ball=0.4, more="background: empty.npy,")).tree.volume == bright
+    )
+    told = run("check", "auto.yaml").stdout
+    assert f"from {list(bright.bounds.min)} to {list(bright.bounds.max)}" in told
+    assert "within bounds: {min: [" in told
+    least, most = re.search("cells: (.*) to (.*) pixels wide", told).groups()
+    assert float(least) < 2 < float(most)
+
+
+@pytest.mark.parametrize(
+    ("make", "overrides", "line"),
+    [
+        (
+            {"behind": 0.9, "radius": 0.5},
+            [],
+            "view 'v0' shows something along most of its edges, so its backgr",
+        ),
+        ({}, [f"views.{i}.split=test" for i in range(3)], "no training views all show something"),
+        ({}, [f"views.{i}.split=test" for i in range(2)], "the views leave it open; more from oth"),
+        (
+            {"behind": 0.9},
+            [],
+            "no training views all show something: give background where smoke is",
+        ),
+        ({}, ["views.0.camera.target=[0, 6, 0]"], "of each place some view shows nothing"),
+        ({}, ["volume.bounds=null"], "volume.resolution: auto takes volume.bounds, a box in num"),
+        ({}, ["frames.last=2"], "does not exist"),
+    ],
+)
+def test_what_pictures_do_not_tell_is_asked_for(
+    scene: Callable[..., Path],
+    refuse: Callable[..., list[str]],
+    make: dict[str, float],
+    overrides: list[str],
+    line: str,
+) -> None:
+    scene(**make)
+    (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))
+    assert line in told
