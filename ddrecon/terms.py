@@ -153,7 +153,11 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
 
 def _ground_term(ground: Ground, grid: Grid) -> str:
     """A ground, and on what it and the volume light each other."""
-    plane, albedo = ground.plane, _listed(ground.albedo, is_by_cell=False)
+    plane = ground.plane
+    albedo = _listed(ground.mean_albedo, is_by_cell=False)
+    if ground.albedo.ndim > 1:
+        rows, columns = ground.albedo.shape[1:]
+        albedo += f" in the mean of {columns} x {rows} pixels"
     cells = " x ".join(map(str, reversed(exchange_grid(grid).shape)))
     return (
         f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}: direct light ray by "

@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import LOWER, UPPER, half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -18,7 +19,7 @@ from ddrecon import renderer
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
 from ddrecon.light.lights import (
@@ -90,6 +91,29 @@ def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
     torch.testing.assert_close(render(scene)[0], expected, rtol=1e-7, atol=0)
 
 
+def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -> None:
+    scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0, -1, 0))
+    rows, columns = 8, 10
+    z, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (rows, columns))
+    scene.ground = Ground((0.2 + 0.5 * z[:, None] + 0.1 * x)[None], scene.ground.plane)
+    pose = look_at(tensor(0, 9, 0.05), tensor(0, 0, 0.05), tensor(0, 0, -1))
+    scene.views = [View("above", Camera(pose, (30, 30), 1.2, is_perspective=False))]
+    row = 0.05 + 1.2 * (2 * (torch.arange(30, dtype=torch.float64) + 0.5) / 30 - 1)
+    v, u = (row[:, None] - LOWER[0]) / (UPPER[0] - LOWER[0]), (row - 0.05 - LOWER[2]) / 0.9
+    inside = ((v > 0) & (v < 1)) & ((u > 0) & (u < 1))
+    v, u = v.clamp(0.5 / rows, 1 - 0.5 / rows), u.clamp(0.5 / columns, 1 - 0.5 / columns)
+    expected = torch.where(inside, 0.2 + 0.5 * v + 0.1 * u, 0.5) * 3 / math.pi
+    torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-12, atol=0)
+
+
+def test_an_even_map_is_a_number() -> None:
+    scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
+    known, ground = render(scene), scene.ground
+    even = ground.albedo.view(3, 1, 1).expand(3, 5, 7)
+    found = render(replace(scene, ground=replace(ground, albedo=even)))
+    torch.testing.assert_close(found, known, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("form", ["ambient", "environment"])
 @pytest.mark.parametrize("g", [0.0, 0.4])
 def test_a_white_furnace_is_white(form: str, g: float) -> None:
@@ -124,7 +148,7 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
-@pytest.mark.parametrize("kind", ["p1", "coarse", "environment"])
+@pytest.mark.parametrize("kind", ["p1", "coarse", "environment", "map"])
 def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if kind == "coarse":
         monkeypatch.setattr(renderer, "MOST_CELLS", 5)
@@ -134,6 +158,8 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
     beam = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
     scene.lights.append(BeamLight(*beam))
+    if kind == "map":
+        scene.ground = replace(scene.ground, albedo=random_values(3, 5, 9))
     if kind == "environment":
         sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 8)
         scene.lights.append(sky)
@@ -248,6 +274,16 @@ GROUND = "ground={height: -0.75, albedo: 0.3}"
 def test_a_ground_that_cannot_be_is_refused(overrides: list[str], what: str) -> None:
     with pytest.raises(SceneError, match=re.escape(what)):
         load_scene(BALL, overrides=[GROUND, VIEWS, "optimize=null", *overrides])
+
+
+def test_a_map_is_read_as_it_is(tmp_path: Path) -> None:
+    gray = random_values(4, 6).float().numpy()
+    for name, factor in (("a.npy", 1), ("b.npy", 2)):
+        np.save(tmp_path / name, factor * gray)
+    scene = load_scene(BALL, overrides=[GROUND, VIEWS, f"ground.albedo={{file: {tmp_path}/a.npy}}"])
+    torch.testing.assert_close(scene.ground.albedo, torch.from_numpy(gray)[None])
+    with pytest.raises(FormatError, match="an albedo is from 0 to 1"):
+        load_scene(BALL, overrides=[GROUND, VIEWS, f"ground.albedo={{file: {tmp_path}/b.npy}}"])
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import attenuate_few
@@ -51,11 +52,36 @@ class Plane:
 class Ground:
     """What reflects the part `albedo` [C], from 0 to 1, of the light that falls on a `plane`.
 
-    It does so evenly into all directions. The plane lies at the box's bottom or below.
+    It does so evenly into all directions. The plane lies at the box's bottom or below. A map of
+    albedo [C, rows, columns] covers what is straight under the box, along both axes from low to
+    high; beyond it is the map's mean.
     """
 
     albedo: Tensor
     plane: Plane
+
+    @property
+    def mean_albedo(self) -> Tensor:
+        """That of the whole plane [C]."""
+        return self.albedo if self.albedo.ndim == 1 else self.albedo.mean((1, 2))
+
+    def albedo_at(self, grid: Grid, points: Tensor) -> Tensor:
+        """The albedo at `points` [R, 3] under the box of `grid`, or beyond: [C, R] or [C, 1]."""
+        mean = self.mean_albedo[:, None]
+        if self.albedo.ndim == 1:
+            return mean
+        places = torch.stack([_place(points[:, axis], grid, axis) for axis in self.plane.across])
+        found = sample_slices(self.albedo[None], places.flip(0).T[None])[0]
+        return torch.where((places.abs() <= 1).all(0), found, mean)
+
+    def albedo_on(self, rows: int, columns: int) -> Tensor:
+        """The mean albedo of so many texels [C, rows, columns]; [C, 1, 1] of what has no map."""
+        mean = self.mean_albedo[:, None, None]
+        if self.albedo.ndim == 1:
+            return mean
+        under = adaptive_avg_pool2d(self.albedo, (rows // 2, columns // 2))
+        beyond = columns // 4, columns // 4, rows // 4, rows // 4
+        return mean + pad(under - mean, beyond)
 
 
 def stay_above(sources: Sequence[Source], plane: Plane) -> list[Source]:
@@ -68,8 +94,8 @@ def stay_above(sources: Sequence[Source], plane: Plane) -> list[Source]:
         elif isinstance(source, PointLight):
             is_above = bool(source.position[up] > plane.height)
         elif isinstance(source, BeamLight):
-            along, place = float(source.direction[up]), float(source.position[up])
-            is_above = along < 0 or (along == 0 and place > plane.height)
+            along, place = source.direction[up], source.position[up]
+            is_above = bool((along < 0) | ((along == 0) & (place > plane.height)))
         else:
             is_above = True
         if isinstance(source, Sky):
@@ -101,12 +127,17 @@ def look_up_texels(texels: Tensor, grid: Grid, plane: Plane, *points: Tensor) ->
     """
     parts = []
     for axis, place in zip(plane.across, points, strict=True):
-        part = (2 * place - grid.lower[axis] - grid.upper[axis]) / grid.extent[axis]
+        part = _place(place, grid, axis)
         size = part.abs()
         parts.append(torch.where(size > 1, part.sign() * (2 - 1 / size.clamp(min=1)), part) / 2)
     rows, columns = torch.broadcast_tensors(*parts)
     places = torch.stack([columns.flatten(), rows.flatten()], -1)
     return sample_slices(texels[None], places[None])[0].unflatten(1, rows.shape)
+
+
+def _place(points: Tensor, grid: Grid, axis: int) -> Tensor:
+    """Where `points` [u] are along `axis`: at -1 and 1 the box ends."""
+    return (2 * points - grid.lower[axis] - grid.upper[axis]) / grid.extent[axis]
 
 
 @functools.cache

@@ -143,8 +143,11 @@ def reflect(lit: LitGround, medium: Medium, settings: RenderSettings) -> tuple[T
             _, travel = unit_directions(light.direction)
             even = even - travel[plane.axis] * light.irradiance
     texels = direct.unflatten(1, points.shape[:2]) + lit.texels + (lit.even - even).view(-1, 1, 1)
-    reflected = lit.ground.albedo / math.pi
-    return reflected * even, reflected.view(-1, 1, 1) * texels
+    here, beyond = (
+        part / math.pi for part in (lit.ground.albedo_on(*points.shape[:2]), lit.ground.mean_albedo)
+    )
+    more = here * texels + (here - beyond.view(-1, 1, 1)) * even.view(-1, 1, 1)
+    return beyond * even, more
 
 
 def see_ground(
@@ -166,7 +169,7 @@ def see_ground(
     )
     direct = _direct_irradiance(lit, medium, points, max(medium.grid.spacing), settings)
     irradiance = lit.even[:, None] + more + direct
-    radiance = lit.ground.albedo[:, None] / math.pi * irradiance
+    radiance = lit.ground.albedo_at(medium.grid, points) / math.pi * irradiance
     colors = max(len(radiance), len(seen))
     seen = seen.expand(colors, len(down))
     return seen.index_copy(1, hit, radiance.expand(colors, -1))

@@ -181,7 +181,7 @@ class GroundSection:
     """A plane at `height` [u] along the volume's `up`; `albedo`: part of light that it reflects."""
 
     height: float
-    albedo: Color = bounded(minimum=0, maximum=1)
+    albedo: Quantity = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)
