@@ -60,7 +60,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "file where left out."
             ),
             "resolution": "Cells along x, y and z; those of the field's file where left out.",
-            "up": "The axis that the height of a `ground` is measured along.",
+            "up": "The axis along which heights count, those of a `ground` and of `heights`.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -118,6 +118,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "file": "Relative to the scene file.",
             "name": "The field's name in the file, where that is not its name here.",
+        },
+    ),
+    (
+        "volume.density, sigma_a, ...: {heights: ...}",
+        schema.Profile,
+        "Values by height, such as those of a gas; `media` has how air stands beside a cloud.",
+        {
+            "heights": "Along `volume.up` [u], each above the one before.",
+            "values": "One at each height; linear between them, and even beyond.",
         },
     ),
     (

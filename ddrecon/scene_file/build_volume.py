@@ -30,6 +30,7 @@ from ddrecon.scene_file.schema import (
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
+    Profile,
     SceneTree,
     TableSection,
     TwoLobeSection,
@@ -60,6 +61,10 @@ def build_media(
     grid = _agree_on_grid(
         scene_file, dict(at for each in media.values() for at in each.fields.values())
     )
+    for each in media.values():
+        with problems.collecting():
+            each.fields.update(_spread_profiles(scene_file, each, grid))
+    problems.raise_any()
     return {
         name: each.build(grid, _build_phase(scene_file, each, dtype, device), dtype, device)
         for name, each in media.items()
@@ -70,13 +75,13 @@ def build_media(
 class _Medium:
     """What the scene `tree` says of a medium, names in which begin with `prefix`.
 
-    `fields` are those of its files by variable, and where the scene names them.
+    `fields` are those of its files and profiles by variable, and where the scene names them.
     """
 
     tree: SceneTree
     prefix: str
     section: MediumSection
-    fields: Mapping[str, tuple[str, Field]]
+    fields: dict[str, tuple[str, Field]]
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
@@ -114,23 +119,56 @@ def _read_fields(
     scene_file: SceneFile, prefix: str, section: MediumSection
 ) -> dict[str, tuple[str, Field]]:
     """The quantities that files give cell by cell, by variable; and where the scene says so."""
+    problems, found = Problems(), {}
+    for variable, (name, value) in _quantities(section).items():
+        if isinstance(value, FieldFile):
+            called = value.name or variable.removeprefix(PHASE)
+            read = partial(read_quantity, name=_kind_name(variable), called=called)
+            with problems.collecting():
+                at = f"volume.{prefix}{name}.file"
+                found[variable] = at, read_referenced(scene_file, at, value.file, read)
+    problems.raise_any()
+    return found
+
+
+def _quantities(section: MediumSection) -> dict[str, tuple[str, Any]]:
+    """What may differ from cell to cell, by variable: its key in `section`, and its value."""
     names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
     given = {name: (name, getattr(section, name)) for name in names}
     if isinstance(section.phase, HenyeyGreensteinSection):
         given["g"] = "phase.g", section.phase.g
     elif isinstance(section.phase, TwoLobeSection):
         given["phase.weight"] = "phase.weight", section.phase.weight
-    problems, found = Problems(), {}
-    for variable, (name, value) in given.items():
-        if isinstance(value, FieldFile):
-            called = value.name or variable.removeprefix(PHASE)
-            # A temperature is as a density: one number a cell, none below 0.
-            kind = "density" if variable == "temperature" else variable
-            read = partial(read_quantity, name=kind, called=called)
-            with problems.collecting():
-                at = f"volume.{prefix}{name}.file"
-                found[variable] = at, read_referenced(scene_file, at, value.file, read)
-    problems.raise_any()
+    return given
+
+
+def _kind_name(variable: str) -> str:
+    """That of its kind: a temperature is as a density, one number a cell and none below 0."""
+    return "density" if variable == "temperature" else variable
+
+
+def _spread_profiles(
+    scene_file: SceneFile, medium: _Medium, grid: Grid
+) -> dict[str, tuple[str, Field]]:
+    """The quantities that `medium` has by height, at the centers of the cells of `grid`."""
+    axis, found = "zyx".index(scene_file.tree.volume.up), {}
+    low, size = grid.lower[axis], grid.spacing[axis]
+    centers = low + size * (np.arange(grid.shape[axis]) + 0.5)
+    for variable, (name, value) in _quantities(medium.section).items():
+        if not isinstance(value, Profile):
+            continue
+        at, kind = f"volume.{medium.prefix}{name}.values", kind_of(_kind_name(variable))
+        colors = [np.ravel(one) for one in value.values]
+        if not kind.is_color and max(map(len, colors)) > 1:
+            raise scene_file.refused(at, "expected numbers: colors belong to the cross sections")
+        if not all(((kind.low <= one) & (one <= kind.high)).all() for one in colors):
+            limits = f"at least {kind.low:g} and at most {kind.high:g}"
+            raise scene_file.refused(at, f"must be {limits}")
+        known = np.stack(np.broadcast_arrays(*colors), 1)
+        column = np.stack([np.interp(centers, value.heights, one) for one in known], -1)
+        level = [size for other, size in enumerate(grid.shape) if other != axis]
+        cells = np.moveaxis(np.broadcast_to(column, (*level, *column.shape)), 2, axis).copy()
+        found[variable] = at, Field(cells[..., 0] if len(known) == 1 else cells)
     return found
 
 

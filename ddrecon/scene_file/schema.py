@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import mul
 from pathlib import Path
 from typing import Any, ClassVar
@@ -35,8 +36,6 @@ Size = tuple[int, int]
 Pair = tuple[float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
-Density = float | FieldFile
-Quantity = Color | FieldFile
 Backdrop = Color | Path
 Paths = Path | tuple[Path, ...]
 
@@ -45,6 +44,24 @@ FRAME = re.compile(r"\{frame(:0?[1-9]?d)?\}")
 """Where the number of a frame stands in the name of a picture: `{frame:04d}`."""
 TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
 """Names that output files of other views have: their components, and previews by iteration."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """`values` at `heights` [u] along the volume's `up`: linear between them, even beyond."""
+
+    heights: tuple[float, ...]
+    values: tuple[Color, ...]
+
+    def violations(self) -> Iterator[Violation]:
+        if any(after <= before for before, after in pairwise(self.heights)):
+            yield "heights", "must go up from one to the next"
+        if len(self.values) != len(self.heights) or not self.heights:
+            yield "values", f"expected one for each height, {len(self.heights)}"
+
+
+Density = float | FieldFile | Profile
+Quantity = Color | FieldFile | Profile
 
 
 @dataclass(frozen=True)
@@ -134,7 +151,9 @@ class MediumSection:
     def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", "g is short for a phase function: give only one of g or phase"
-        if type(self) is MediumSection and isinstance(getattr(self.phase, "g", None), FieldFile):
+        if type(self) is MediumSection and isinstance(
+            getattr(self.phase, "g", None), FieldFile | Profile
+        ):
             yield "phase", "the g of a medium is the same in all cells where there are two"
 
 
@@ -181,7 +200,7 @@ class GroundSection:
     """A plane at `height` [u] along the volume's `up`; `albedo`: part of light that it reflects."""
 
     height: float
-    albedo: Quantity = bounded(minimum=0, maximum=1)
+    albedo: Color | FieldFile = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)
