@@ -130,6 +130,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "volume.sigma_t: {meters: ...}",
+        schema.Water,
+        "Of droplets, `phase: {type: mie, ...}`: 1.5 / effective radius [micrometers] per meter, "
+        "twice their cross section.\n`density` is then their liquid water [g/m3].",
+        {"meters": "How many a u has: 1000 where lengths are in kilometers."},
+    ),
+    (
         "volume.phase: {type: henyey_greenstein}",
         schema.HenyeyGreensteinSection,
         "The usual phase function of one number; `g: 0.3` is short for it.",
@@ -169,7 +176,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "wavelength": "In micrometers, one for each color.",
             "refractive_index": "Of the droplets; of water 1.33.",
-            "effective_radius": "In micrometers: of clouds 5 to 15.",
+            "effective_radius": (
+                "In micrometers: of clouds 5 to 15. Where it differs from cell to cell, each is a "
+                "mixture of the smallest and the largest, even in 1 / radius; 0 is for no droplets."
+            ),
             "effective_variance": "Of the distribution: of clouds about 0.1.",
         },
     ),

@@ -22,7 +22,7 @@ from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mie import scatter_droplets
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
@@ -34,11 +34,15 @@ from ddrecon.scene_file.schema import (
     SceneTree,
     TableSection,
     TwoLobeSection,
+    Water,
 )
 from ddrecon.settings import FieldFile
 from ddrecon.variables.kinds import FIELDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
+RADIUS = "phase.effective_radius"
+EXTINCTION = 1.5
+"""Of 1 g/m3 of droplets with an effective radius of 1 micrometer [1/m]: 3 Q / (4 rho r), Q = 2."""
 FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
 
@@ -87,7 +91,11 @@ class _Medium:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
         if name in self.fields:
             return cells_of(self.fields[name][1]).double()
-        value = self.tree.share_color(self.prefix + name, getattr(self.section, name))
+        value = _quantities(self.section)[name][1]
+        if isinstance(value, Water):
+            radius = self.values(RADIUS)
+            return torch.where(radius > 0, EXTINCTION * value.meters / radius, 0.0)
+        value = self.tree.share_color(self.prefix + name, value)
         return torch.tensor(value, dtype=torch.float64).view(-1)
 
     def build(
@@ -139,12 +147,14 @@ def _quantities(section: MediumSection) -> dict[str, tuple[str, Any]]:
         given["g"] = "phase.g", section.phase.g
     elif isinstance(section.phase, TwoLobeSection):
         given["phase.weight"] = "phase.weight", section.phase.weight
+    elif isinstance(section.phase, MieSection):
+        given[RADIUS] = RADIUS, section.phase.effective_radius
     return given
 
 
 def _kind_name(variable: str) -> str:
-    """That of its kind: a temperature is as a density, one number a cell and none below 0."""
-    return "density" if variable == "temperature" else variable
+    """That of its kind: of others than variables that of density, a number a cell, none below 0."""
+    return variable if variable in FIELDS else "density"
 
 
 def _spread_profiles(
@@ -241,7 +251,7 @@ def _build_phase(
     """The phase function of `medium`; MissingExtraError for droplets without miepython."""
 
     def tensor(value: Any, name: str = "") -> Tensor:
-        if isinstance(value, FieldFile):
+        if isinstance(value, FieldFile | Profile):
             return medium.values(name).to(device, dtype)
         value = medium.tree.share_color(f"{medium.prefix}{name}", value)
         return torch.as_tensor(value, dtype=dtype, device=device)
@@ -257,11 +267,27 @@ def _build_phase(
             key = f"volume.{medium.prefix}phase.file"
             return Tabulated(tensor(_table(scene_file, section, key)))
         case MieSection():
-            colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
-            sizes = section.effective_radius, section.effective_variance
-            values = [scatter_droplets(float(length), float(n), *sizes) for length, n in colors]
-            return Tabulated(tensor(np.stack(values)))
+            radius = medium.values(RADIUS).squeeze(0)
+            known = radius[radius > 0]
+            if not len(known) or known.max() > 100:
+                what = f"must be above 0 somewhere and at most 100, found {float(radius.max()):g}"
+                raise scene_file.refused(f"volume.{medium.prefix}{RADIUS}", what)
+            least, most = float(known.min()), float(known.max())
+            smallest = Tabulated(tensor(_droplets(section, least)))
+            if least == most:
+                return smallest
+            # Where there are none, as large as elsewhere in the mean.
+            inverse = 1 / torch.where(radius > 0, radius, known.mean())
+            weight = tensor((inverse - 1 / most) / (1 / least - 1 / most))
+            return Blend(smallest, Tabulated(tensor(_droplets(section, most))), weight)
     return Rayleigh(tensor(0.0))
+
+
+def _droplets(section: MieSection, radius: float) -> np.ndarray:
+    """Values at even angles, [C, steps + 1]."""
+    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
+    sizes = radius, section.effective_variance
+    return np.stack([scatter_droplets(float(length), float(n), *sizes) for length, n in colors])
 
 
 def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:

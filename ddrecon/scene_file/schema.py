@@ -60,6 +60,13 @@ class Profile:
             yield "values", f"expected one for each height, {len(self.heights)}"
 
 
+@dataclass(frozen=True)
+class Water:
+    """What droplets of `phase` extinguish, by their liquid water; `meters`: how many a u has."""
+
+    meters: float = bounded(above=0)
+
+
 Density = float | FieldFile | Profile
 Quantity = Color | FieldFile | Profile
 
@@ -107,7 +114,7 @@ class MieSection:
 
     wavelength: Color = bounded(above=0, maximum=1e3)
     refractive_index: Color = bounded(above=1, maximum=10)
-    effective_radius: float = bounded(above=0, maximum=100)
+    effective_radius: Density = bounded(above=0, maximum=100)
     effective_variance: float = bounded(above=0, below=0.5)
 
 
@@ -143,7 +150,7 @@ class MediumSection:
     density: Density = bounded(minimum=0)
     sigma_a: Quantity | None = bounded(None, minimum=0)
     sigma_s: Quantity | None = bounded(None, minimum=0)
-    sigma_t: Quantity | None = bounded(None, minimum=0)
+    sigma_t: Quantity | Water | None = bounded(None, minimum=0)
     albedo: Quantity | None = bounded(None, minimum=0, maximum=1)
     g: float = bounded(0.0, above=-1, below=1)
     phase: PartSection | None = None
@@ -151,10 +158,14 @@ class MediumSection:
     def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", "g is short for a phase function: give only one of g or phase"
-        if type(self) is MediumSection and isinstance(
-            getattr(self.phase, "g", None), FieldFile | Profile
-        ):
-            yield "phase", "the g of a medium is the same in all cells where there are two"
+        if isinstance(self.sigma_t, Water) and not isinstance(self.phase, MieSection):
+            yield "sigma_t", "meters are for droplets, phase: {type: mie, ...}"
+        for name in ("g", "effective_radius") if type(self) is MediumSection else ():
+            if isinstance(getattr(self.phase, name, None), FieldFile | Profile):
+                yield (
+                    "phase",
+                    f"the {name} of a medium is the same in all cells where there are two",
+                )
 
 
 @dataclass(frozen=True)
