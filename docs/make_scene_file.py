@@ -74,6 +74,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "A file gives it cell by cell."
             ),
             "phase": "How light is scattered by angle, in place of `g`; see below.",
+            "effective_radius": (
+                "Of droplets, `phase: {type: mie, ...}`, where it differs by cell [micrometers]: "
+                "mixtures of the smallest and the largest; 0 where there are none."
+            ),
             "emission": (
                 "Radiance that a unit of length emits [radiance/u], whatever the density. As a "
                 "parameter that starts from 0 it is a field, one number a color."
@@ -176,10 +180,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "wavelength": "In micrometers, one for each color.",
             "refractive_index": "Of the droplets; of water 1.33.",
-            "effective_radius": (
-                "In micrometers: of clouds 5 to 15. Where it differs from cell to cell, each is a "
-                "mixture of the smallest and the largest, even in 1 / radius; 0 is for no droplets."
-            ),
+            "effective_radius": "In micrometers: of clouds 5 to 15; or `volume.effective_radius`.",
             "effective_variance": "Of the distribution: of clouds about 0.1.",
         },
     ),

@@ -40,7 +40,7 @@ from ddrecon.settings import FieldFile
 from ddrecon.variables.kinds import FIELDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
-RADIUS = "phase.effective_radius"
+RADIUS = "effective_radius"
 EXTINCTION = 1.5
 """Of 1 g/m3 of droplets with an effective radius of 1 micrometer [1/m]: 3 Q / (4 rho r), Q = 2."""
 FAR_OFF = 0.01
@@ -148,7 +148,8 @@ def _quantities(section: MediumSection) -> dict[str, tuple[str, Any]]:
     elif isinstance(section.phase, TwoLobeSection):
         given["phase.weight"] = "phase.weight", section.phase.weight
     elif isinstance(section.phase, MieSection):
-        given[RADIUS] = RADIUS, section.phase.effective_radius
+        by_cell, same = getattr(section, RADIUS, None), section.phase.effective_radius
+        given[RADIUS] = RADIUS, same if by_cell is None else by_cell
     return given
 
 

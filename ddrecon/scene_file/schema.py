@@ -114,8 +114,8 @@ class MieSection:
 
     wavelength: Color = bounded(above=0, maximum=1e3)
     refractive_index: Color = bounded(above=1, maximum=10)
-    effective_radius: Density = bounded(above=0, maximum=100)
     effective_variance: float = bounded(above=0, below=0.5)
+    effective_radius: float | None = bounded(None, above=0, maximum=100)
 
 
 PartSection = HenyeyGreensteinSection | RayleighSection | TableSection | MieSection
@@ -158,14 +158,17 @@ class MediumSection:
     def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", "g is short for a phase function: give only one of g or phase"
-        if isinstance(self.sigma_t, Water) and not isinstance(self.phase, MieSection):
-            yield "sigma_t", "meters are for droplets, phase: {type: mie, ...}"
-        for name in ("g", "effective_radius") if type(self) is MediumSection else ():
-            if isinstance(getattr(self.phase, name, None), FieldFile | Profile):
-                yield (
-                    "phase",
-                    f"the {name} of a medium is the same in all cells where there are two",
-                )
+        by_cell = getattr(self, "effective_radius", None)
+        if not isinstance(self.phase, MieSection):
+            if isinstance(self.sigma_t, Water):
+                yield "sigma_t", "meters are for droplets, phase: {type: mie, ...}"
+            if by_cell is not None:
+                yield "effective_radius", "is that of droplets, phase: {type: mie, ...}"
+        elif (by_cell is None) == (self.phase.effective_radius is None):
+            yield "phase", "give droplets one effective_radius: here, or volume.effective_radius"
+        is_field = isinstance(getattr(self.phase, "g", None), FieldFile | Profile)
+        if type(self) is MediumSection and is_field:
+            yield "phase", "the g of a medium is the same in all cells where there are two"
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,7 @@ class VolumeSection(MediumSection):
     phase: PhaseSection | None = None  # type: ignore[assignment]
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
+    effective_radius: Density | None = bounded(None, minimum=0, maximum=100)
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))

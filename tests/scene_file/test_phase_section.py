@@ -160,7 +160,7 @@ def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None
     water |= {"density": 0.5, "sigma_t": {"meters": 1000}, "albedo": 1}
 
     def built(radius: Any) -> Volume:
-        volume = water | {"phase": droplets | {"effective_radius": radius}}
+        volume = water | {"phase": droplets, "effective_radius": radius}
         return load_scene(write(changed(volume=volume)), dtype=torch.float64).volume
 
     medium = built(sizes)

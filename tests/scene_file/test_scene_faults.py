@@ -55,6 +55,7 @@ volume.density={{file: moved.npz}} => density.file: has the bounds (-1, -1.5, -1
 volume=3 => volume: expected a mapping, found 3
 volume.phase={{type: rayleigh}} => volume.phase: g is short for a phase function: give only one
 volume={{density: 1, sigma_t: {{meters: 1}}, albedo: 1}} => volume.sigma_t: meters are for droplets
+volume.effective_radius=1 => volume.effective_radius: is that of droplets, phase: {{type: mie, ...}}
 volume.phase={{type: two_lobes}} => did you mean 'two_lobe'?
 volume.phase={{type: blend}} => blend went: write two media, volume.media
 {MEDIA}{{cloud: {MEDIUM}}}}} => volume.media: expected two media, found 1
