@@ -9,29 +9,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from ddrecon.cameras import Rays
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep_rule
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
-from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
+from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
+from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.pairs import TurnedBeam
-from ddrecon.light.profile import mean_profile, seen_radius
+from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source, decompose_lights
-from ddrecon.march.emission import Emission
-from ddrecon.march.integral import march
-from ddrecon.march.sight import look_along
+from ddrecon.march.direct import Beamed, shine_on, transmittance
+from ddrecon.march.ground import LitGround
 from ddrecon.medium.coefficients import Medium, keep_medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
@@ -41,7 +40,6 @@ from ddrecon.settings import RenderSettings
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """Of the box, in array order."""
-Beamed = DirectionalLight | PointLight | BeamLight
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
@@ -49,36 +47,40 @@ RAY_BY_RAY = RenderSettings(tolerance=0.0)
 def find_balance(scene: Scene) -> dict[str, Any]:
     """What power `enters` the box of `scene` of each light, is `absorbed` there, and `leaves`.
 
-    By each face, as unscattered and as scattered light. `fractions` are the same of all that
-    enters; `defect_percent` is what enters and neither is absorbed nor leaves. Of one color each is
-    a number, else a list of three. Raises UsageError where no light enters, or where nobody follows
-    light that is scattered.
+    By each face, as unscattered and as scattered light. What a ground sends up and what the medium
+    emits enters as well; `into_ground` is what of all that leaves falls on the ground. `fractions`
+    are the same of all that enters; `defect_percent` is what enters and neither is absorbed nor
+    leaves. Of one color each is a number, else a list of three. Raises UsageError where no light
+    enters, or where nobody follows light that is scattered.
     """
-    light_field = solve_light(scene, SolveMemory())
-    medium, directions = light_field.medium, DIRECTIONS[scene.diffusion.angles]
-    if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, scene.diffusion):
+    light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
+    medium, lit = light_field.medium, light_field.ground
+    if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
-    media = medium, keep_medium(scene.volume)
-    enters, leaves = dict[str, Tensor](), list[Tensor]()
-    for number, light in enumerate(scene.lights):
-        parts = decompose_lights([light])
-        crossing = reduce(torch.add, (_cross_box(part, media, directions) for part in parts))
-        enters[f"lights.{number}"] = crossing[0].sum(0)
-        leaves.append(crossing[1:])
+    box = _Box((medium, keep_medium(scene.volume)), DIRECTIONS[settings.angles], lit)
+    sources = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
+    crossings = {name: box.cross(parts) for name, parts in sources.items()}
+    if lit:
+        ambient = ambient_radiance([*chain(*sources.values())], medium.g).flatten()
+        crossings["ground"] = box.cross_upwards(ambient)
+    if medium.emission is not None:
+        crossings["emission"] = box.cross_out()
+    enters = {name: crossing[0].sum((0, 1)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    passing, unscattered = reduce(torch.add, leaves)
+    _, passing, unscattered = reduce(torch.add, crossings.values())
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, directions)
+    scattered = passing - unscattered + box.sweep_out(medium, source, rise)
     for beam in light_field.turned:
-        scattered = scattered + _leave_turned(beam, medium.grid)
-    lost = average_cells(medium).absorption.value * fluence_of(light_field)
+        scattered = scattered + _leave_turned(beam, medium.grid, box.up)
+    lost = average_cells(medium).absorption.value * fluence_of(light_field, settings)
     absorbed = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
-    entered = reduce(torch.add, enters.values())
+    entered, into_ground = reduce(torch.add, enters.values()), (unscattered + scattered)[0].sum(0)
+    unscattered, scattered = unscattered.sum(0), scattered.sum(0)
     left = absorbed + (unscattered + scattered).sum(0)
 
     def in_units(unit: Tensor) -> dict[str, Any]:
@@ -87,6 +89,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
             "enters": {name: _plain(power / unit) for name, power in enters.items()},
             "absorbed": _plain(absorbed / unit),
             "leaves": {f: {"unscattered": _plain(u), "scattered": _plain(s)} for f, u, s in parts},
+            **({"into_ground": _plain(into_ground / unit)} if lit else {}),
         }
 
     powers, fractions = in_units(torch.ones_like(entered)), in_units(entered)
@@ -98,100 +101,136 @@ def _plain(values: Tensor) -> float | list[float]:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _cross_box(part: Source, media: Sequence[Medium], directions: int) -> Tensor:
-    """The power of `part` of a light that leaves by each of `FACES`, [1 + media, 6, C].
+@dataclass(frozen=True)
+class _Box:
+    """A box with the medium as light is followed in it, and as it is, over the ground `lit`.
 
-    First what would if the box were empty, then what does unscattered in each of the `media`.
+    Power leaves by each of `FACES`, downwards and upwards, [2, 6, C]. Of what crosses the box it is
+    what would leave if that were empty, and what does unscattered in each of the `media`, [3, 2, 6,
+    C]. Sweeps have so many `directions`.
     """
-    if isinstance(part, AmbientLight):
-        grid, radiance = media[0].grid, part.radiance
-        sides = [math.prod(grid.extent) / grid.extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
-        empty = math.pi * torch.outer(radiance.new_tensor(sides), radiance).double()
-        dark = Moments(torch.zeros_like(media[0].extinction.value))
-        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), directions
-        found = [empty, *(empty + _sweep_out(medium, *given) for medium in media)]
-        return torch.stack(torch.broadcast_tensors(*found))
-    if isinstance(part, Sky):
-        each = zip(part.travel, part.irradiance, strict=True)
-        regions = (DirectionalLight(array_order(travel), power) for travel, power in each)
-        return reduce(torch.add, (_follow_out(region, media) for region in regions))
-    return _follow_out(part, media)
+
+    media: tuple[Medium, Medium]
+    directions: int
+    lit: LitGround | None
+
+    @property
+    def up(self) -> int:
+        """The axis that points up; any where no ground asks for it."""
+        return self.lit.ground.plane.axis if self.lit else 1
+
+    def cross(self, parts: Sequence[Source]) -> Tensor:
+        """What crosses of a light, of those of its `parts` that the ground does not hide."""
+        parts = stay_above(parts, self.lit.ground.plane) if self.lit else parts
+        crossing = self.media[0].g.new_zeros(3, 2, len(FACES), 1, dtype=torch.float64)
+        for part in parts:
+            if isinstance(part, AmbientLight):
+                crossing = crossing + self._cross_evenly(part.radiance, (True, self.lit is None))
+            elif isinstance(part, Sky):
+                for travel, power in zip(part.travel, part.irradiance, strict=True):
+                    crossing = crossing + self._follow(DirectionalLight(array_order(travel), power))
+            else:
+                crossing = crossing + self._follow(part)
+        return crossing
+
+    def cross_upwards(self, ambient: Tensor) -> Tensor:
+        """What crosses of the ground's light: `ambient` light [C], and what that sends more."""
+        crossing = self._cross_evenly(ambient, (False, True))
+        for way, angle in zip(*hemisphere(self.up, UPWARDS, 1.0), strict=True):
+            light = DirectionalLight(array_order(way).to(ambient), angle[None].to(ambient))
+            crossing = crossing + self._follow(light, ambient)
+        return crossing
+
+    def cross_out(self) -> Tensor:
+        """What crosses of emission; in an empty box it would leave, no matter where."""
+        medium = self.media[0]
+        emission = average_cells(medium).emitting.remaining.value
+        power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
+        empty = power / (2 * len(FACES))
+        even = torch.ones_like(medium.extinction.value)
+        given = Moments(even), cell_gradient(even)
+        found = (self.sweep_out(medium.emitting, *given) for medium in self.media)
+        return torch.stack(torch.broadcast_tensors(empty, *found))
+
+    def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
+        """What crosses of a `radiance` [C] that is the same everywhere: `sides` are down and up."""
+        extent, nothing = self.media[0].grid.extent, self.media[0].extinction.value * 0
+        areas = [math.prod(extent) / extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
+        halves = torch.full((2, len(FACES)), 0.5)
+        halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
+        parts = (halves * torch.tensor(areas, dtype=torch.float64))[..., None].to(radiance.device)
+        empty, given = math.pi * parts * radiance, (Moments(nothing), cell_gradient(nothing))
+        inflow = radiance.view(-1, 1, 1, 1)
+        found = (empty + self.sweep_out(medium, *given, inflow) for medium in self.media)
+        crossing = torch.stack(torch.broadcast_tensors(empty, *found))
+        return crossing * crossing.new_tensor(sides).view(2, 1, 1)
+
+    def _follow(self, light: Beamed, ambient: Tensor | None = None) -> Tensor:
+        """What crosses of a beam, along rays to the middles of cells at faces.
+
+        With `ambient` it is that times what the ground sends more than this radiance [C].
+        """
+        grid, field, powers = self.media[0].grid, self.media[0].extinction.field, list[Tensor]()
+        for axis, side in product(range(3), range(2)):
+            lines, size = grid.centers(field), list(grid.spacing)
+            lines[axis] = field.new_full((1, 1, 1), (grid.lower, grid.upper)[side][axis])
+            area, size[axis] = math.prod(size) / size[axis], 0.0
+            points = torch.stack(torch.broadcast_tensors(*lines), -1).flatten(0, 2)
+            rays, travel, irradiance = shine_on(light, points, grid, max(grid.spacing), size)
+            if ambient is not None and self.lit and self.lit.sent:
+                plane, (even, texels) = self.lit.ground.plane, self.lit.sent
+                met = plane.meet(points, travel)
+                more = look_up_texels(texels, grid, plane, *(met[:, a] for a in plane.across))
+                irradiance = irradiance * ((even - ambient)[:, None] + more)
+            power = area * irradiance * (travel[:, axis] * (2 * side - 1)).clamp(min=0)
+            passing = (power * transmittance(medium, rays, RAY_BY_RAY) for medium in self.media)
+            leaving = torch.stack(torch.broadcast_tensors(power, *passing)).double()
+            is_up = travel[:, self.up] > 0
+            powers.append(torch.stack([(leaving * ~is_up).sum(2), (leaving * is_up).sum(2)], 1))
+        return torch.stack(powers, 2)
+
+    def sweep_out(
+        self, medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None = None
+    ) -> Tensor:
+        """The power that leaves in one sweep of light that `source` scatters in `medium`.
+
+        `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in
+        an empty box.
+        """
+        grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
+        courses, weights, values = sweep_rule(self.directions, len(moments))
+        power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
+        for direction, weight, row in zip(courses, weights, values.to(moments), strict=True):
+            scatters = torch.tensordot(row, moments, 1)
+            _, leaving = radiance_along(cells, scatters, rise, inflow, direction)
+            course, left = Course.of(grid, direction), leaving.clone()
+            gone = leaving.new_zeros(len(FACES), len(leaving), dtype=torch.float64)
+            # What leaves a cell goes on to the next slice, or beyond it, and there beyond other
+            # faces.
+            for axis, moved in sorted(enumerate(course.moved), key=lambda one: -abs(one[1])):
+                layer = left.select(1 + axis, -int(moved > 0))
+                gone[2 * axis + (moved > 0)] = abs(moved) * layer.sum((1, 2))
+                layer *= 1 - abs(moved)
+            gone = 4 * math.pi * weight * math.prod(grid.spacing) / course.step * gone
+            power = power + _split(gone, direction[self.up])
+        return power
 
 
-def _follow_out(light: Beamed, media: Sequence[Medium]) -> Tensor:
-    """The same of a beam, along rays to the middles of cells at faces."""
-    grid, field, powers = media[0].grid, media[0].extinction.field, list[Tensor]()
-    for axis, side in product(range(3), range(2)):
-        lines, size = grid.centers(field), list(grid.spacing)
-        lines[axis] = field.new_full((1, 1, 1), (grid.lower, grid.upper)[side][axis])
-        area, size[axis] = math.prod(size) / size[axis], 0.0
-        rays, irradiance = _shine_on(light, lines, size, grid)
-        outward = (rays.direction[:, axis] * (2 * side - 1)).clamp(min=0)
-        leaving, sight = [area * irradiance * outward], look_along(grid, rays, RAY_BY_RAY)
-        for medium in media:
-            dark = (), torch.zeros_like(field[:1]), medium.seen, None
-            emission = Emission(grid, medium.extinction, medium.scattering, *dark)
-            seen = march(emission, sight, RAY_BY_RAY, torch.ones_like(outward[None]))
-            leaving.append(leaving[0] * seen)
-        powers.append(torch.stack(torch.broadcast_tensors(*leaving)).sum(2, dtype=torch.float64))
-    return torch.stack(powers, 1)
-
-
-def _shine_on(
-    light: Beamed, lines: Sequence[Tensor], size: Sequence[float], grid: Grid
-) -> tuple[Rays, Tensor]:
-    """The rays of `light` that end in the middles of cells at a face, and its irradiance [C, R].
-
-    That is averaged over these cells of `size`, which lie along `lines`.
-    """
-    points = torch.stack(torch.broadcast_tensors(*lines), -1).flatten(0, 2)
-    if isinstance(light, PointLight):
-        eye = array_order(light.position)
-        distance = torch.linalg.vector_norm(points - eye, dim=1, keepdim=True)
-        rays = Rays(eye.expand_as(points), (points - eye) / distance, eye)
-        return rays, light.intensity[:, None] / distance[:, 0] ** 2
-    travel = normalize(array_order(light.direction), dim=0).expand_as(points)
-    rays = Rays(points - 2 * math.hypot(*grid.extent) * travel, travel, None)
-    if isinstance(light, DirectionalLight):
-        return rays, light.irradiance[:, None]
-    beam = light.position, light.direction, seen_radius(light.radius, grid)
-    return rays, light.power[:, None] * mean_profile(lines, size, *beam).flatten()
-
-
-def _sweep_out(
-    medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None, directions: int
-) -> Tensor:
-    """The power [6, C] that leaves by each face, in one sweep, of light that `source` scatters.
-
-    `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in an
-    empty box.
-    """
-    grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
-    courses, weights, values = sweep_rule(directions, len(moments))
-    power = moments.new_zeros(6, 1, dtype=torch.float64)
-    for direction, weight, row in zip(courses, weights, values.to(moments), strict=True):
-        scatters = torch.tensordot(row, moments, 1)
-        _, leaving = radiance_along(cells, scatters, rise, inflow, direction)
-        course, left = Course.of(grid, direction), leaving.clone()
-        gone = leaving.new_zeros(6, len(leaving), dtype=torch.float64)
-        # What leaves a cell goes on to the next slice, or beyond it, and there beyond other faces.
-        for axis, moved in sorted(enumerate(course.moved), key=lambda one: -abs(one[1])):
-            layer = left.select(1 + axis, -int(moved > 0))
-            gone[2 * axis + (moved > 0)] = abs(moved) * layer.sum((1, 2))
-            layer *= 1 - abs(moved)
-        power = power + 4 * math.pi * weight * math.prod(grid.spacing) / course.step * gone
-    return power
-
-
-def _leave_turned(beam: TurnedBeam, grid: Grid) -> Tensor:
-    """The power [6, C] of a turned `beam` (E8.11), at faces the line through two cells."""
-    power = beam.radiance.new_zeros(6, len(beam.radiance), dtype=torch.float64)
+def _leave_turned(beam: TurnedBeam, grid: Grid, up: int) -> Tensor:
+    """The power of a turned `beam` (E8.11), at faces the line through two cells."""
+    power = beam.radiance.new_zeros(len(FACES), len(beam.radiance), dtype=torch.float64)
     for axis, along in enumerate(beam.direction.tolist()):
         layers = beam.radiance.unbind(1 + axis)[:: -1 if along > 0 else 1]
         last, before = layers[0], layers[min(1, len(layers) - 1)]
         area = 4 * math.pi * abs(along) * math.prod(grid.spacing) / grid.spacing[axis]
         power[2 * axis + (along > 0)] = area * (1.5 * last - 0.5 * before).clamp(min=0).sum((1, 2))
-    return power
+    return _split(power, float(beam.direction[up]))
+
+
+def _split(power: Tensor, rise: float) -> Tensor:
+    """`power` of light that rises so much, downwards and upwards; of level light half each."""
+    part = (1 + (rise > 0) - (rise < 0)) / 2
+    return torch.stack([(1 - part) * power, part * power])
 
 
 def lines(report: dict[str, Any]) -> list[str]:
@@ -209,5 +248,6 @@ def lines(report: dict[str, Any]) -> list[str]:
             f"scattered {text(part['scattered'], '.2%')}"
             for face, part in parts["leaves"].items()
         ),
+        *(f"into the ground: {text(parts[key], '.2%')}" for key in parts if key == "into_ground"),
         f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %",
     ]

@@ -21,7 +21,8 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import LIMITERS, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
-from ddrecon.diffusion.rounds.transport import run_rounds
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS
+from ddrecon.diffusion.rounds.transport import run_rounds, sweep_emission
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
@@ -135,17 +136,19 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     cells = average_cells(medium)
     ambient = ambient_radiance(sources, medium.g).flatten()
 
-    def from_below(lit: LitGround) -> Moments:
+    def from_below(even: Tensor, texels: Tensor) -> Moments:
         """What the ground sends into the box, less the ambient light from everywhere."""
-        even, texels = reflect(lit, medium, render_settings)
         return light_from_below(cells, plane, even - ambient, texels)
 
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
-    first = _find_light(coarse, sources, settings, replace(memory, last={}), from_below(lit))
+    begun = from_below(*reflect(lit, medium, render_settings))
+    first = _find_light(coarse, sources, settings, replace(memory, last={}), begun)
     glow = _glow(first, plane, multiply_scatters(medium, settings))
     lit = light_texels(lit, sources, medium, glow, render_settings)
-    below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
-    return replace(_find_light(volume, sources, settings, memory, below), ground=lit)
+    sent = reflect(lit, medium, render_settings)
+    below = from_below(*sent).mapped(lambda field: resample(field, volume.grid))
+    light_field = _find_light(volume, sources, settings, memory, below)
+    return replace(light_field, ground=replace(lit, sent=sent))
 
 
 def exchange_grid(grid: Grid) -> Grid:
@@ -219,15 +222,17 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 
     Differentiable as `render`, and `memory` as there.
     """
-    return fluence_of(solve_light(scene, memory or SolveMemory()))
+    return fluence_of(solve_light(scene, memory or SolveMemory()), scene.diffusion)
 
 
-def fluence_of(light_field: LightField) -> Tensor:
+def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     """The fluence [C, z, y, x] >= 0, averaged over each cell: of the whole grid, also in slabs."""
     medium = light_field.medium
     mean = light_field.diffuse.mean + light_field.received.mean
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
     mean = mean if sky is None else mean + sky.mean
+    if medium.emission is not None and not multiply_scatters(medium, settings):
+        mean = mean + sweep_emission(average_cells(medium), DIRECTIONS[settings.angles]).mean
     return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.sweep import count_directions
@@ -15,11 +13,10 @@ from ddrecon.light.lights import (
     BeamLight,
     DirectionalLight,
     EnvironmentLight,
-    Light,
     PointLight,
 )
 from ddrecon.light.profile import seen_radius
-from ddrecon.light.sky import count_suns
+from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
@@ -67,7 +64,7 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
         "diffusion": not is_fused or (has_slabs and is_diffuse),
         "transport rounds": has_rounds
         and not has_kernels("transport rounds", is_on_gpu, has_slabs),
-        "beams": has_slabs and (has_skies or _has_beams(scene.lights)),
+        "beams": has_slabs and (has_skies or _has_beams(scene)),
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),
         "pairs of beams": is_diffuse and _has_pairs(medium, scene),
         "phases by cell": medium.is_cellwise,
@@ -120,16 +117,13 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
 
 def _has_pairs(medium: Medium, scene: Scene) -> bool:
     """Whether backward peaks turn beams back and forth (E8.11)."""
-    return has_backward_peak(medium) and _has_beams(scene.lights)
+    return has_backward_peak(medium) and _has_beams(scene)
 
 
-def _has_beams(lights: Sequence[Light]) -> bool:
+def _has_beams(scene: Scene) -> bool:
     """Whether a light is directional, or has suns that are."""
-    return any(
-        isinstance(light, DirectionalLight | BeamLight)
-        or (isinstance(light, EnvironmentLight) and count_suns(light)[0] > 0)
-        for light in lights
-    )
+    parts = decompose_lights(scene.lights)
+    return any(isinstance(part, DirectionalLight | BeamLight) for part in parts)
 
 
 def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
@@ -139,7 +133,7 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
             terms.append(f"transmittance towards {_count(count, name)}")
     for light in lights:
         if isinstance(light, BeamLight):
-            radius = float(seen_radius(light.radius, scene.volume.grid))
+            radius = float(seen_radius(light.radius, max(scene.volume.grid.spacing)))
             terms.append(
                 f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
             )
@@ -159,7 +153,11 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
 
 def _ground_term(ground: Ground, grid: Grid) -> str:
     """A ground, and on what it and the volume light each other."""
-    plane, albedo = ground.plane, _listed(ground.albedo, is_by_cell=False)
+    plane = ground.plane
+    albedo = _listed(ground.mean_albedo, is_by_cell=False)
+    if ground.albedo.ndim > 1:
+        rows, columns = ground.albedo.shape[1:]
+        albedo += f" in the mean of {columns} x {rows} pixels"
     cells = " x ".join(map(str, reversed(exchange_grid(grid).shape)))
     return (
         f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}: direct light ray by "

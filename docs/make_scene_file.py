@@ -63,7 +63,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Cells along x, y and z; those of the field's file where left out. `auto`: two "
                 "pixels wide."
             ),
-            "up": "The axis that the height of a `ground` is measured along.",
+            "up": "The axis along which heights count, those of a `ground` and of `heights`.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -77,6 +77,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "A file gives it cell by cell."
             ),
             "phase": "How light is scattered by angle, in place of `g`; see below.",
+            "effective_radius": (
+                "Of droplets, `phase: {type: mie, ...}`, where it differs by cell [micrometers]: "
+                "mixtures of the smallest and the largest; 0 where there are none."
+            ),
             "emission": (
                 "Radiance that a unit of length emits [radiance/u], whatever the density. As a "
                 "parameter that starts from 0 it is a field, one number a color."
@@ -124,6 +128,22 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "volume.density, sigma_a, ...: {heights: ...}",
+        schema.Profile,
+        "Values by height, such as those of a gas; `media` has how air stands beside a cloud.",
+        {
+            "heights": "Along `volume.up` [u], each above the one before.",
+            "values": "One at each height; linear between them, and even beyond.",
+        },
+    ),
+    (
+        "volume.sigma_t: {meters: ...}",
+        schema.Water,
+        "Of droplets, `phase: {type: mie, ...}`: 1.5 / effective radius [micrometers] per meter, "
+        "twice their cross section.\n`density` is then their liquid water [g/m3].",
+        {"meters": "How many a u has: 1000 where lengths are in kilometers."},
+    ),
+    (
         "volume.phase: {type: henyey_greenstein}",
         schema.HenyeyGreensteinSection,
         "The usual phase function of one number; `g: 0.3` is short for it.",
@@ -163,7 +183,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "wavelength": "In micrometers, one for each color.",
             "refractive_index": "Of the droplets; of water 1.33.",
-            "effective_radius": "In micrometers: of clouds 5 to 15.",
+            "effective_radius": "In micrometers: of clouds 5 to 15; or `volume.effective_radius`.",
             "effective_variance": "Of the distribution: of clouds about 0.1.",
         },
     ),
@@ -174,7 +194,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "Cameras see it, in shadow and in the light of the volume, and it lights the volume.",
         {
             "height": "Along `volume.up` [u]: at the bottom of the box, or below.",
-            "albedo": "The part of the light that it reflects; `ground.albedo` can be optimized.",
+            "albedo": (
+                "The part of the light that it reflects; `ground.albedo` can be optimized. A file "
+                "is a picture, or `.npy`, of what is straight under the box, `[z, x]` (`[y, x]` "
+                "with `up: z`) from low to high as in volume files; beyond it is its mean."
+            ),
         },
     ),
     (

@@ -15,6 +15,7 @@ from ddrecon.balance import find_balance, lines
 from ddrecon.diffusion.cells import average
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
+from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Light, PointLight
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
@@ -108,6 +109,44 @@ def test_what_enters_is_absorbed_or_leaves(
     record = find_balance(lit_by(light, density, g=g, sigma_a=sigma_a, sigma_s=(5.0,), **changes))
     assert torch.tensor(record["defect_percent"]).abs().max() < 0.6
     assert bool(torch.tensor(record["absorbed"]).all()) == any(sigma_a)
+
+
+@pytest.mark.parametrize("sigma_s", [0.0, 5.0])
+@pytest.mark.parametrize("has_ground", [False, True])
+def test_emission_enters_and_is_absorbed_or_leaves(has_ground: bool, sigma_s: float) -> None:
+    """The ground reflects a part of what falls on it, and less enters again."""
+    emission = random_values(1, 6, 7, 5)
+    changes = {"transport_rounds": 12, "degree": 3, "tolerance": 1e-9, "directional": None}
+    density = torch.ones(6, 7, 5, dtype=torch.float64)
+    changes |= {"emission": emission, "sigma_a": (2.0,), "sigma_s": (sigma_s,), "g": 0.3}
+    scene = make_scene(density, **changes)
+    if has_ground:
+        scene = replace(scene, ground=Ground(tensor(0.7), Plane(-0.6, 1)))
+    record = find_balance(scene)
+    power = 4 * math.pi * float(average(emission).mean()) * 1.0 * 1.2 * 0.9
+    assert record["enters"]["emission"] == pytest.approx(power, rel=1e-12)
+    assert abs(record["defect_percent"]) < (1.0 if has_ground else 1e-3)
+    if has_ground:
+        assert 0 < record["enters"]["ground"] < 0.7 * record["into_ground"]
+
+
+def test_a_white_furnace_over_a_white_ground_is_in_balance() -> None:
+    changes = {"sigma_a": (0.0,), "sigma_s": (6.0,), "g": 0.4, "transport_rounds": 2, "degree": 3}
+    scene = lit_by(AmbientLight(tensor(0.5)), random_values(4, 5, 6), **changes)
+    record = find_balance(replace(scene, ground=Ground(tensor(1.0), Plane(-0.7, 1))))
+    sides = math.pi * 0.5 * (1.0 * 1.2 + 1.2 * 0.9)
+    ends = math.pi * 0.5 * 1.0 * 0.9
+    assert record["enters"] == pytest.approx({"lights.0": ends + sides, "ground": ends + sides})
+    assert record["into_ground"] == pytest.approx(ends + sides)
+    assert abs(record["defect_percent"]) < 1e-7
+
+
+def test_a_ground_sends_back_its_part_of_a_pencil() -> None:
+    """The box stands on it: what it reflects enters, as well as 24 directions say."""
+    scene = lit_by(PENCIL, torch.zeros(10, 12, 10, dtype=torch.float64))
+    record = find_balance(replace(scene, ground=Ground(tensor(0.4), Plane(-0.6, 1))))
+    assert record["into_ground"][0] == pytest.approx(2.0, rel=1e-6)
+    assert record["enters"]["ground"][0] == pytest.approx(0.8, rel=0.1)
 
 
 def test_light_that_nothing_stops_leaves_as_it_came() -> None:

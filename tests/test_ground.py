@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import LOWER, UPPER, half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -16,10 +17,16 @@ from ddrecon import renderer
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane, look_up_texels, texel_centers
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    PointLight,
+)
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render, solve_light, view_components
@@ -53,9 +60,13 @@ def on_ground(
     return replace(made, ground=Ground(tensor(*albedo), Plane(height, 1)))
 
 
-def test_an_empty_box_leaves_the_light_of_sun_lamp_and_sky() -> None:
+def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
     scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), ambient=(0.2, 0.3, 0.5))
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
+    down, up = (
+        BeamLight(tensor(0, 9, 0), tensor(0, y, 0), tensor(5), tensor(0.9)) for y in (-2, 1)
+    )
+    scene.lights += [replace(down, radius=down.radius[0]), replace(up, radius=up.radius[0])]
     # straight from above, and only the plane is seen
     pose = look_at(tensor(0.1, 9, 0.2), tensor(0.1, 0, 0.2), tensor(0, 0, -1))
     scene.views = [View("above", Camera(pose, (5, 6), 3.0, is_perspective=False))]
@@ -63,10 +74,34 @@ def test_an_empty_box_leaves_the_light_of_sun_lamp_and_sky() -> None:
     x, z = 0.1 + column[None], 0.2 + row[:, None]
     height = 1.0 - HEIGHT
     distance = ((x - 0.3) ** 2 + (z + 0.2) ** 2 + height**2).sqrt()
-    sun = 3 * 2 / 3
+    sun = 3 * 2 / 3 + 2 * 5 / (math.pi * 0.9**2) * torch.exp(-2 * (x**2 + z**2) / 0.9**2)
     irradiance = sun + 2 * height / distance**3 + math.pi * tensor(0.2, 0.3, 0.5)[:, None, None]
     expected = tensor(*ALBEDO)[:, None, None] / math.pi * irradiance
-    torch.testing.assert_close(render(scene)[0], expected, rtol=1e-12, atol=0)
+    # the beam's radius is a little more: none is thinner than half a cell
+    torch.testing.assert_close(render(scene)[0], expected, rtol=1e-7, atol=0)
+
+
+def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -> None:
+    scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0, -1, 0))
+    rows, columns = 8, 10
+    z, x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in (rows, columns))
+    scene.ground = Ground((0.2 + 0.5 * z[:, None] + 0.1 * x)[None], scene.ground.plane)
+    pose = look_at(tensor(0, 9, 0.05), tensor(0, 0, 0.05), tensor(0, 0, -1))
+    scene.views = [View("above", Camera(pose, (30, 30), 1.2, is_perspective=False))]
+    row = 0.05 + 1.2 * (2 * (torch.arange(30, dtype=torch.float64) + 0.5) / 30 - 1)
+    v, u = (row[:, None] - LOWER[0]) / (UPPER[0] - LOWER[0]), (row - 0.05 - LOWER[2]) / 0.9
+    inside = ((v > 0) & (v < 1)) & ((u > 0) & (u < 1))
+    v, u = v.clamp(0.5 / rows, 1 - 0.5 / rows), u.clamp(0.5 / columns, 1 - 0.5 / columns)
+    expected = torch.where(inside, 0.2 + 0.5 * v + 0.1 * u, 0.5) * 3 / math.pi
+    torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-12, atol=0)
+
+
+def test_an_even_map_is_a_number() -> None:
+    scene = on_ground(random_values(*SHAPE), ambient=(0.2,), g=0.3, transport_rounds=1)
+    known, ground = render(scene), scene.ground
+    even = ground.albedo.view(3, 1, 1).expand(3, 5, 7)
+    found = render(replace(scene, ground=replace(ground, albedo=even)))
+    torch.testing.assert_close(found, known, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("form", ["ambient", "environment"])
@@ -103,7 +138,7 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
-@pytest.mark.parametrize("kind", ["p1", "coarse", "environment"])
+@pytest.mark.parametrize("kind", ["p1", "coarse", "environment", "map"])
 def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if kind == "coarse":
         monkeypatch.setattr(renderer, "MOST_CELLS", 4)
@@ -111,6 +146,10 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
     density = 0.2 + random_values(4, 5, 3)
     scene = on_ground(density, g=0.3, ambient=(0.3,), travel=(-2.0, -2.2, -1.0), **model)
     scene.lights.append(PointLight(tensor(0.3, 1.0, -0.2), tensor(2.0)))
+    beam = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
+    scene.lights.append(BeamLight(*beam))
+    if kind == "map":
+        scene.ground = replace(scene.ground, albedo=random_values(3, 5, 9))
     if kind == "environment":
         sky = EnvironmentLight(random_values(1, 5, 8), tensor(1.0)[0], tensor(20.0)[0], 3)
         scene.lights.append(sky)
@@ -121,6 +160,8 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
         "lights.0.direction": scene.lights[0].direction,
         "lights.1.radiance": scene.lights[1].radiance,
         "lights.2.position": scene.lights[2].position,
+        "lights.3.position": beam[0],
+        "lights.3.radius": beam[3],
     }
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     weights = random_values(1, 3, 6, 7, seed=3)
@@ -205,8 +246,8 @@ def test_texels_are_found_where_they_are() -> None:
     points = texel_centers(grid, plane, tensor(0))
     texels = random_values(2, *points.shape[:2])
     z, x = points[..., 0].flatten(), points[..., 2].flatten()
-    found = look_up_texels(texels, grid, plane, z[None], x[None])
-    torch.testing.assert_close(found[0], texels.flatten(1))
+    found = look_up_texels(texels, grid, plane, z, x)
+    torch.testing.assert_close(found, texels.flatten(1))
     assert float(z.max()) > 3 * grid.upper[0] and float(z.min()) < 3 * grid.lower[0]
 
 
@@ -226,6 +267,16 @@ GROUND = "ground={height: -0.75, albedo: 0.3}"
 def test_a_ground_that_cannot_be_is_refused(overrides: list[str], what: str) -> None:
     with pytest.raises(SceneError, match=re.escape(what)):
         load_scene(BALL, overrides=[GROUND, VIEWS, "optimize=null", *overrides])
+
+
+def test_a_map_is_read_as_it_is(tmp_path: Path) -> None:
+    gray = random_values(4, 6).float().numpy()
+    for name, factor in (("a.npy", 1), ("b.npy", 2)):
+        np.save(tmp_path / name, factor * gray)
+    scene = load_scene(BALL, overrides=[GROUND, VIEWS, f"ground.albedo={{file: {tmp_path}/a.npy}}"])
+    torch.testing.assert_close(scene.ground.albedo, torch.from_numpy(gray)[None])
+    with pytest.raises(FormatError, match="an albedo is from 0 to 1"):
+        load_scene(BALL, overrides=[GROUND, VIEWS, f"ground.albedo={{file: {tmp_path}/b.npy}}"])
 
 
 @pytest.mark.slow

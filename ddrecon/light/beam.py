@@ -127,13 +127,9 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool 
     else:
         count = max(1, quarter // 8)
     parts = zip(directions.split(count), weights.split(count), strict=True)
-    sums = reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
-    if len(sums) == 1:
-        return Moments(sums[0])
-    # Cut, not indexed: on the way back this is put together once.
-    first, higher = sums.split([4, len(sums) - 4])
-    mean, z, y, x = first.unbind()
-    return Moments(mean, (z, y, x), higher if len(higher) else None)
+    return Moments.of_sums(
+        reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
+    )
 
 
 def attenuate_few(

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import attenuate_few
-from ddrecon.light.lights import DirectionalLight, PointLight
+from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
@@ -41,16 +42,46 @@ class Plane:
         first, second = (axis for axis in range(3) if axis != self.axis)
         return first, second
 
+    def meet(self, points: Tensor, direction: Tensor) -> Tensor:
+        """Where lines through `points` [R, 3] along `direction` [R or 1, 3] meet the plane."""
+        distance = (self.height - points[:, self.axis]) / direction[:, self.axis]
+        return points + distance[:, None] * direction
+
 
 @dataclass(eq=False)
 class Ground:
     """What reflects the part `albedo` [C], from 0 to 1, of the light that falls on a `plane`.
 
-    It does so evenly into all directions. The plane lies at the box's bottom or below.
+    It does so evenly into all directions. The plane lies at the box's bottom or below. A map of
+    albedo [C, rows, columns] covers what is straight under the box, along both axes from low to
+    high; beyond it is the map's mean.
     """
 
     albedo: Tensor
     plane: Plane
+
+    @property
+    def mean_albedo(self) -> Tensor:
+        """That of the whole plane [C]."""
+        return self.albedo if self.albedo.ndim == 1 else self.albedo.mean((1, 2))
+
+    def albedo_at(self, grid: Grid, points: Tensor) -> Tensor:
+        """The albedo at `points` [R, 3] under the box of `grid`, or beyond: [C, R] or [C, 1]."""
+        mean = self.mean_albedo[:, None]
+        if self.albedo.ndim == 1:
+            return mean
+        places = torch.stack([_place(points[:, axis], grid, axis) for axis in self.plane.across])
+        found = sample_slices(self.albedo[None], places.flip(0).T[None])[0]
+        return torch.where((places.abs() <= 1).all(0), found, mean)
+
+    def albedo_on(self, rows: int, columns: int) -> Tensor:
+        """The mean albedo of so many texels [C, rows, columns]; [C, 1, 1] of what has no map."""
+        mean = self.mean_albedo[:, None, None]
+        if self.albedo.ndim == 1:
+            return mean
+        under = adaptive_avg_pool2d(self.albedo, (rows // 2, columns // 2))
+        beyond = columns // 4, columns // 4, rows // 4, rows // 4
+        return mean + pad(under - mean, beyond)
 
 
 def stay_above(sources: Sequence[Source], plane: Plane) -> list[Source]:
@@ -62,6 +93,9 @@ def stay_above(sources: Sequence[Source], plane: Plane) -> list[Source]:
             is_above = bool(source.direction[up] < 0)
         elif isinstance(source, PointLight):
             is_above = bool(source.position[up] > plane.height)
+        elif isinstance(source, BeamLight):
+            along, place = source.direction[up], source.position[up]
+            is_above = bool((along < 0) | ((along == 0) & (place > plane.height)))
         else:
             is_above = True
         if isinstance(source, Sky):
@@ -87,17 +121,23 @@ def texel_centers(grid: Grid, plane: Plane, like: Tensor) -> Tensor:
 
 
 def look_up_texels(texels: Tensor, grid: Grid, plane: Plane, *points: Tensor) -> Tensor:
-    """`texels` [C, rows, columns] at the `points` [N, P] [u], along both axes in the plane: E5.2.
+    """`texels` [C, rows, columns] at `points` [...] [u], along both axes in the plane: E5.2.
 
-    Returns `[N, C, P]`.
+    Returns `[C, ...]`.
     """
     parts = []
     for axis, place in zip(plane.across, points, strict=True):
-        part = (2 * place - grid.lower[axis] - grid.upper[axis]) / grid.extent[axis]
+        part = _place(place, grid, axis)
         size = part.abs()
         parts.append(torch.where(size > 1, part.sign() * (2 - 1 / size.clamp(min=1)), part) / 2)
     rows, columns = torch.broadcast_tensors(*parts)
-    return sample_slices(texels.expand(len(rows), -1, -1, -1), torch.stack([columns, rows], -1))
+    places = torch.stack([columns.flatten(), rows.flatten()], -1)
+    return sample_slices(texels[None], places[None])[0].unflatten(1, rows.shape)
+
+
+def _place(points: Tensor, grid: Grid, axis: int) -> Tensor:
+    """Where `points` [u] are along `axis`: at -1 and 1 the box ends."""
+    return (2 * points - grid.lower[axis] - grid.upper[axis]) / grid.extent[axis]
 
 
 @functools.cache
@@ -129,27 +169,12 @@ def light_from_below(medium: Medium, plane: Plane, even: Tensor, texels: Tensor)
     directions, angles = (part.to(even) for part in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
     weights = moment_weights(rays, medium.degree)[..., 0]
-    one, arriving = even.new_ones(1, 1, 1), []
+    one, arriving = even.new_ones(1, 1, 1), list[Tensor]()
+    axis, centers = plane.axis, medium.grid.centers(even)
     for way in directions:
         (passed,) = attenuate_few(medium, way[None], one)
-        sent = even.view(-1, 1, 1, 1) + _see_texels(medium.grid, plane, texels, way)
+        drift = (centers[axis] - plane.height) / way[axis]
+        points = (centers[one] - way[one] * drift for one in plane.across)
+        sent = even.view(-1, 1, 1, 1) + look_up_texels(texels, medium.grid, plane, *points)
         arriving.append(passed * sent)
-    total = torch.tensordot(weights.T, torch.stack(arriving), 1)
-    if len(total) == 1:
-        return Moments(total[0])
-    mean, z, y, x = total[:4]
-    return Moments(mean, (z, y, x), total[4:] if len(total) > 4 else None)
-
-
-def _see_texels(grid: Grid, plane: Plane, texels: Tensor, way: Tensor) -> Tensor:
-    """What cells [C, z, y, x] see of `texels` against light that goes along `way`."""
-    axis, (row, column) = plane.axis, plane.across
-    centers = grid.centers(texels)
-    drift = (centers[axis] - plane.height) / way[axis]
-    points = (centers[one] - way[one] * drift for one in plane.across)
-    rows, columns = (
-        point.expand(grid.shape).permute(axis, row, column).flatten(1) for point in points
-    )
-    found = look_up_texels(texels, grid, plane, rows, columns)
-    found = found.unflatten(2, (grid.shape[row], grid.shape[column])).transpose(0, 1)
-    return found.movedim(1, 1 + axis)
+    return Moments.of_sums(torch.tensordot(weights.T, torch.stack(arriving), 1))

@@ -59,6 +59,16 @@ class Moments:
         y, z, x = (_FIRST * values[k] for k in (1, 2, 3))
         return Moments(values[0], (z, y, x), values[4:] if len(values) > 4 else None)
 
+    @staticmethod
+    def of_sums(sums: Tensor) -> Moments:
+        """The light whose mean, flux along z, y, x and moments of degree 2 and more are `sums`."""
+        if len(sums) == 1:
+            return Moments(sums[0])
+        # Cut, not indexed: on the way back this is put together once.
+        first, higher = sums.split([4, len(sums) - 4])
+        mean, z, y, x = first.unbind()
+        return Moments(mean, (z, y, x), higher if len(higher) else None)
+
     def harmonics(self, degree: int) -> Tensor:
         """All phi_k up to `degree` [K, C, z, y, x] (E2.8); those that are missing are zero."""
         parts = [self.mean[None]]

@@ -29,16 +29,17 @@ NORM_ORDER = 8
 """Order of the norm of a beam's radius and a pencil's: nearly the larger, without a kink."""
 
 
-def seen_radius(radius: Tensor, grid: Grid) -> Tensor:
-    """The radius [u] that a beam of `radius` has in `grid`."""
-    thinnest = radius.new_tensor(THINNEST * max(grid.spacing))
-    return torch.linalg.vector_norm(torch.stack([radius, thinnest]), ord=NORM_ORDER)
+def seen_radius(radius: Tensor, width: float | Tensor) -> Tensor:
+    """The radius [u] that a beam of `radius` has among cells of `width`."""
+    thinnest = torch.as_tensor(THINNEST * width, dtype=radius.dtype, device=radius.device)
+    both = torch.stack(torch.broadcast_tensors(radius, thinnest))
+    return torch.linalg.vector_norm(both, ord=NORM_ORDER, dim=0)
 
 
 @remember
 def profile_in(grid: Grid, position: Tensor, direction: Tensor, radius: Tensor) -> Tensor:
     """The irradiance of a beam in each cell over its power, [1, z, y, x] [1/u^2]."""
-    beam = position, direction, seen_radius(radius, grid)
+    beam = position, direction, seen_radius(radius, max(grid.spacing))
     return mean_profile(grid.centers(position), grid.spacing, *beam)[None]
 
 
@@ -49,7 +50,10 @@ def mean_profile(
     direction: Tensor,
     radius: Tensor,
 ) -> Tensor:
-    """The mean of E5.5 over boxes of `size` around `centers` (along z, y, x), [z, y, x]."""
+    """The mean of E5.5 over boxes of `size` around `centers` (along z, y, x), [z, y, x].
+
+    `radius` may differ from box to box.
+    """
     travel = normalize(array_order(direction), dim=0)
     offset = [c - p for c, p in zip(centers, array_order(position), strict=True)]
     along = sum(o * d for o, d in zip(offset, travel, strict=True))
@@ -61,6 +65,7 @@ def mean_profile(
         more = sum(2 * o * s for o, s in zip(offset, across, strict=True))
         return torch.exp(-2 / radius**2 * (square + (more + across @ across)))
 
-    shifts = product(*([h * ((k + 0.5) / POINTS - 0.5) for k in range(POINTS)] for h in size))
+    middles = [(k + 0.5) / POINTS - 0.5 for k in range(POINTS)]
+    shifts = [*product(*([h * part for part in middles] if h else [0.0] for h in size))]
     total = reduce(torch.add, (recompute(sample, radius.new_tensor(shift)) for shift in shifts))
-    return total * (2 / (math.pi * POINTS**3)) / radius**2
+    return total * (2 / (math.pi * len(shifts))) / radius**2

@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.grid import Grid, array_order
+from ddrecon.grid import Grid
 from ddrecon.light.beam import unit_directions
 from ddrecon.light.ground import Ground, Plane, hemisphere, look_up_texels, texel_centers
-from ddrecon.light.lights import DirectionalLight, PointLight
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source
+from ddrecon.march.direct import Beamed, rays_against, shine_on, transmittance
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_along
@@ -30,6 +31,10 @@ from ddrecon.settings import RenderSettings
 
 DOWNWARDS = 48
 """Directions of the light that the ground receives from sky and medium."""
+WIDE = 2.5
+"""Texels have the irradiance at their middles, of beams as if cells were so many times as wide: so
+all texels together receive the power of a beam within 1e-3.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,18 +42,20 @@ class LitGround:
     """A `ground`, and the light that falls on it.
 
     Direct light is that of `lights`, which shine from above. The irradiance of all other light is
-    `even` [C] where no medium is near, and as much more as `texels` [C, rows, columns] say.
+    `even` [C] where no medium is near, and as much more as `texels` [C, rows, columns] say. `sent`
+    is what it sends into the medium, as of `reflect`, once that is known.
     """
 
     ground: Ground
-    lights: tuple[DirectionalLight | PointLight, ...]
+    lights: tuple[Beamed, ...]
     even: Tensor
     texels: Tensor
+    sent: tuple[Tensor, Tensor] | None = None
 
 
 def light_evenly(ground: Ground, sources: Sequence[Source], grid: Grid, like: Tensor) -> LitGround:
     """`ground` in the light of `sources`, all above it, as if the box of `grid` were empty."""
-    lights = tuple(one for one in sources if isinstance(one, DirectionalLight | PointLight))
+    lights = tuple(one for one in sources if isinstance(one, Beamed))
     even = math.pi * ambient_radiance(sources, like).flatten()
     for sky in sources:
         if isinstance(sky, Sky):
@@ -77,7 +84,7 @@ def light_texels(
         return march(glow(sight.rays, number), sight, settings, behind) - behind
 
     def shade(travel: Tensor) -> Tensor:
-        return _passed(medium, _rays_against(grid, points, travel), settings) - 1
+        return transmittance(medium, rays_against(grid, points, travel), settings) - 1
 
     texels = torch.zeros_like(behind)
     directions, angles = upwards(plane)
@@ -104,44 +111,20 @@ def _sights(
     like = torch.empty(0, dtype=dtype, device=device)
     points = texel_centers(grid, plane, like).flatten(0, 1)
     directions = upwards(plane)[0].to(like)
-    return tuple(look_along(grid, _rays_against(grid, points, -up), settings) for up in directions)
-
-
-def _rays_against(grid: Grid, points: Tensor, travel: Tensor) -> Rays:
-    """Rays through `points` [R, 3] of the ground against light that goes along `travel` [3].
-
-    They begin behind the points, outside of the box: that may stand on the ground.
-    """
-    way = travel.expand_as(points)
-    return Rays(points + max(grid.extent) * way, -way, None)
-
-
-def _passed(medium: Medium, rays: Rays, settings: RenderSettings) -> Tensor:
-    """The transmittance [C, R] of `medium` along all of `rays`."""
-    extinction, dark = medium.extinction, torch.zeros_like(medium.extinction.field[:1])
-    absorbing = Emission(
-        medium.grid, extinction, extinction, (), dark, medium.seen, None, support=medium.support
-    )
-    one = dark.new_ones(1, len(rays.direction))
-    return march(absorbing, look_along(medium.grid, rays, settings), settings, one)
+    return tuple(look_along(grid, rays_against(grid, points, -up), settings) for up in directions)
 
 
 def _direct_irradiance(
-    lit: LitGround, medium: Medium, points: Tensor, settings: RenderSettings
+    lit: LitGround, medium: Medium, points: Tensor, width: float | Tensor, settings: RenderSettings
 ) -> Tensor:
-    """The irradiance [C, R] of lights at `points` [R, 3] of the ground, through `medium`."""
+    """The irradiance [C, R] of lights at `points` [R, 3] of the ground, through `medium`.
+
+    No beam is thinner than cells of `width` allow.
+    """
     axis, total = lit.ground.plane.axis, points.new_zeros(1, len(points))
     for light in lit.lights:
-        if isinstance(light, DirectionalLight):
-            _, travel = unit_directions(light.direction)
-            rays = _rays_against(medium.grid, points, travel)
-            irradiance = -travel[axis] * light.irradiance[:, None]
-        else:
-            eye = array_order(light.position)
-            distance = torch.linalg.vector_norm(points - eye, dim=-1)
-            rays = Rays(eye.expand_as(points), (points - eye) / distance[:, None], eye)
-            irradiance = -rays.direction[:, axis] / distance**2 * light.intensity[:, None]
-        total = total + irradiance * _passed(medium, rays, settings)
+        rays, travel, irradiance = shine_on(light, points, medium.grid, width)
+        total = total - travel[:, axis] * irradiance * transmittance(medium, rays, settings)
     return total
 
 
@@ -152,14 +135,19 @@ def reflect(lit: LitGround, medium: Medium, settings: RenderSettings) -> tuple[T
     """
     plane, even = lit.ground.plane, lit.even
     points = texel_centers(medium.grid, plane, even)
-    direct = _direct_irradiance(lit, medium, points.flatten(0, 1), settings)
+    along = (torch.gradient(points[..., axis], dim=dim)[0] for dim, axis in enumerate(plane.across))
+    width = WIDE * torch.maximum(*along).flatten()
+    direct = _direct_irradiance(lit, medium, points.flatten(0, 1), width, settings)
     for light in lit.lights:
         if isinstance(light, DirectionalLight):
             _, travel = unit_directions(light.direction)
             even = even - travel[plane.axis] * light.irradiance
     texels = direct.unflatten(1, points.shape[:2]) + lit.texels + (lit.even - even).view(-1, 1, 1)
-    reflected = lit.ground.albedo / math.pi
-    return reflected * even, reflected.view(-1, 1, 1) * texels
+    here, beyond = (
+        part / math.pi for part in (lit.ground.albedo_on(*points.shape[:2]), lit.ground.mean_albedo)
+    )
+    more = here * texels + (here - beyond.view(-1, 1, 1)) * even.view(-1, 1, 1)
+    return beyond * even, more
 
 
 def see_ground(
@@ -175,13 +163,13 @@ def see_ground(
     if not len(hit):
         return seen
     rays = rays.select(hit)
-    distance = (plane.height - rays.origin[:, plane.axis]) / down[hit]
-    points = rays.origin + distance[:, None] * rays.direction
-    (more,) = look_up_texels(
-        lit.texels, medium.grid, plane, *(points[None, :, axis] for axis in plane.across)
+    points = plane.meet(rays.origin, rays.direction)
+    more = look_up_texels(
+        lit.texels, medium.grid, plane, *(points[:, axis] for axis in plane.across)
     )
-    irradiance = lit.even[:, None] + more + _direct_irradiance(lit, medium, points, settings)
-    radiance = lit.ground.albedo[:, None] / math.pi * irradiance
+    direct = _direct_irradiance(lit, medium, points, max(medium.grid.spacing), settings)
+    irradiance = lit.even[:, None] + more + direct
+    radiance = lit.ground.albedo_at(medium.grid, points) / math.pi * irradiance
     colors = max(len(radiance), len(seen))
     seen = seen.expand(colors, len(down))
     return seen.index_copy(1, hit, radiance.expand(colors, -1))

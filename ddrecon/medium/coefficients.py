@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -152,6 +152,13 @@ class Medium:
         Delta-Eddington scaling leaves it unchanged.
         """
         return self.absorption.value + (1 - self.g) * self.scattering.value
+
+    @property
+    def emitting(self) -> Medium:
+        """One that scatters of even light of radiance 1 what this one emits (E2.11)."""
+        assert self.emission is not None
+        scale = self.emission.new_ones(1, 1, 1, 1)
+        return replace(self, remaining=Coefficient(scale, self.emission))
 
     @property
     def has_flux(self) -> bool:

@@ -193,6 +193,8 @@ def _ground(ground: Ground, grid: Grid) -> dict[str, Any]:
 
     It lies a little below the box: of two surfaces in the same place rays meet either.
     """
+    if ground.albedo.ndim > 1:
+        raise SceneError("ground.albedo: is a map here, and one number or color for Mitsuba")
     up, diagonal = 2 - ground.plane.axis, math.hypot(*grid.extent)
     half, bottom = FAR * diagonal, grid.lower[ground.plane.axis] - NEAR * diagonal
     place, middle = np.zeros((4, 4)), np.array([*grid.center_xyz, 1.0])

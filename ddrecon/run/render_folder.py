@@ -93,7 +93,7 @@ def _write_fluence(
     light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
 ) -> list[str]:
     """The names of files of these `kinds` in `folder`, which the first rank writes."""
-    found = forward_ad.unpack_dual(fluence_of(light_field)).primal
+    found = forward_ad.unpack_dual(fluence_of(light_field, scene.diffusion)).primal
     stem = folder / "volumes" / "fluence"
     if not is_first():
         return []

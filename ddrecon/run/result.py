@@ -99,7 +99,8 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
             _, index, attribute = name.split(".")
             described["lights"][int(index)]["file" if isinstance(value, str) else attribute] = value
     if "ground.albedo" in values:
-        described["ground"]["albedo"] = values["ground.albedo"]
+        albedo = values["ground.albedo"]
+        described["ground"]["albedo"] = {"file": albedo} if isinstance(albedo, str) else albedo
     for section in described["views"]:
         camera, owner = section["camera"], f"views.{section['name']}."
         found = {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}

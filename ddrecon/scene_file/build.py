@@ -176,12 +176,16 @@ def _build_light(
         position, direction = tensor(section.position), tensor(section.direction)
         return BeamLight(position, direction, color("power"), tensor(section.radius))
     pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
-    is_gray = bool((pixels == pixels[..., :1]).all())
-    if is_gray and not scene_file.tree.may_change(f"lights.{index}.radiance"):
-        pixels = pixels[..., :1]
-    radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
+    radiance = _map_of(scene_file, f"lights.{index}.radiance", pixels).to(device, dtype)
     numbers = tensor(section.scale), tensor(section.rotation)
     return EnvironmentLight(radiance, *numbers, section.directions, section.up)
+
+
+def _map_of(scene_file: SceneFile, name: str, pixels: np.ndarray) -> Tensor:
+    """The variable `name` [C, h, w] of `pixels` [h, w, 3]; gray unless that may change."""
+    if not scene_file.tree.may_change(name) and bool((pixels == pixels[..., :1]).all()):
+        pixels = pixels[..., :1]
+    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
 
 
 def _build_ground(
@@ -204,9 +208,22 @@ def _build_ground(
         if float(view.camera.pose[2 - axis, 3]) <= section.height:
             what = f"the camera of view {view.name!r} is not above it"
             raise scene_file.refused("ground.height", what)
-    albedo = tree.share_color("ground.albedo", section.albedo)
-    reflected = torch.tensor(albedo, dtype=dtype, device=device).view(-1)
-    return Ground(reflected, Plane(section.height, axis))
+    if isinstance(section.albedo, FieldFile):
+        file = section.albedo.file
+        pixels = read_referenced(scene_file, "ground.albedo.file", file, _read_albedo)
+        reflected = _map_of(scene_file, "ground.albedo", pixels)
+    else:
+        albedo = tree.share_color("ground.albedo", section.albedo)
+        reflected = torch.tensor(albedo, dtype=dtype).view(-1)
+    return Ground(reflected.to(device, dtype), Plane(section.height, axis))
+
+
+def _read_albedo(path: Path) -> np.ndarray:
+    pixels = read_image(path).pixels
+    if pixels.min() < 0 or pixels.max() > 1:
+        ends = f"{pixels.min():.3g} to {pixels.max():.3g}"
+        raise FormatError(path, f"has values from {ends}; an albedo is from 0 to 1")
+    return pixels
 
 
 def _read_map(path: Path) -> np.ndarray:

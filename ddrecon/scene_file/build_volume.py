@@ -22,7 +22,7 @@ from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mie import scatter_droplets
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
@@ -31,14 +31,19 @@ from ddrecon.scene_file.schema import (
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
+    Profile,
     SceneTree,
     TableSection,
     TwoLobeSection,
+    Water,
 )
 from ddrecon.settings import FieldFile
 from ddrecon.variables.kinds import FIELDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
+RADIUS = "effective_radius"
+EXTINCTION = 1.5
+"""Of 1 g/m3 of droplets with an effective radius of 1 micrometer [1/m]: 3 Q / (4 rho r), Q = 2."""
 FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
 
@@ -61,6 +66,10 @@ def build_media(
     grid = _agree_on_grid(
         scene_file, dict(at for each in media.values() for at in each.fields.values())
     )
+    for each in media.values():
+        with problems.collecting():
+            each.fields.update(_spread_profiles(scene_file, each, grid))
+    problems.raise_any()
     return {
         name: each.build(grid, _build_phase(scene_file, each, dtype, device), dtype, device)
         for name, each in media.items()
@@ -71,19 +80,23 @@ def build_media(
 class _Medium:
     """What the scene `tree` says of a medium, names in which begin with `prefix`.
 
-    `fields` are those of its files by variable, and where the scene names them.
+    `fields` are those of its files and profiles by variable, and where the scene names them.
     """
 
     tree: SceneTree
     prefix: str
     section: MediumSection
-    fields: Mapping[str, tuple[str, Field]]
+    fields: dict[str, tuple[str, Field]]
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
         if name in self.fields:
             return cells_of(self.fields[name][1]).double()
-        value = self.tree.share_color(self.prefix + name, getattr(self.section, name))
+        value = _quantities(self.section)[name][1]
+        if isinstance(value, Water):
+            radius = self.values(RADIUS)
+            return torch.where(radius > 0, EXTINCTION * value.meters / radius, 0.0)
+        value = self.tree.share_color(self.prefix + name, value)
         return torch.tensor(value, dtype=torch.float64).view(-1)
 
     def build(
@@ -115,23 +128,59 @@ def _read_fields(
     scene_file: SceneFile, prefix: str, section: MediumSection
 ) -> dict[str, tuple[str, Field]]:
     """The quantities that files give cell by cell, by variable; and where the scene says so."""
+    problems, found = Problems(), {}
+    for variable, (name, value) in _quantities(section).items():
+        if isinstance(value, FieldFile):
+            called = value.name or variable.removeprefix(PHASE)
+            read = partial(read_quantity, name=_kind_name(variable), called=called)
+            with problems.collecting():
+                at = f"volume.{prefix}{name}.file"
+                found[variable] = at, read_referenced(scene_file, at, value.file, read)
+    problems.raise_any()
+    return found
+
+
+def _quantities(section: MediumSection) -> dict[str, tuple[str, Any]]:
+    """What may differ from cell to cell, by variable: its key in `section`, and its value."""
     names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
     given = {name: (name, getattr(section, name)) for name in names}
     if isinstance(section.phase, HenyeyGreensteinSection):
         given["g"] = "phase.g", section.phase.g
     elif isinstance(section.phase, TwoLobeSection):
         given["phase.weight"] = "phase.weight", section.phase.weight
-    problems, found = Problems(), {}
-    for variable, (name, value) in given.items():
-        if isinstance(value, FieldFile):
-            called = value.name or variable.removeprefix(PHASE)
-            # A temperature is as a density: one number a cell, none below 0.
-            kind = "density" if variable == "temperature" else variable
-            read = partial(read_quantity, name=kind, called=called)
-            with problems.collecting():
-                at = f"volume.{prefix}{name}.file"
-                found[variable] = at, read_referenced(scene_file, at, value.file, read)
-    problems.raise_any()
+    elif isinstance(section.phase, MieSection):
+        by_cell, same = getattr(section, RADIUS, None), section.phase.effective_radius
+        given[RADIUS] = RADIUS, same if by_cell is None else by_cell
+    return given
+
+
+def _kind_name(variable: str) -> str:
+    """That of its kind: of others than variables that of density, a number a cell, none below 0."""
+    return variable if variable in FIELDS else "density"
+
+
+def _spread_profiles(
+    scene_file: SceneFile, medium: _Medium, grid: Grid
+) -> dict[str, tuple[str, Field]]:
+    """The quantities that `medium` has by height, at the centers of the cells of `grid`."""
+    axis, found = "zyx".index(scene_file.tree.volume.up), {}
+    low, size = grid.lower[axis], grid.spacing[axis]
+    centers = low + size * (np.arange(grid.shape[axis]) + 0.5)
+    for variable, (name, value) in _quantities(medium.section).items():
+        if not isinstance(value, Profile):
+            continue
+        at, kind = f"volume.{medium.prefix}{name}.values", kind_of(_kind_name(variable))
+        colors = [np.ravel(one) for one in value.values]
+        if not kind.is_color and max(map(len, colors)) > 1:
+            raise scene_file.refused(at, "expected numbers: colors belong to the cross sections")
+        if not all(((kind.low <= one) & (one <= kind.high)).all() for one in colors):
+            limits = f"at least {kind.low:g} and at most {kind.high:g}"
+            raise scene_file.refused(at, f"must be {limits}")
+        known = np.stack(np.broadcast_arrays(*colors), 1)
+        column = np.stack([np.interp(centers, value.heights, one) for one in known], -1)
+        level = [size for other, size in enumerate(grid.shape) if other != axis]
+        cells = np.moveaxis(np.broadcast_to(column, (*level, *column.shape)), 2, axis).copy()
+        found[variable] = at, Field(cells[..., 0] if len(known) == 1 else cells)
     return found
 
 
@@ -204,7 +253,7 @@ def _build_phase(
     """The phase function of `medium`; MissingExtraError for droplets without miepython."""
 
     def tensor(value: Any, name: str = "") -> Tensor:
-        if isinstance(value, FieldFile):
+        if isinstance(value, FieldFile | Profile):
             return medium.values(name).to(device, dtype)
         value = medium.tree.share_color(f"{medium.prefix}{name}", value)
         return torch.as_tensor(value, dtype=dtype, device=device)
@@ -220,11 +269,27 @@ def _build_phase(
             key = f"volume.{medium.prefix}phase.file"
             return Tabulated(tensor(_table(scene_file, section, key)))
         case MieSection():
-            colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
-            sizes = section.effective_radius, section.effective_variance
-            values = [scatter_droplets(float(length), float(n), *sizes) for length, n in colors]
-            return Tabulated(tensor(np.stack(values)))
+            radius = medium.values(RADIUS).squeeze(0)
+            known = radius[radius > 0]
+            if not len(known) or known.max() > 100:
+                what = f"must be above 0 somewhere and at most 100, found {float(radius.max()):g}"
+                raise scene_file.refused(f"volume.{medium.prefix}{RADIUS}", what)
+            least, most = float(known.min()), float(known.max())
+            smallest = Tabulated(tensor(_droplets(section, least)))
+            if least == most:
+                return smallest
+            # Where there are none, as large as elsewhere in the mean.
+            inverse = 1 / torch.where(radius > 0, radius, known.mean())
+            weight = tensor((inverse - 1 / most) / (1 / least - 1 / most))
+            return Blend(smallest, Tabulated(tensor(_droplets(section, most))), weight)
     return Rayleigh(tensor(0.0))
+
+
+def _droplets(section: MieSection, radius: float) -> np.ndarray:
+    """Values at even angles, [C, steps + 1]."""
+    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
+    sizes = radius, section.effective_variance
+    return np.stack([scatter_droplets(float(length), float(n), *sizes) for length, n in colors])
 
 
 def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import mul
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -37,8 +38,6 @@ Size = tuple[int, int]
 Pair = tuple[float, float]
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
-Density = float | FieldFile
-Quantity = Color | FieldFile
 Backdrop = Color | Path
 Paths = Path | tuple[Path, ...]
 
@@ -47,6 +46,31 @@ FRAME = re.compile(r"\{frame(:0?[1-9]?d)?\}")
 """Where the number of a frame stands in the name of a picture: `{frame:04d}`."""
 TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
 """Names that output files of other views have: their components, and previews by iteration."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """`values` at `heights` [u] along the volume's `up`: linear between them, even beyond."""
+
+    heights: tuple[float, ...]
+    values: tuple[Color, ...]
+
+    def violations(self) -> Iterator[Violation]:
+        if any(after <= before for before, after in pairwise(self.heights)):
+            yield "heights", "must go up from one to the next"
+        if len(self.values) != len(self.heights) or not self.heights:
+            yield "values", f"expected one for each height, {len(self.heights)}"
+
+
+@dataclass(frozen=True)
+class Water:
+    """What droplets of `phase` extinguish, by their liquid water; `meters`: how many a u has."""
+
+    meters: float = bounded(above=0)
+
+
+Density = float | FieldFile | Profile
+Quantity = Color | FieldFile | Profile
 
 
 @dataclass(frozen=True)
@@ -92,8 +116,8 @@ class MieSection:
 
     wavelength: Color = bounded(above=0, maximum=1e3)
     refractive_index: Color = bounded(above=1, maximum=10)
-    effective_radius: float = bounded(above=0, maximum=100)
     effective_variance: float = bounded(above=0, below=0.5)
+    effective_radius: float | None = bounded(None, above=0, maximum=100)
 
 
 PartSection = HenyeyGreensteinSection | RayleighSection | TableSection | MieSection
@@ -128,7 +152,7 @@ class MediumSection:
     density: Density = bounded(minimum=0)
     sigma_a: Quantity | None = bounded(None, minimum=0)
     sigma_s: Quantity | None = bounded(None, minimum=0)
-    sigma_t: Quantity | None = bounded(None, minimum=0)
+    sigma_t: Quantity | Water | None = bounded(None, minimum=0)
     albedo: Quantity | None = bounded(None, minimum=0, maximum=1)
     g: float = bounded(0.0, above=-1, below=1)
     phase: PartSection | None = None
@@ -136,7 +160,16 @@ class MediumSection:
     def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", "g is short for a phase function: give only one of g or phase"
-        if type(self) is MediumSection and isinstance(getattr(self.phase, "g", None), FieldFile):
+        by_cell = getattr(self, "effective_radius", None)
+        if not isinstance(self.phase, MieSection):
+            if isinstance(self.sigma_t, Water):
+                yield "sigma_t", "meters are for droplets, phase: {type: mie, ...}"
+            if by_cell is not None:
+                yield "effective_radius", "is that of droplets, phase: {type: mie, ...}"
+        elif (by_cell is None) == (self.phase.effective_radius is None):
+            yield "phase", "give droplets one effective_radius: here, or volume.effective_radius"
+        is_field = isinstance(getattr(self.phase, "g", None), FieldFile | Profile)
+        if type(self) is MediumSection and is_field:
             yield "phase", "the g of a medium is the same in all cells where there are two"
 
 
@@ -151,6 +184,7 @@ class VolumeSection(MediumSection):
     phase: PhaseSection | None = None  # type: ignore[assignment]
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
+    effective_radius: Density | None = bounded(None, minimum=0, maximum=100)
     bounds: Bounds | Auto | None = None
     resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
@@ -186,7 +220,7 @@ class GroundSection:
     """A plane at `height` [u] along the volume's `up`; `albedo`: part of light that it reflects."""
 
     height: float
-    albedo: Color = bounded(minimum=0, maximum=1)
+    albedo: Color | FieldFile = bounded(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.errors import DataWarning
+from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Tabulated
@@ -145,3 +146,28 @@ def test_a_number_of_each_cell_is_optimized_from_one(write: Callable[[str], Path
     weight = scene.starts["phase.weight"]
     assert weight.shape == scene.volume.grid.shape and bool((weight == 0.4).all())
     assert scene.starts["phase.g"].tolist() == pytest.approx([0.8, -0.3])
+
+
+def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None:
+    """Between ends that are exact, moments are those of droplets of each size."""
+    pytest.importorskip("miepython")
+    droplets = {"type": "mie", "wavelength": 0.67, "refractive_index": 1.33}
+    droplets |= {"effective_variance": 0.1}
+    sizes = {"heights": [-0.5, 0.5], "values": [6.0, 12.0]}
+    water = {name: VOLUME[name] for name in ("bounds", "resolution")}
+    water |= {"density": 0.5, "sigma_t": {"meters": 1000}, "albedo": 1}
+
+    def built(radius: Any) -> Volume:
+        volume = water | {"phase": droplets, "effective_radius": radius}
+        return load_scene(write(changed(volume=volume)), dtype=torch.float64).volume
+
+    medium = built(sizes)
+    radius = 9 + 6 * medium.grid.centers(medium.density)[1].flatten()
+    found = medium.phase.moments(9)[0, :, 0, :, 0]
+    torch.testing.assert_close(medium.sigma_s[0, 0, :, 0], 1500 / radius)
+    assert not medium.sigma_a.any()
+    for place, size in enumerate(radius.tolist()):
+        own = built(size)
+        exact = 1e-12 if place in (0, 2) else 4e-3
+        torch.testing.assert_close(own.phase.moments(9)[0], found[:, place], rtol=0, atol=exact)
+        assert own.sigma_s.item() == pytest.approx(1500 / size)

@@ -21,16 +21,21 @@ SCENES = f"""
 volume.g=.nan => volume.g: expected a finite number
 volume.g=1e400 => volume.g: expected a finite number
 volume.g=2 => -D volume.g=2: volume.g: must be below 1, found 2
-volume.density=[1, 2, 3] => density: expected a number or {{file: ...}}, found a list of 3
+volume.density=[1, 2, 3] => expected a number, {{file: ...}} or {{heights: ...}}, found a list of 3
 volume.density={{constant: -1}} => volume.density.constant: must be at least 0
 volume.density={{constant: 1, file: a.npz}} => volume.density.constant: unknown key
 volume.density={{file: 3}} => density.file: expected a file, found 3 (put it in quotes)
 volume.density={{file: "a\\0"}} => volume.density.file: expected text that can be printed
 volume.density={{file: gone.npz}} => volume.density.file: gone.npz does not exist
 volume.density={{file: {"n" * 5000}}} => -D volume.density={{file: nnn
-volume.sigma_a=[1, 2] => sigma_a: expected a number, [r, g, b] or {{file: ...}}, found a list of 2
-volume.sigma_a=red => sigma_a: expected a number, [r, g, b] or {{file: ...}}, found 'red'
-volume.sigma_a=true => volume.sigma_a: expected a number, [r, g, b] or {{file: ...}}, found true
+volume.sigma_a=[1, 2] => [r, g, b], {{file: ...}} or {{heights: ...}}, found a list of 2
+volume.sigma_a=red => [r, g, b], {{file: ...}} or {{heights: ...}}, found 'red'
+volume.sigma_a=true => [r, g, b], {{file: ...}} or {{heights: ...}}, found true
+volume.density={{heights: [0, 0], values: [1, 2]}} => heights: must go up from one to the next
+volume.density={{heights: [0, 1], values: [1]}} => density.values: expected one for each height, 2
+volume.density={{heights: [0], values: [-1]}} => volume.density.values: must be at least 0
+volume.density={{heights: [0], values: [[1, 2, 3]]}} => density.values: expected numbers: colors
+volume.g={{heights: [0], values: [2]}} => volume.g.values: must be at least -0.99 and at most 0.99
 volume.albedo=0.5 => volume: give only one of sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1}} => volume: missing sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1, sigma_t: 1}} => volume: missing key 'albedo'
@@ -47,6 +52,8 @@ volume.density={{file: wide.npz}} => has the resolution 3 x 2 x 2, but volume.re
 volume.density={{file: moved.npz}} => density.file: has the bounds (-1, -1.5, -1) to (1, 1.5, 1)
 volume=3 => volume: expected a mapping, found 3
 volume.phase={{type: rayleigh}} => volume.phase: g is short for a phase function: give only one
+volume={{density: 1, sigma_t: {{meters: 1}}, albedo: 1}} => volume.sigma_t: meters are for droplets
+volume.effective_radius=1 => volume.effective_radius: is that of droplets, phase: {{type: mie, ...}}
 volume.phase={{type: two_lobes}} => did you mean 'two_lobe'?
 volume.phase={{type: blend}} => blend went: write two media, volume.media
 {MEDIA}{{cloud: {MEDIUM}}}}} => volume.media: expected two media, found 1

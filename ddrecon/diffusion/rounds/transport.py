@@ -21,7 +21,7 @@ from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import count_directions, sweep_change
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
-from ddrecon.medium.coefficients import Coefficient, Medium
+from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
@@ -51,8 +51,8 @@ def run_rounds(
     if rounds == 0:
         return light
     medium, grid = problem.medium, problem.medium.grid
-    directions = count_directions(degree, rounds)
-    light, emitted = _renewed(light, grid), _sweep_emission(medium, directions)
+    directions, light = count_directions(degree, rounds), _renewed(light, grid)
+    emitted = None if medium.emission is None else sweep_emission(medium, directions)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
         made = _round(problem, light, emitted, solve, directions, round_index, cosine, factor)
@@ -60,17 +60,13 @@ def run_rounds(
     return light
 
 
-def _sweep_emission(medium: Medium, directions: int) -> Moments | None:
+def sweep_emission(medium: Medium, directions: int) -> Moments:
     """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
 
-    It is the same in all rounds, and swept once: as light of mean 1 that `medium` would scatter
-    with the coefficient j. Like kappa_a, j is even within cells.
+    It is the same in all rounds, and swept once. Like kappa_a, j is even within cells.
     """
-    if medium.emission is None:
-        return None
-    emission = medium.emission
-    emitting = replace(medium, remaining=Coefficient(emission.new_ones(1, 1, 1, 1), emission))
-    nothing = torch.zeros_like(medium.extinction.value.detach() * emission.detach())
+    emitting = medium.emitting
+    nothing = torch.zeros_like(medium.extinction.value.detach() * emitting.remaining.value.detach())
     even = Moments(torch.ones_like(nothing))
     return sweep_change(emitting, Moments(nothing), even, None, directions)
 
@@ -95,7 +91,7 @@ def _round(
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `emitted`: light as of `_sweep_emission`; `cosine`: as of `_flux_factor`.
+    `emitted`: light as of `sweep_emission`; `cosine`: as of `_flux_factor`.
     """
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
