@@ -419,14 +419,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
                 "where there are none: without model `p1` or scheme `conservative`. With "
-                "degree 5 it is one more beyond 0.55, and where a face of the box is dense at least one "
-                "more in cells thicker than 1.5 optical depths, two from 4 on. Where none is, it is "
-                "1 in cells thicker than 3."
+                "degree 5 it is one more beyond 0.55, and where a face of the box is dense at "
+                "least one more in cells thicker than 1.5 optical depths, two from 4 on. Where "
+                "none is, it is 1 in cells thicker than 3."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "
-                "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not sought and at most "
-                "0.32 in size. It is 5 where a face of the box is half as dense as the mean, or "
+                "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not "
+                "sought and at most 0.32 in size. It is 5 where a face of the box is half as dense as the mean, or "
                 "where g is below -0.67."
             ),
         },
