@@ -20,19 +20,23 @@ from torch.nn.functional import normalize
 from ddrecon.cameras import Rays
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.rounds.bounced import TURNS, follow_inside
 from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
 from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep_rule
+from ddrecon.diffusion.rounds.transport import face_mirror
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.profile import mean_profile, seen_radius
+from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Medium, keep_medium
+from ddrecon.medium.fresnel import reflectance, transmitted_moments
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
@@ -42,6 +46,8 @@ from ddrecon.settings import RenderSettings
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """Of the box, in array order."""
 Beamed = DirectionalLight | PointLight | BeamLight
+SWEEPS = 12
+"""So often light is swept where faces reflect it inside."""
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
@@ -49,10 +55,11 @@ RAY_BY_RAY = RenderSettings(tolerance=0.0)
 def find_balance(scene: Scene) -> dict[str, Any]:
     """What power `enters` the box of `scene` of each light, is `absorbed` there, and `leaves`.
 
-    By each face, as unscattered and as scattered light. `fractions` are the same of all that
-    enters; `defect_percent` is what enters and neither is absorbed nor leaves. Of one color each is
-    a number, else a list of three. Raises UsageError where no light enters, or where nobody follows
-    light that is scattered.
+    By each face, as unscattered and as scattered light. Where faces refract light, what is
+    `reflected` by them from outside counts among what enters as well. `fractions` are the same of
+    all that enters; `defect_percent` is what enters and neither is absorbed nor leaves. Of one
+    color each is a number, else a list of three. Raises UsageError where no light enters, or where
+    nobody follows light that is scattered.
     """
     light_field = solve_light(scene, SolveMemory())
     medium, angles = light_field.medium, scene.diffusion.angles
@@ -64,27 +71,30 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     for number, light in enumerate(scene.lights):
         parts = decompose_lights([light])
         crossing = reduce(torch.add, (_cross_box(part, media, angles) for part in parts))
-        enters[f"lights.{number}"] = crossing[0].sum(0)
+        enters[f"lights.{number}"] = crossing[:2].sum((0, 1))
         leaves.append(crossing[1:])
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    passing, unscattered = reduce(torch.add, leaves)
+    reflected, passing, unscattered = reduce(torch.add, leaves)
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles)
+    start = light_field.diffuse.harmonics(medium.degree)
+    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles, start)
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid)
     lost = average_cells(medium).absorption.value * fluence_of(light_field)
     absorbed = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
     entered = reduce(torch.add, enters.values())
-    left = absorbed + (unscattered + scattered).sum(0)
+    left = absorbed + (unscattered + scattered + reflected).sum(0)
 
     def in_units(unit: Tensor) -> dict[str, Any]:
         parts = zip(FACES, unscattered / unit, scattered / unit, strict=True)
+        outside = {} if medium.index == 1 else {"reflected": _plain(reflected.sum(0) / unit)}
         return {
             "enters": {name: _plain(power / unit) for name, power in enters.items()},
+            **outside,
             "absorbed": _plain(absorbed / unit),
             "leaves": {f: {"unscattered": _plain(u), "scattered": _plain(s)} for f, u, s in parts},
         }
@@ -99,27 +109,52 @@ def _plain(values: Tensor) -> float | list[float]:
 
 
 def _cross_box(part: Source, media: Sequence[Medium], angles: int) -> Tensor:
-    """The power of `part` of a light that leaves by each of `FACES`, [1 + media, 6, C].
+    """The power of `part` of a light that goes through `FACES`, [2 + media, 6, C].
 
-    First what would if the box were empty, then what does unscattered in each of the `media`.
+    First what comes in, then what is reflected from outside, and what leaves unscattered in each of
+    the `media`.
     """
+    grid, index = media[0].grid, media[0].index
     if isinstance(part, AmbientLight):
-        grid, radiance = media[0].grid, part.radiance
+        radiance = index**2 * part.radiance
+        passed = 1.0 if index == 1 else transmitted_moments(index)[0]
         sides = [math.prod(grid.extent) / grid.extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
-        empty = math.pi * torch.outer(radiance.new_tensor(sides), radiance).double()
+        falling = math.pi * torch.outer(part.radiance.new_tensor(sides), part.radiance).double()
+        empty = passed * index**2 * falling
         dark = Moments(torch.zeros_like(media[0].extinction.value))
         given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), angles
-        found = [empty, *(empty + _sweep_out(medium, *given) for medium in media)]
-        return torch.stack(torch.broadcast_tensors(*found))
+        start = torch.zeros_like(dark.harmonics(media[0].degree))
+        found = [empty + _sweep_out(medium, *given, start) for medium in media]
+        return torch.stack(torch.broadcast_tensors(empty, falling - empty, *found))
     if isinstance(part, Sky):
         each = zip(part.travel, part.irradiance, strict=True)
         regions = (DirectionalLight(array_order(travel), power) for travel, power in each)
-        return reduce(torch.add, (_follow_out(region, media) for region in regions))
-    return _follow_out(part, media)
+        return reduce(torch.add, (_follow_out(region, media, 0) for region in regions))
+    return _follow_out(part, media, TURNS)
 
 
-def _follow_out(light: Beamed, media: Sequence[Medium]) -> Tensor:
+def _follow_refracted(light: Beamed, media: Sequence[Medium], turns: int) -> Tensor:
+    """The same of a beam where faces refract it, and reflect it inside so often."""
+    assert not isinstance(light, PointLight)
+    powers = list[Tensor]()
+    for beam in enter_faces(media[0].grid, media[0].index, light):
+        assert beam.face is not None and beam.at_face is not None
+        grid, cosine = media[0].grid, array_order(beam.light.direction)[beam.face].abs()
+        area = math.prod(grid.spacing) / grid.spacing[beam.face] * cosine * beam.at_face.sum()
+        entering = (area * beam.light.irradiance).expand(6, -1) / 6
+        outer = reflectance(cosine, media[0].index)
+        found = [entering, outer / (1 - outer) * entering]
+        for medium in media:
+            passages = follow_inside(medium, beam, turns)
+            found.append(reduce(torch.add, (one.released for one in passages)))
+        powers.append(torch.stack(torch.broadcast_tensors(*found)).double())
+    return reduce(torch.add, powers)
+
+
+def _follow_out(light: Beamed, media: Sequence[Medium], turns: int) -> Tensor:
     """The same of a beam, along rays to the middles of cells at faces."""
+    if media[0].index != 1:
+        return _follow_refracted(light, media, turns)
     grid, field, powers = media[0].grid, media[0].extinction.field, list[Tensor]()
     for axis, side in product(range(3), range(2)):
         lines, size = grid.centers(field), list(grid.spacing)
@@ -128,6 +163,7 @@ def _follow_out(light: Beamed, media: Sequence[Medium]) -> Tensor:
         rays, irradiance = _shine_on(light, lines, size, grid)
         outward = (rays.direction[:, axis] * (2 * side - 1)).clamp(min=0)
         leaving, sight = [area * irradiance * outward], look_along(grid, rays, RAY_BY_RAY)
+        leaving.append(torch.zeros_like(leaving[0]))
         for medium in media:
             dark = (), torch.zeros_like(field[:1]), medium.seen, None
             emission = Emission(grid, medium.extinction, medium.scattering, *dark)
@@ -159,27 +195,42 @@ def _shine_on(
 
 
 def _sweep_out(
-    medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None, angles: int
+    medium: Medium,
+    source: Moments,
+    rise: Tensor,
+    inflow: Tensor | None,
+    angles: int,
+    light: Tensor,
 ) -> Tensor:
     """The power [6, C] that leaves by each face, in one sweep, of light that `source` scatters.
 
     `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in an
-    empty box.
+    empty box. Where faces reflect light inside, it's swept until that has come to rest, from
+    `light` [K, C, z, y, x] on.
     """
     grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
     directions, weights, values = sweep_rule(angles, len(moments))
-    power = moments.new_zeros(6, 1, dtype=torch.float64)
-    for direction, weight, row in zip(directions, weights, values.to(moments), strict=True):
-        scatters = torch.tensordot(row, moments, 1)
-        _, leaving = radiance_along(cells, scatters, rise, inflow, direction)
-        course, left = Course.of(grid, direction), leaving.clone()
-        gone = leaving.new_zeros(6, len(leaving), dtype=torch.float64)
-        # What leaves a cell goes on to the next slice, or beyond it, and there beyond other faces.
-        for axis, moved in sorted(enumerate(course.moved), key=lambda one: -abs(one[1])):
-            layer = left.select(1 + axis, -int(moved > 0))
-            gone[2 * axis + (moved > 0)] = abs(moved) * layer.sum((1, 2))
-            layer *= 1 - abs(moved)
-        power = power + 4 * math.pi * weight * math.prod(grid.spacing) / course.step * gone
+    mirror = face_mirror(medium, angles)
+    for sweep in range(1 if mirror is None else SWEEPS):
+        if mirror is not None:
+            mirror.begin(light if sweep == 0 else None)
+        power = moments.new_zeros(6, 1, dtype=torch.float64)
+        rows = values.to(moments)
+        for number, (way, weight) in enumerate(zip(directions, weights, strict=True)):
+            scatters = torch.tensordot(rows[number], moments, 1)
+            ends = None if mirror is None else mirror.entering(number)
+            _, _, gone = radiance_along(cells, scatters, rise, inflow, way, ends=ends)
+            if mirror is not None:
+                mirror.left.append(gone)
+                gone = mirror.released(number)
+            course, part = Course.of(grid, way), 4 * math.pi * weight * math.prod(grid.spacing)
+            for place, (axis, layer) in enumerate(zip(course.axes, gone, strict=True)):
+                moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
+                if not moved:
+                    continue
+                out = part / course.step * abs(moved) * layer.sum(across, dtype=torch.float64)
+                face = torch.arange(6) == 2 * axis + int(moved > 0)
+                power = power + face.to(out.device)[:, None] * out
     return power
 
 
@@ -203,6 +254,11 @@ def lines(report: dict[str, Any]) -> list[str]:
     parts = report["fractions"]
     return [
         *(f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()),
+        *(
+            f"reflected from outside: {text(p, '.2%')}"
+            for n, p in parts.items()
+            if n == "reflected"
+        ),
         f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})",
         *(
             f"leaves by {face}: unscattered {text(part['unscattered'], '.2%')}, "

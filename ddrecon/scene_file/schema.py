@@ -146,6 +146,7 @@ class VolumeSection(MediumSection):
     phase: PhaseSection | None = None  # type: ignore[assignment]
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
+    index: float = bounded(1.0, minimum=1, maximum=4)
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))

@@ -18,13 +18,15 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change
+from ddrecon.diffusion.rounds.mirror import Mirror
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change, sweep_rule
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.slabs.exchange import add_halo
@@ -51,15 +53,25 @@ def run_rounds(
     if rounds == 0:
         return light
     medium, grid = problem.medium, problem.medium.grid
-    light, emitted = _renewed(light, grid), _sweep_emission(medium, degree)
+    glow = face_mirror(medium, degree)
+    light, emitted = _renewed(light, grid), _sweep_emission(medium, degree, glow)
+    mirror = face_mirror(medium, degree, None if emitted is None else glow)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
-        made = _round(problem, light, emitted, solve, degree, round_index, cosine, factor)
+        made = _round(problem, light, emitted, solve, degree, round_index, cosine, factor, mirror)
         light = _renewed(made, grid)
     return light
 
 
-def _sweep_emission(medium: Medium, degree: int) -> Moments | None:
+def face_mirror(medium: Medium, degree: int, besides: Mirror | None = None) -> Mirror | None:
+    """What the faces of `medium` are to sweeps, None where they reflect nothing."""
+    if medium.index == 1:
+        return None
+    directions, _, values = sweep_rule(degree, count_harmonics(medium.degree))
+    return Mirror(medium.grid, medium.index, directions, values, besides)
+
+
+def _sweep_emission(medium: Medium, degree: int, mirror: Mirror | None) -> Moments | None:
     """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
 
     It is the same in all rounds, and swept once: as light of mean 1 that `medium` would scatter
@@ -71,7 +83,7 @@ def _sweep_emission(medium: Medium, degree: int) -> Moments | None:
     emitting = replace(medium, remaining=Coefficient(emission.new_ones(1, 1, 1, 1), emission))
     nothing = torch.zeros_like(medium.extinction.value.detach() * emission.detach())
     even = Moments(torch.ones_like(nothing))
-    return sweep_change(emitting, Moments(nothing), even, None, degree)
+    return sweep_change(emitting, Moments(nothing), even, None, degree, mirror)
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -91,6 +103,7 @@ def _round(
     round_index: int,
     cosine: Tensor,
     factor: Tensor | None,
+    mirror: Mirror | None,
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
@@ -101,7 +114,7 @@ def _round(
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(medium, light, problem.source, inflow, degree)
+    change = sweep_change(medium, light, problem.source, inflow, degree, mirror)
     change = change if emitted is None else change.plus(emitted)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
