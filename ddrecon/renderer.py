@@ -412,15 +412,16 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
         beside = look_behind(rays, given)
-        radiance = rays.direction.new_zeros(1, len(rays.direction)) if beside is None else beside
+        radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
         for window in windows:
             behind = None if given is None else given[:, window.numbers]
             behind = look_behind(Rays(window.points, window.outside, None), behind)
             emission = _emission(light_field, window.sight.rays)
             seen = see_through(window, emission, light_field.diffuse, medium, behind, scene.render)
             colors = max(len(radiance), len(seen))
-            radiance = radiance.expand(colors, -1)
+            radiance = radiance.expand(colors, len(rays.direction))
             radiance = radiance.index_copy(1, window.numbers, seen.expand(colors, -1))
+        radiance = radiance.expand(-1, len(rays.direction))
     if samples > 1:
         radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)
     return radiance.expand(3, -1).unflatten(-1, camera.size)

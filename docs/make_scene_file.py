@@ -61,6 +61,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "resolution": "Cells along x, y and z; those of the field's file where left out.",
             "up": "The axis that the height of a `ground` is measured along.",
+            "index": (
+                "Refractive index inside the box, whose flat faces refract and reflect light; "
+                "outside it is 1. Not with a ground, point lights or cameras inside."
+            ),
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
