@@ -80,8 +80,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    start = light_field.diffuse.harmonics(medium.degree)
-    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles, start)
+    light = light_field.diffuse
+    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles, light)
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid)
     lost = average_cells(medium).absorption.value * fluence_of(light_field)
@@ -122,9 +122,8 @@ def _cross_box(part: Source, media: Sequence[Medium], angles: int) -> Tensor:
         falling = math.pi * torch.outer(part.radiance.new_tensor(sides), part.radiance).double()
         empty = passed * index**2 * falling
         dark = Moments(torch.zeros_like(media[0].extinction.value))
-        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), angles
-        start = torch.zeros_like(dark.harmonics(media[0].degree))
-        found = [empty + _sweep_out(medium, *given, start) for medium in media]
+        given = dark, cell_gradient(dark.mean), radiance.view(-1, 1, 1, 1), angles, dark
+        found = [empty + _sweep_out(medium, *given) for medium in media]
         return torch.stack(torch.broadcast_tensors(empty, falling - empty, *found))
     if isinstance(part, Sky):
         each = zip(part.travel, part.irradiance, strict=True)
@@ -200,20 +199,20 @@ def _sweep_out(
     rise: Tensor,
     inflow: Tensor | None,
     angles: int,
-    light: Tensor,
+    light: Moments,
 ) -> Tensor:
     """The power [6, C] that leaves by each face, in one sweep, of light that `source` scatters.
 
     `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in an
     empty box. Where faces reflect light inside, it's swept until that has come to rest, from
-    `light` [K, C, z, y, x] on.
+    `light` on.
     """
     grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
     directions, weights, values = sweep_rule(angles, len(moments))
     mirror = face_mirror(medium, angles)
     for sweep in range(1 if mirror is None else SWEEPS):
         if mirror is not None:
-            mirror.begin(light if sweep == 0 else None)
+            mirror.begin(light.harmonics(medium.degree) if sweep == 0 else None)
         power = moments.new_zeros(6, 1, dtype=torch.float64)
         rows = values.to(moments)
         for number, (way, weight) in enumerate(zip(directions, weights, strict=True)):

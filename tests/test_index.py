@@ -37,6 +37,10 @@ def within(index: float, density: Tensor, **changes: Any) -> Scene:
     return replace(scene, volume=replace(scene.volume, index=index))
 
 
+def within_one(scene: Scene) -> Scene:
+    return replace(scene, volume=replace(scene.volume, index=1.0))
+
+
 @pytest.mark.parametrize("n", [1.1, 1.4, 2.0])
 def test_fresnel_has_its_closed_forms(n: float) -> None:
     brewster, critical = n / math.hypot(1, n), math.sqrt(1 - 1 / n**2)
@@ -94,8 +98,8 @@ def test_no_power_is_lost_or_made(light: str) -> None:
     density = 0.5 + random_values(6, 7, 5)
     scene = within(1.4, density, **lights, **medium, transport_rounds=12)
     scene = replace(scene, lights=[BeamLight(*BEAM)]) if light == "beam" else scene
-    report = find_balance(scene)
-    assert abs(report["defect_percent"]) < (2.0 if light == "slanted" else 0.7)
+    report, plain = (find_balance(one) for one in (scene, within_one(scene)))
+    assert abs(report["defect_percent"]) < abs(plain["defect_percent"]) + 0.5
     if light == "down":
         assert report["fractions"]["reflected"] == pytest.approx((0.4 / 2.4) ** 2)
     if light == "ambient":
@@ -134,17 +138,19 @@ def test_images_have_tangent_adjoint_and_differences(
     def loss(named: dict[str, Tensor]) -> Tensor:
         return (weights * ddrecon.render(with_values(world, named))).sum()
 
-    for name, value in values.items():
-        shift = random_values(*value.shape, seed=2).view(value.shape) - 0.4
-        leaf = value.clone().requires_grad_()
-        adjoint = (torch.autograd.grad(loss({name: leaf}), leaf)[0] * shift).sum()
-        with forward_ad.dual_level():
-            dual = forward_ad.make_dual(value.clone(), shift)
-            tangent = forward_ad.unpack_dual(loss({name: dual})).tangent
-        with torch.no_grad():
-            up, down = (loss({name: value + step * shift}) for step in (1e-5, -1e-5))
-        torch.testing.assert_close(adjoint, tangent, rtol=1e-10, atol=1e-12)
-        torch.testing.assert_close(adjoint, (up - down) / 2e-5, rtol=2e-5, atol=1e-8)
+    shifts = {n: random_values(*v.shape, seed=2).view(v.shape) - 0.4 for n, v in values.items()}
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    bars = torch.autograd.grad(loss(leaves), list(leaves.values()))
+    adjoint = sum((bar * shifts[n]).sum() for n, bar in zip(names, bars, strict=True))
+    with forward_ad.dual_level():
+        duals = {n: forward_ad.make_dual(v.clone(), shifts[n]) for n, v in values.items()}
+        tangent = forward_ad.unpack_dual(loss(duals)).tangent
+    with torch.no_grad():
+        up, down = (
+            loss({n: v + step * shifts[n] for n, v in values.items()}) for step in (1e-6, -1e-6)
+        )
+    torch.testing.assert_close(adjoint, tangent, rtol=1e-11, atol=0)
+    torch.testing.assert_close(tangent, (up - down) / 2e-6, rtol=1e-6, atol=0)
 
 
 SCENE = """
