@@ -142,7 +142,8 @@ def _follow_refracted(light: Beamed, media: Sequence[Medium], turns: int) -> Ten
         area = math.prod(grid.spacing) / grid.spacing[beam.face] * cosine * beam.at_face.sum()
         entering = (area * beam.light.irradiance).expand(6, -1) / 6
         outer = reflectance(cosine, media[0].index)
-        found = [entering, outer / (1 - outer) * entering]
+        # Of light that only grazes a face nothing enters.
+        found = [entering, outer / (1 - outer).clamp(min=1e-9) * entering]
         for medium in media:
             passages = follow_inside(medium, beam, turns)
             found.append(reduce(torch.add, (one.released for one in passages)))

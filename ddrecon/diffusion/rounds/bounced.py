@@ -54,11 +54,11 @@ def follow_inside(medium: Medium, beam: Confined, most: int = TURNS) -> Iterator
     flows: dict[tuple[int, ...], dict[int, Tensor]] = {
         (1, 1, 1): {place: lay_face(entering, place, course)}
     }
-    strongest = float(entering.detach().max())
+    strongest = float(entering.detach().abs().max())
     for turns in range(most + 1):
         turned: dict[tuple[int, ...], dict[int, Tensor]] = {}
         for signs, ends in flows.items():
-            if max(float(one.detach().max()) for one in ends.values()) <= LEAST * strongest:
+            if max(float(one.detach().abs().max()) for one in ends.values()) < LEAST * strongest:
                 continue
             way = travel * travel.new_tensor(signs)
             course = Course.along(grid, way)
