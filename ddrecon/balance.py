@@ -80,8 +80,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    light = light_field.diffuse
-    scattered = passing - unscattered + _sweep_out(medium, source, rise, None, angles, light)
+    given = rise, None, angles, light_field.diffuse
+    scattered = passing - unscattered + _sweep_out(medium, source, *given)
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid)
     lost = average_cells(medium).absorption.value * fluence_of(light_field)
