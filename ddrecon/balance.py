@@ -19,19 +19,23 @@ from torch import Tensor
 
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.rounds.bounced import TURNS, follow_inside
 from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep_rule
+from ddrecon.diffusion.rounds.transport import face_mirror
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
-from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.reduced import ambient_radiance
+from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
 from ddrecon.medium.coefficients import Medium, keep_medium
+from ddrecon.medium.fresnel import reflectance, transmitted_moments
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
@@ -40,6 +44,8 @@ from ddrecon.settings import RenderSettings
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """Of the box, in array order."""
+SWEEPS = 12
+"""So often light is swept where faces reflect it inside."""
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
@@ -48,10 +54,11 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     """What power `enters` the box of `scene` of each light, is `absorbed` there, and `leaves`.
 
     By each face, as unscattered and as scattered light. What a ground sends up and what the medium
-    emits enters as well; `into_ground` is what of all that leaves falls on the ground. `fractions`
-    are the same of all that enters; `defect_percent` is what enters and neither is absorbed nor
-    leaves. Of one color each is a number, else a list of three. Raises UsageError where no light
-    enters, or where nobody follows light that is scattered.
+    emits enters as well; `into_ground` is what of all that leaves falls on the ground. Where faces
+    refract light, what is `reflected` by them from outside counts as entering, too. `fractions` are
+    the same of all that enters; `defect_percent` is what enters and neither is absorbed nor leaves.
+    Of one color each is a number, else a list of three. Raises UsageError where no light enters, or
+    where nobody follows light that is scattered.
     """
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
     medium, lit = light_field.medium, light_field.ground
@@ -66,27 +73,31 @@ def find_balance(scene: Scene) -> dict[str, Any]:
         crossings["ground"] = box.cross_upwards(ambient)
     if medium.emission is not None:
         crossings["emission"] = box.cross_out()
-    enters = {name: crossing[0].sum((0, 1)) for name, crossing in crossings.items()}
+    enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    _, passing, unscattered = reduce(torch.add, crossings.values())
+    _, outside, passing, unscattered = reduce(torch.add, crossings.values())
+    reflected = outside.sum((0, 1))
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
     rise = cell_gradient(light_field.diffuse.mean + received.mean)
-    scattered = passing - unscattered + box.sweep_out(medium, source, rise)
+    scattered = (
+        passing - unscattered + box.sweep_out(medium, source, rise, light=light_field.diffuse)
+    )
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid, box.up)
     lost = average_cells(medium).absorption.value * fluence_of(light_field, settings)
     absorbed = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
     entered, into_ground = reduce(torch.add, enters.values()), (unscattered + scattered)[0].sum(0)
     unscattered, scattered = unscattered.sum(0), scattered.sum(0)
-    left = absorbed + (unscattered + scattered).sum(0)
+    left = absorbed + reflected + (unscattered + scattered).sum(0)
 
     def in_units(unit: Tensor) -> dict[str, Any]:
         parts = zip(FACES, unscattered / unit, scattered / unit, strict=True)
         return {
             "enters": {name: _plain(power / unit) for name, power in enters.items()},
+            **({} if medium.index == 1 else {"reflected": _plain(reflected / unit)}),
             "absorbed": _plain(absorbed / unit),
             "leaves": {f: {"unscattered": _plain(u), "scattered": _plain(s)} for f, u, s in parts},
             **({"into_ground": _plain(into_ground / unit)} if lit else {}),
@@ -106,8 +117,8 @@ class _Box:
     """A box with the medium as light is followed in it, and as it is, over the ground `lit`.
 
     Power leaves by each of `FACES`, downwards and upwards, [2, 6, C]. Of what crosses the box it is
-    what would leave if that were empty, and what does unscattered in each of the `media`, [3, 2, 6,
-    C]. Sweeps have so many `directions`.
+    what would leave if that were empty, what faces reflect outside, and what leaves unscattered in
+    each of the `media`, [4, 2, 6, C]. Sweeps have so many `directions`.
     """
 
     media: tuple[Medium, Medium]
@@ -122,13 +133,14 @@ class _Box:
     def cross(self, parts: Sequence[Source]) -> Tensor:
         """What crosses of a light, of those of its `parts` that the ground does not hide."""
         parts = stay_above(parts, self.lit.ground.plane) if self.lit else parts
-        crossing = self.media[0].g.new_zeros(3, 2, len(FACES), 1, dtype=torch.float64)
+        crossing = self.media[0].g.new_zeros(4, 2, len(FACES), 1, dtype=torch.float64)
         for part in parts:
             if isinstance(part, AmbientLight):
                 crossing = crossing + self._cross_evenly(part.radiance, (True, self.lit is None))
             elif isinstance(part, Sky):
                 for travel, power in zip(part.travel, part.irradiance, strict=True):
-                    crossing = crossing + self._follow(DirectionalLight(array_order(travel), power))
+                    region = DirectionalLight(array_order(travel), power)
+                    crossing = crossing + self._follow(region, turns=0)
             else:
                 crossing = crossing + self._follow(part)
         return crossing
@@ -150,7 +162,7 @@ class _Box:
         even = torch.ones_like(medium.extinction.value)
         given = Moments(even), cell_gradient(even)
         found = (self.sweep_out(medium.emitting, *given) for medium in self.media)
-        return torch.stack(torch.broadcast_tensors(empty, *found))
+        return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *found))
 
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
         """What crosses of a `radiance` [C] that is the same everywhere: `sides` are down and up."""
@@ -159,17 +171,22 @@ class _Box:
         halves = torch.full((2, len(FACES)), 0.5)
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         parts = (halves * torch.tensor(areas, dtype=torch.float64))[..., None].to(radiance.device)
-        empty, given = math.pi * parts * radiance, (Moments(nothing), cell_gradient(nothing))
-        inflow = radiance.view(-1, 1, 1, 1)
+        falling, given = math.pi * parts * radiance, (Moments(nothing), cell_gradient(nothing))
+        index = self.media[0].index
+        empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
+        inflow = index**2 * radiance.view(-1, 1, 1, 1)
         found = (empty + self.sweep_out(medium, *given, inflow) for medium in self.media)
-        crossing = torch.stack(torch.broadcast_tensors(empty, *found))
+        crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *found))
         return crossing * crossing.new_tensor(sides).view(2, 1, 1)
 
-    def _follow(self, light: Beamed, ambient: Tensor | None = None) -> Tensor:
+    def _follow(self, light: Beamed, ambient: Tensor | None = None, turns: int = TURNS) -> Tensor:
         """What crosses of a beam, along rays to the middles of cells at faces.
 
-        With `ambient` it is that times what the ground sends more than this radiance [C].
+        With `ambient` it is that times what the ground sends more than this radiance [C]. `turns`:
+        how often it is followed on where faces reflect it inside.
         """
+        if self.media[0].index != 1:
+            return self._follow_refracted(light, turns)
         grid, field, powers = self.media[0].grid, self.media[0].extinction.field, list[Tensor]()
         for axis, side in product(range(3), range(2)):
             lines, size = grid.centers(field), list(grid.spacing)
@@ -184,35 +201,70 @@ class _Box:
                 irradiance = irradiance * ((even - ambient)[:, None] + more)
             power = area * irradiance * (travel[:, axis] * (2 * side - 1)).clamp(min=0)
             passing = (power * transmittance(medium, rays, RAY_BY_RAY) for medium in self.media)
-            leaving = torch.stack(torch.broadcast_tensors(power, *passing)).double()
+            leaving = torch.stack(torch.broadcast_tensors(power, 0 * power, *passing)).double()
             is_up = travel[:, self.up] > 0
             powers.append(torch.stack([(leaving * ~is_up).sum(2), (leaving * is_up).sum(2)], 1))
         return torch.stack(powers, 2)
 
+    def _follow_refracted(self, light: Beamed, turns: int) -> Tensor:
+        """What crosses of a beam that faces refract, and reflect inside so often."""
+        assert not isinstance(light, PointLight)
+        powers, (medium, _) = list[Tensor](), self.media
+        for beam in enter_faces(medium.grid, medium.index, light):
+            assert beam.face is not None and beam.at_face is not None
+            cosine, spacing = (
+                array_order(beam.light.direction)[beam.face].abs(),
+                medium.grid.spacing,
+            )
+            area = math.prod(spacing) / spacing[beam.face] * cosine * beam.at_face.sum()
+            entering = (area * beam.light.irradiance).expand(len(FACES), -1) / len(FACES)
+            outer = reflectance(cosine, medium.index)
+            # Of light that only grazes a face nothing enters.
+            found = [entering, outer / (1 - outer).clamp(min=1e-9) * entering]
+            for one in self.media:
+                passages = follow_inside(one, beam, turns)
+                found.append(reduce(torch.add, (each.released for each in passages)))
+            powers.append(torch.stack(torch.broadcast_tensors(*found)).double())
+        power = reduce(torch.add, powers)
+        return torch.stack([power, 0 * power], 1)
+
     def sweep_out(
-        self, medium: Medium, source: Moments, rise: Tensor, inflow: Tensor | None = None
+        self,
+        medium: Medium,
+        source: Moments,
+        rise: Tensor,
+        inflow: Tensor | None = None,
+        light: Moments | None = None,
     ) -> Tensor:
         """The power that leaves in one sweep of light that `source` scatters in `medium`.
 
         `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in
-        an empty box.
+        an empty box. Where faces reflect light inside, it is swept until that has come to rest,
+        from `light` on, None for none.
         """
         grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
         courses, weights, values = sweep_rule(self.directions, len(moments))
-        power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
-        for direction, weight, row in zip(courses, weights, values.to(moments), strict=True):
-            scatters = torch.tensordot(row, moments, 1)
-            _, leaving = radiance_along(cells, scatters, rise, inflow, direction)
-            course, left = Course.of(grid, direction), leaving.clone()
-            gone = leaving.new_zeros(len(FACES), len(leaving), dtype=torch.float64)
-            # What leaves a cell goes on to the next slice, or beyond it, and there beyond other
-            # faces.
-            for axis, moved in sorted(enumerate(course.moved), key=lambda one: -abs(one[1])):
-                layer = left.select(1 + axis, -int(moved > 0))
-                gone[2 * axis + (moved > 0)] = abs(moved) * layer.sum((1, 2))
-                layer *= 1 - abs(moved)
-            gone = 4 * math.pi * weight * math.prod(grid.spacing) / course.step * gone
-            power = power + _split(gone, direction[self.up])
+        mirror, rows = face_mirror(medium, self.directions), values.to(moments)
+        begun = 0 * moments if light is None else light.harmonics(medium.degree)
+        for sweep in range(1 if mirror is None else SWEEPS):
+            if mirror is not None:
+                mirror.begin(begun if sweep == 0 else None)
+            power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
+            for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
+                scatters = torch.tensordot(rows[number], moments, 1)
+                ends = None if mirror is None else mirror.entering(number)
+                _, _, out = radiance_along(cells, scatters, rise, inflow, direction, ends=ends)
+                if mirror is not None:
+                    mirror.left.append(out)
+                    out = mirror.released(number)
+                course, gone = Course.of(grid, direction), power.new_zeros(6, out[0].shape[-3])
+                part = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
+                for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
+                    moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
+                    if moved:
+                        lost = layer.sum(across, dtype=torch.float64)
+                        gone[2 * axis + (moved > 0)] = part * abs(moved) * lost
+                power = power + _split(gone, direction[self.up])
         return power
 
 
@@ -242,6 +294,11 @@ def lines(report: dict[str, Any]) -> list[str]:
     parts = report["fractions"]
     return [
         *(f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()),
+        *(
+            f"reflected from outside: {text(parts[key], '.2%')}"
+            for key in parts
+            if key == "reflected"
+        ),
         f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})",
         *(
             f"leaves by {face}: unscattered {text(part['unscattered'], '.2%')}, "

@@ -7,6 +7,7 @@ target with `up` up. World vectors here are (x, y, z); `cast_rays` hands them on
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,6 +15,9 @@ from torch import Tensor
 
 from ddrecon.grid import Grid, Triple, array_order
 from ddrecon.lenses import distort, ray_through
+
+NEWTON_STEPS = 12
+"""By which a view ray through a pane is found to rounding."""
 
 
 @dataclass(eq=False)
@@ -77,20 +81,54 @@ def rotation(vector: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Pane:
+    """A plane across an array `axis` at `place` [u]; beyond it the refractive index is `index`."""
+
+    axis: int
+    place: float
+    index: float
+
+    def bend(self, eye: Tensor, away: Sequence[Tensor]) -> list[Tensor]:
+        """Where light from an `eye` before the pane comes from in points `away` from it, behind it.
+
+        All along z, y, x: of any length. With t the tangent of the angle before the pane, at the
+        heights H and d before and behind it, Snell's law has the distance across as
+        H t + d t / sqrt(n^2 + (n^2 - 1) t^2).
+        """
+        before = (eye[self.axis] - self.place).abs()
+        behind = away[self.axis].abs() - before
+        square = sum(one**2 for axis, one in enumerate(away) if axis != self.axis)
+        bent, squared = (self.index**2 - 1) * square, self.index**2
+        # By Newton's method, of t over the distance: from 0 up, and it never comes beyond.
+        tangent = torch.zeros_like(square + behind)
+        for step in range(NEWTON_STEPS):
+            # The last step's derivative is that of the implicit function.
+            with torch.set_grad_enabled(torch.is_grad_enabled() and step == NEWTON_STEPS - 1):
+                root = (squared + bent * tangent**2).sqrt()
+                slope = (before + behind * squared / root**3).detach()
+                tangent = tangent - ((before + behind / root) * tangent - 1) / slope
+        inside = tangent / (squared + bent * tangent**2).sqrt()
+        side = away[self.axis].sign()
+        return [-side if axis == self.axis else -inside * one for axis, one in enumerate(away)]
+
+
+@dataclass(frozen=True)
 class Rays:
     """View rays, in array order.
 
     `origin` [R, 3] in u; `direction` [R, 3], of unit length, away from the camera. `eye` [3] is the
-    point that all rays of a perspective camera pass through, None for parallel rays.
+    point that all rays of a perspective camera pass through, None for parallel rays. Rays inside a
+    box that refracts light have passed a `pane` of it since.
     """
 
     origin: Tensor
     direction: Tensor
     eye: Tensor | None
+    pane: Pane | None = None
 
     def select(self, index: Tensor) -> Rays:
         """The rays at `index`."""
-        return Rays(self.origin[index], self.direction[index], self.eye)
+        return Rays(self.origin[index], self.direction[index], self.eye, self.pane)
 
     def towards_eye(self, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
         """Unit directions from the cells of `grid` to the camera: z, y, x, each for `[z, y, x]`.
@@ -102,6 +140,8 @@ class Rays:
             z, y, x = -self.direction[0]
             return z, y, x
         z, y, x = (e - c for e, c in zip(self.eye, grid.centers(self.eye), strict=True))
+        if self.pane is not None:
+            z, y, x = self.pane.bend(self.eye, [-z, -y, -x])
         distance = (z**2 + y**2 + x**2).sqrt().clamp(min=torch.finfo(self.eye.dtype).tiny)
         return z / distance, y / distance, x / distance
 

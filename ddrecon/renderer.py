@@ -21,15 +21,16 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import LIMITERS, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
+from ddrecon.diffusion.rounds.bounced import reflected_light
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
-from ddrecon.diffusion.rounds.transport import run_rounds, sweep_emission
+from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import Plane, light_from_below, stay_above
-from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
+from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_towards
 from ddrecon.light.pairs import TurnedBeam
@@ -48,6 +49,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
 from ddrecon.march.sight import look_through
+from ddrecon.march.windows import look_inside, see_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
 from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
@@ -57,7 +59,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import Slab
+from ddrecon.slabs.slab import Slab, own_slab
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
@@ -124,6 +126,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     it begins with light that goes to and fro on a coarse grid (E5.4).
     """
     volume, sources, settings = cut_volume(scene.volume), scene_sources(scene), scene.diffusion
+    require_refracting(scene)
     if scene.ground is None:
         return _find_light(volume, sources, settings, memory)
     if isinstance(volume.grid, Slab):
@@ -149,6 +152,21 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     below = from_below(*sent).mapped(lambda field: resample(field, volume.grid))
     light_field = _find_light(volume, sources, settings, memory, below)
     return replace(light_field, ground=replace(lit, sent=sent))
+
+
+def require_refracting(scene: Scene) -> None:
+    """Raises UsageError for what is not computed where the volume's faces refract light."""
+    settings, is_there = scene.diffusion, dict[str, bool]()
+    if scene.volume.index != 1:
+        is_there = {
+            "a ground": scene.ground is not None,
+            "point lights": any(isinstance(light, PointLight) for light in scene.lights),
+            "diffusion.scheme: printed": settings.scheme == "printed",
+            "diffusion.model: flux_limited": settings.model == "flux_limited",
+            "--share cells": isinstance(own_slab(scene.volume.grid), Slab),
+        }
+    if lacks := [what for what, is_so in is_there.items() if is_so]:
+        raise UsageError(f"volume.index: there is none with {lacks[0]}")
 
 
 def exchange_grid(grid: Grid) -> Grid:
@@ -177,6 +195,9 @@ def _find_light(
 ) -> LightField:
     """The light of `lights` in `volume`, and of what comes from `below`."""
     medium = _medium_of(volume, settings)
+    if medium.index != 1:
+        # With what faces reflect inside of light that is not yet scattered (E5.8).
+        below = reflected_light(average_cells(medium), lights, medium.degree)
     if not multiply_scatters(medium, settings):
         return follow_unscattered_light(medium, lights, below)
     # The paper's own scheme knows values at centers only.
@@ -189,7 +210,7 @@ def _find_light(
     source = received.source
     if sky is not None:
         source = source.plus(sky.weighted(remaining_moments(cells)))
-    outside = ambient_radiance(lights, cells.g)
+    outside = medium.index**2 * ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(cells, source, outside, settings, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
@@ -232,7 +253,8 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
     mean = mean if sky is None else mean + sky.mean
     if medium.emission is not None and not multiply_scatters(medium, settings):
-        mean = mean + sweep_emission(average_cells(medium), DIRECTIONS[settings.angles]).mean
+        cells, directions = average_cells(medium), DIRECTIONS[settings.angles]
+        mean = mean + sweep_emission(cells, directions, face_mirror(cells, directions)).mean
     return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
 
 
@@ -378,17 +400,34 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
     Behind the volume is the ground, or what is `given` [C, h, w], else the lights.
     """
-    sight = look_through(camera, scene.volume.grid, scene.render)
-    samples = scene.render.samples_per_pixel
-    behind = None
+    samples, medium = scene.render.samples_per_pixel, light_field.medium
     if given is not None:
-        behind = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)
-    elif scene.render.background:
-        behind = _background(scene.lights, sight.rays)
-    if light_field.ground is not None:
-        medium = light_field.medium
-        behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
-    radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
+        given = given.expand(-1, *camera.size).flatten(1).repeat(1, samples)
+
+    def look_behind(rays: Rays, given: Tensor | None) -> Tensor | None:
+        if given is None and scene.render.background:
+            return _background(scene.lights, rays)
+        return given
+
+    if medium.index == 1:
+        sight = look_through(camera, medium.grid, scene.render)
+        behind = look_behind(sight.rays, given)
+        if light_field.ground is not None:
+            behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
+        radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
+    else:
+        rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
+        beside = look_behind(rays, given)
+        radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
+        for window in windows:
+            behind = None if given is None else given[:, window.numbers]
+            behind = look_behind(Rays(window.points, window.outside, None), behind)
+            emission = _emission(light_field, window.sight.rays)
+            seen = see_through(window, emission, light_field.diffuse, medium, behind, scene.render)
+            colors = max(len(radiance), len(seen))
+            radiance = radiance.expand(colors, len(rays.direction))
+            radiance = radiance.index_copy(1, window.numbers, seen.expand(colors, -1))
+        radiance = radiance.expand(-1, len(rays.direction))
     if samples > 1:
         radiance = radiance.unflatten(-1, (samples, -1)).mean(-2)
     return radiance.expand(3, -1).unflatten(-1, camera.size)

@@ -20,6 +20,7 @@ from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import exchange_grid, multiply_scatters
@@ -38,6 +39,7 @@ def needed_terms(scene: Scene) -> list[str]:
         f"phase function {phase.NAME}, mean cosine {means}",
         *_light_terms(scene, is_diffuse),
         *_glow_terms(scene.volume, is_diffuse),
+        *_face_terms(scene.volume.index),
         *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
@@ -63,14 +65,25 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
     parts = {
         "diffusion": not is_fused or (has_slabs and is_diffuse),
         "transport rounds": has_rounds
-        and not has_kernels("transport rounds", is_on_gpu, has_slabs),
+        and (scene.volume.index != 1 or not has_kernels("transport rounds", is_on_gpu, has_slabs)),
         "beams": has_slabs and (has_skies or _has_beams(scene)),
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),
         "pairs of beams": is_diffuse and _has_pairs(medium, scene),
         "phases by cell": medium.is_cellwise,
+        "faces that refract": scene.volume.index != 1,
         "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
     }
     return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
+
+
+def _face_terms(index: float) -> list[str]:
+    if index == 1:
+        return []
+    inside, outside = 1 - transmitted_moments(index)[0], ((index - 1) / (index + 1)) ** 2
+    return [
+        f"refractive index {index:g}: faces reflect {inside:.1%} of diffuse light inside, "
+        f"and {outside:.1%} of light from straight ahead"
+    ]
 
 
 def _glow_terms(volume: Volume, is_diffuse: bool) -> list[str]:

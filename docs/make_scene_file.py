@@ -64,6 +64,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "pixels wide."
             ),
             "up": "The axis along which heights count, those of a `ground` and of `heights`.",
+            "index": (
+                "Refractive index inside the box, whose flat faces refract and reflect light; "
+                "outside it is 1. Not with a ground, point lights or cameras inside."
+            ),
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -426,8 +430,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "
                 "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not "
-                "sought and at most 0.32 in size. It is 5 where a face of the box is half as dense as the mean, or "
-                "where g is below -0.67."
+                "sought and at most 0.32 in size. It is 5 where a face of the box is half as "
+                "dense as the mean, or where g is below -0.67."
             ),
         },
     ),

@@ -24,6 +24,7 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.fresnel import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.ghosts import Ghosts
@@ -55,10 +56,15 @@ class DiffusionProblem:
             return close_medium(self.medium, self.closure)
         return recompute(lambda: self.closure(self.medium.transport_extinction))
 
+    @property
+    def _is_fused(self) -> bool:
+        """Whether kernels find what flows through faces: through those that reflect torch does."""
+        return is_fused() and self.medium.index == 1
+
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E2.7."""
-        if is_fused():
+        if self._is_fused:
             from ddrecon.diffusion.fused.faces import assemble_system
 
             z, y, x, loss, right = assemble_system(
@@ -85,7 +91,7 @@ class DiffusionProblem:
         """
         if not self.has_flux:
             return None
-        if is_fused():
+        if self._is_fused:
             from ddrecon.diffusion.fused.faces import find_flux
 
             return find_flux(
@@ -103,7 +109,7 @@ class DiffusionProblem:
         _, right = self.system
         if flux is None:
             return right + source
-        if is_fused():
+        if self._is_fused:
             from ddrecon.diffusion.fused.faces import spread_flux
 
             return spread_flux(self.medium, self.diffusion, flux, (right, source))
@@ -158,7 +164,7 @@ def _loss_and_source(
     kappa_a + escape, and kappa_s Q0 + escape L, where escape is the part through the box's faces
     and L the radiance `outside`.
     """
-    escape = boundary_loss(diffusion, medium.grid)
+    escape = boundary_loss(diffusion, medium.grid, face_resistance(medium.index))
     loss = medium.absorption.value + escape
     return loss, medium.remaining_scattering * source_mean + escape * outside
 
@@ -166,7 +172,8 @@ def _loss_and_source(
 def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
     """The part along `axis` of div(D kappa_s Q1)."""
     scattered = medium.remaining_scattering * source_flux
-    faces = face_fluxes(None, scattered, diffusion, medium.grid, axis)
+    resistance = face_resistance(medium.index)
+    faces = face_fluxes(None, scattered, diffusion, medium.grid, axis, resistance=resistance)
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
@@ -180,4 +187,5 @@ def axis_flux(
 ) -> Tensor:
     """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
-    return 3 * cell_average(face_fluxes(mean, source, diffusion, medium.grid, axis, outside), axis)
+    given = diffusion, medium.grid, axis, outside, face_resistance(medium.index)
+    return 3 * cell_average(face_fluxes(mean, source, *given), axis)

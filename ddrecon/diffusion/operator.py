@@ -163,15 +163,16 @@ def harmonic_mean(u: Tensor, axis: int) -> Tensor:
     return 2 * a * (b / (a + b))
 
 
-def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
+def boundary_loss(diffusion: Tensor, grid: Grid, resistance: float = 2.0) -> Tensor:
     """What a cell loses through the faces of the box, per unit L0 [1/u] (Marshak, E2.6).
 
-    1 / (h (2 + h / (2 D))) for each such face; `diffusion`: D [u], `[C, z, y, x]`.
+    1 / (h (2 + h / (2 D))) for each such face; `diffusion`: D [u], `[C, z, y, x]`; `resistance`: as
+    of `escape`.
     """
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         for end in (_first, _last):
-            end(loss, axis).add_(escape(end(diffusion, axis), step) / step)
+            end(loss, axis).add_(escape(end(diffusion, axis), step, resistance) / step)
     return loss
 
 
@@ -182,12 +183,14 @@ def face_fluxes(
     grid: Grid,
     axis: int,
     outside: Tensor | None = None,
+    resistance: float = 2.0,
 ) -> Tensor:
     """F = D (-grad L0 + kappa_s Q1) along `axis` on all faces (E2.5 without its 3, and E2.6).
 
     F is linear in three terms; one that is None is zero. `radiance`: L0 [C, z, y, x];
     `source_flux`: the component of kappa_s Q1 along `axis`, same shape; `outside`: the radiance
-    [C, 1, 1, 1] that enters from outside the box, the same from everywhere. `diffusion`: D [u].
+    [C, 1, 1, 1] that enters from outside the box, the same from everywhere. `diffusion`: D [u];
+    `resistance`: as of `escape`.
     Returns an array one entry longer than the cells along `axis`: the faces of the box come first
     and last, and fluxes are positive towards higher indices.
     """
@@ -209,7 +212,7 @@ def face_fluxes(
         # E2.6 for L0 - outside in place of L0
         low, high = low + outside, high - outside
     # E2.6 divides by 2 + h / (2 D); inside, the drive is times the harmonic mean of D (E2.7)
-    into, out = (escape(end(diffusion, axis), step) for end in (_first, _last))
+    into, out = (escape(end(diffusion, axis), step, resistance) for end in (_first, _last))
     return torch.cat([into * low, harmonic_mean(diffusion, axis) * inside, out * high], axis)
 
 
@@ -218,9 +221,12 @@ def cell_average(faces: Tensor, axis: int) -> Tensor:
     return 0.5 * (lower_cells(faces, axis) + upper_cells(faces, axis))
 
 
-def escape(diffusion: Tensor, step: float) -> Tensor:
-    """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E2.6)."""
-    return diffusion / (2 * diffusion + step / 2)
+def escape(diffusion: Tensor, step: float, resistance: float) -> Tensor:
+    """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E2.6).
+
+    `resistance`: in place of the first 2, more where faces reflect light inside (E2.13).
+    """
+    return diffusion / (resistance * diffusion + step / 2)
 
 
 def _first(u: Tensor, axis: int) -> Tensor:

@@ -49,7 +49,7 @@ def scatter_towards(
     if light.flux is None:
         return scatter_once_more(medium, light).mean.clamp(min=0)
     more = recompute(_sum_turned, medium, rays, turned) if turned else None
-    if is_fused() and not medium.is_cellwise:
+    if is_fused() and not medium.is_cellwise and rays.pane is None:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)

@@ -49,17 +49,25 @@ def mean_profile(
     position: Tensor,
     direction: Tensor,
     radius: Tensor,
+    inside: tuple[int, Tensor] | None = None,
 ) -> Tensor:
     """The mean of E5.5 over boxes of `size` around `centers` (along z, y, x), [z, y, x].
 
-    `radius` may differ from box to box.
+    `radius` may differ from box to box. Where the beam has come through a face across an axis, and
+    gone on by [3] for each unit along that, these are `inside`, and `position` is where it met the
+    face.
     """
     travel = normalize(array_order(direction), dim=0)
     offset = [c - p for c, p in zip(centers, array_order(position), strict=True)]
+    if inside is not None:
+        axis, slope = inside
+        offset = [o - s * offset[axis] for o, s in zip(offset, slope, strict=True)]
     along = sum(o * d for o, d in zip(offset, travel, strict=True))
     square = sum((o - along * d) ** 2 for o, d in zip(offset, travel, strict=True))
 
     def sample(shift: Tensor) -> Tensor:
+        if inside is not None:
+            shift = shift - slope * shift[axis]
         # |across + shift|^2, which is linear in the offset but for that of the center
         across = shift - (shift @ travel) * travel
         more = sum(2 * o * s for o, s in zip(offset, across, strict=True))

@@ -19,6 +19,7 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
 from ddrecon.light.profile import profile_in
+from ddrecon.light.refracted import Confined, enter_faces, refract_sky
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
@@ -55,15 +56,31 @@ class Received:
 
 def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
     """The beams of directional, point and beam `lights` in `medium`."""
-    parallel = [light for light in lights if isinstance(light, DirectionalLight)]
+    parallel = _unconfined(medium, lights)
     beams: list[Beam | PointBeam] = [*follow_beams(medium, parallel)] if parallel else []
     for light in lights:
         if isinstance(light, PointLight):
             beams.append(follow_point_light(medium, light))
-        elif isinstance(light, BeamLight):
-            (beam,) = follow_beams(medium, [light.unconfined])
-            beams.append(replace(beam, profile=_profile(medium, light)))
+        for one in _confine(medium, light):
+            (beam,) = follow_beams(medium, [one.light])
+            beams.append(replace(beam, profile=one.profile))
     return tuple(beams)
+
+
+def _confine(medium: Medium, light: Source) -> tuple[Confined, ...]:
+    """The beams of `light` that shine on a part of the box, or on each cell differently."""
+    if medium.index != 1 and isinstance(light, DirectionalLight | BeamLight):
+        return enter_faces(medium.grid, medium.index, light)
+    if isinstance(light, BeamLight):
+        beam = light.position, light.direction, light.radius
+        return (Confined(light.unconfined, profile_in(medium.grid, *beam)),)
+    return ()
+
+
+def _unconfined(medium: Medium, lights: Sequence[Source]) -> list[DirectionalLight]:
+    """Those of `lights` that are the same in all of the box."""
+    everywhere = lights if medium.index == 1 else ()
+    return [light for light in everywhere if isinstance(light, DirectionalLight)]
 
 
 def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Received:
@@ -74,15 +91,14 @@ def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Recei
     backward peaks turn back belongs to the beams of parallel light (E8.11).
     """
     parts = list[Received]()
-    if parallel := [light for light in lights if isinstance(light, DirectionalLight)]:
+    if parallel := _unconfined(cells, lights):
         parts.append(_receive_parallel(cells, parallel, degree))
     for light in lights:
         if isinstance(light, PointLight):
             received = receive_point_light(cells, light, degree)
             parts.append(Received(received.weighted(remaining_moments(cells)), received.mean))
-        elif isinstance(light, BeamLight):
-            found = _receive_parallel(cells, [light.unconfined], degree)
-            parts.append(found.across(_profile(cells, light)))
+        for one in _confine(cells, light):
+            parts.append(_receive_parallel(cells, [one.light], degree).across(one.profile))
     nothing = torch.zeros_like(cells.extinction.value)
     return reduce(Received.plus, parts) if parts else Received(Moments(nothing), nothing)
 
@@ -94,10 +110,6 @@ def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree:
     pairs = [follow_pair(cells, light) for light in lights]
     parts = (Received(one.source(cells), one.along + one.against, one.turned) for one in pairs)
     return reduce(Received.plus, parts)
-
-
-def _profile(medium: Medium, light: BeamLight) -> Tensor:
-    return profile_in(medium.grid, light.position, light.direction, light.radius)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
@@ -129,6 +141,13 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     skies = _lit_skies(lights)
     if not skies:
         return None
+    if medium.index != 1:
+        parts = (
+            attenuate(medium, one.travel, moment_weights(one, degree)).scaled(*[profile] * 3)
+            for sky in skies
+            for one, profile in refract_sky(medium.grid, medium.index, sky)
+        )
+        return reduce(Moments.plus, parts)
     weights = torch.cat([moment_weights(sky, degree) for sky in skies])
     return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
@@ -158,6 +177,10 @@ def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor
 
     total = torch.zeros_like(medium.extinction.value)
     for sky in _lit_skies(skies):
+        if medium.index != 1:
+            for one, profile in refract_sky(medium.grid, medium.index, sky):
+                total = total + profile * recompute(scatter, one.travel[0], one.irradiance[0])
+            continue
         for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
             total = total + recompute(scatter, travel, irradiance)
     return total / (4 * math.pi)

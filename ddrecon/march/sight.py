@@ -48,6 +48,11 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
     It is kept while the camera is there, unless that is varied, and found anew when any of its
     fields is another or has changed.
     """
+    return _look(grid, settings, *parts_of(camera))
+
+
+def parts_of(camera: Camera) -> list[Any]:
+    """By what `camera` is known again, and then its fields."""
     values = [getattr(camera, part.name) for part in fields(camera)]
     # The numbers themselves where an array of NumPy has the same memory: nobody counts its changes.
     shared = tuple(
@@ -55,7 +60,7 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
         for tensor in camera.tensors
         if is_steady(tensor) and not tensor.untyped_storage().resizable()
     )
-    return _look(grid, settings, shared, *values)
+    return [shared, *values]
 
 
 @remember

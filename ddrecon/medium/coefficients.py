@@ -39,7 +39,7 @@ class Volume(Displayed):
 
     What glows has an `emission` >= 0, the radiance that a unit of length adds (E2.11), or is as
     bright as a `black_body` [radiance], whose light it emits as it absorbs: each [C] or
-    [C, z, y, x], or None.
+    [C, z, y, x], or None. `index`: the refractive index inside the box, outside of which it is 1.
     """
 
     grid: Grid
@@ -51,6 +51,7 @@ class Volume(Displayed):
     support: Tensor | None = None
     emission: Tensor | None = None
     black_body: Tensor | None = None
+    index: float = 1.0
 
     def __init__(
         self,
@@ -63,10 +64,11 @@ class Volume(Displayed):
         support: Tensor | None = None,
         emission: Tensor | None = None,
         black_body: Tensor | None = None,
+        index: float = 1.0,
     ):
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
         self.media, self.support = media, support
-        self.emission, self.black_body = emission, black_body
+        self.emission, self.black_body, self.index = emission, black_body, index
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
 
     @property
@@ -124,7 +126,7 @@ class Medium:
     phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
     times a mass, it is the depth x of E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of
     it varies, and None without a peak. `support` is the volume's. `emission` j [C, z, y, x] is the
-    radiance that a unit of length adds (E2.11), None where nothing glows.
+    radiance that a unit of length adds (E2.11), None where nothing glows. `index` is the volume's.
     """
 
     grid: Grid
@@ -139,6 +141,7 @@ class Medium:
     seen: SeenPhase
     support: Tensor | None = None
     emission: Tensor | None = None
+    index: float = 1.0
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -199,7 +202,7 @@ def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> V
     phase = volume.phase
     if phase.cells is not None:
         phase = phase.with_cells(put(phase.cells))
-    return Volume(grid, phase=phase, **fields)
+    return Volume(grid, phase=phase, index=volume.index, **fields)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
@@ -243,17 +246,21 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
         seen=seen,
         support=volume.support,
         emission=_find_emission(volume, absorption),
+        index=volume.index,
     )
 
 
 def _find_emission(volume: Volume, absorption: Coefficient) -> Tensor | None:
-    """j of E2.11: what is given, within the support, or kappa_a times a black body's radiance."""
+    """j of E2.11: what is given, within the support, or kappa_a times a black body's radiance.
+
+    Within a refractive index n that is n^2 times as bright (E2.13).
+    """
     given = volume.emission if volume.black_body is None else volume.black_body
     if given is None:
         return None
     radiance = given if given.ndim == 4 else along_colors(given)
     if volume.black_body is not None:
-        return absorption.value * radiance
+        return absorption.value * (volume.index**2 * radiance)
     emission = radiance.expand(-1, *volume.grid.shape)
     return emission if volume.support is None else emission * volume.support
 

@@ -100,6 +100,8 @@ def is_gray(volume: Volume) -> bool:
 def _medium(volume: Volume) -> dict[str, Any]:
     if volume.emission is not None or volume.black_body is not None:
         raise SceneError("volume: it glows, and Mitsuba's media emit nothing")
+    if volume.index != 1:
+        raise SceneError("volume.index: Mitsuba is not told how faces refract light")
     # In double precision on the CPU; cross sections are [C, z, y, x] or [C, 1, 1, 1].
     density, sigma_a, sigma_s = (
         value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)

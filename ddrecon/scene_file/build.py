@@ -27,12 +27,14 @@ from ddrecon.light.lights import (
     PointLight,
 )
 from ddrecon.march.samplers import choose_steps, greatest_depth
+from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, count_threads, make_room
 from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.renderer import require_refracting
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
@@ -144,6 +146,12 @@ def build_scene(
     scene = Scene(
         volume, lights, views, render, diffusion, optimize, path=scene_file.path, ground=ground
     )
+    try:
+        require_refracting(scene)
+        for view in views if volume.index != 1 else ():
+            look_inside(view.camera, grid, volume.index, render)
+    except UsageError as error:
+        raise scene_file.refused("volume.index", str(error).partition(": ")[2]) from None
     for name, settings in optimize.parameters.items() if optimize else ():
         with problems.collecting():
             scene.starts[name] = _start(scene_file, scene, name, settings)

@@ -121,7 +121,8 @@ class _Medium:
         elif self.tree.may_change(self.prefix + "emission"):
             emission = sigma_a.new_zeros(3)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
-        return replace(medium, emission=emission, black_body=black_body)
+        index = getattr(self.section, "index", 1.0)
+        return replace(medium, emission=emission, black_body=black_body, index=index)
 
 
 def _read_fields(

@@ -185,6 +185,7 @@ class VolumeSection(MediumSection):
     emission: Quantity | None = bounded(None, minimum=0)
     temperature: Density | None = bounded(None, minimum=0)
     effective_radius: Density | None = bounded(None, minimum=0, maximum=100)
+    index: float = bounded(1.0, minimum=1, maximum=4)
     bounds: Bounds | Auto | None = None
     resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))

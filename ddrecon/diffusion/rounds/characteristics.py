@@ -14,12 +14,13 @@ light comes from one neighbor and leaves for the other.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
+from ddrecon.light.shear import cross_grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import Slicing, across
@@ -29,6 +30,10 @@ SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
 Direction = tuple[float, float, float]
 """A unit vector in array order, the way light travels."""
+Ends = tuple[Tensor, Tensor, Tensor]
+"""Light on faces of the box, in the layout of a course: across slices [C, rows, columns], rows
+[slices, C, columns] and columns [slices, C, rows].
+"""
 NEARLY = 1e-9
 """Drifts this near to none or to a whole cell are taken as that: they need no interpolation."""
 
@@ -39,13 +44,14 @@ class Course:
 
     `order`: the array axes, slices first; `forward`: 1 or -1, the way the slice number changes;
     `drift`: by how many rows and columns light moves from one slice to the next, with signs, at
-    most 1; `step`: the length of its path between them [u].
+    most 1; `step`: the length of its path between them [u]. Both are numbers, or tensors of a
+    direction that may be varied.
     """
 
     order: tuple[int, int, int, int]
     forward: int
-    drift: tuple[float, float]
-    step: float
+    drift: tuple[Any, Any]
+    step: Any
 
     @staticmethod
     def of(grid: Grid, direction: Direction) -> Course:
@@ -59,10 +65,22 @@ class Course:
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
         return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), 1 / fastest)
 
+    @staticmethod
+    def along(grid: Grid, direction: Tensor) -> Course:
+        """The same of unit `direction` [3], which may be varied."""
+        slicing, (row, column), step = cross_grid(grid, direction)
+        return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), step)
+
+    @property
+    def axes(self) -> list[int]:
+        """The grid's axes across which the faces of `Ends` lie."""
+        return [dim - 1 for dim in self.order if dim]
+
     @property
     def moved(self) -> list[float]:
         """By how many cells along z, y and x light moves from one slice to the next."""
-        moved = {SLICES: float(self.forward), ROWS: self.drift[0], COLUMNS: self.drift[1]}
+        row, column = map(float, self.drift)
+        moved = {SLICES: float(self.forward), ROWS: row, COLUMNS: column}
         return [moved[self.order.index(1 + axis)] for axis in range(3)]
 
     def lay(self, field: Tensor) -> Tensor:
@@ -86,13 +104,16 @@ def radiance_along(
     inflow: Tensor | None,
     direction: Direction,
     entering: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    ends: Ends | None = None,
+) -> tuple[Tensor, Tensor, Ends]:
     """I along `direction` (E2.9): its mean in each cell, and what leaves it [C, z, y, x].
+
+    And what leaves the box. `ends` is what enters it besides `inflow`.
 
     `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
     `medium` adds (1 - f) kappa_s a unit length; `gradient` [3, C, z, y, x]: by how much q rises
     from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
-    which what leaves cells is counted. In a slab both are those of its own cells; `entering` is
+    which what leaves is counted. In a slab both are those of its own cells; `entering` is
     what leaves the layer before these, as the neighbor has it.
     """
     grid = medium.grid
@@ -126,32 +147,40 @@ def radiance_along(
                 torch.cat([first, part][::way], dim)
                 for first, part in zip(more, (passed, source), strict=True)
             )
-    arriving, leaving = follow(passed, source, course)
+    arriving, leaving, gone = follow(passed, source, course, ends)
     if isinstance(grid, Slab) and way and entering is not None:
         arriving, leaving = (
             part.narrow(dim, int(way > 0), grid.size) for part in (arriving, leaving)
         )
     found = course.lift(torch.addcmul(own, arriving, phi))
-    return found if inflow is None else found + inflow, course.lift(leaving)
+    return found if inflow is None else found + inflow, course.lift(leaving), gone
 
 
-def follow(passed: Tensor, source: Tensor, course: Course) -> tuple[Tensor, Tensor]:
+def follow(
+    passed: Tensor, source: Tensor, course: Course, ends: Ends | None = None
+) -> tuple[Tensor, Tensor, Ends]:
     """I_in, where rays enter a slice, and I_out = `passed` I_in + `source`, slice after slice.
 
-    `[slices, C, rows, columns]`; I is zero before the first slice and beyond the faces of the box.
+    `[slices, C, rows, columns]`; and what leaves the box. Through its faces enters what is at the
+    `ends`, None for nothing.
     """
-    rows, columns = course.drift
-    # A row and a column of zeros where light comes from.
-    zeros = int(columns > 0), int(columns < 0), int(rows > 0), int(rows < 0)
-    entered, left, arriving = [], [], torch.zeros_like(source[0])
-    for share, more in list(zip(passed.unbind(), source.unbind(), strict=True))[:: course.forward]:
+    first = torch.zeros_like(source[0])
+    across, *sides = ends or (first, first[:, 0], first[:, :, 0])
+    entered, left, gone = list[Tensor](), list[Tensor](), (list[Tensor](), list[Tensor]())
+    arriving = across
+    order = range(len(source))[:: course.forward]
+    for k in order:
         entered.append(arriving)
-        left.append(torch.addcmul(more, share, arriving))
-        arriving = pad(left[-1], zeros)
-        for dim, drift in ((1, rows), (2, columns)):
+        arriving = torch.addcmul(source[k], passed[k], arriving)
+        left.append(arriving)
+        # Part of each row goes on to the next and of the last leaves the box; so of columns.
+        for dim, (side, beyond, drift) in enumerate(zip(sides, gone, course.drift, strict=True), 1):
             if drift:
-                low, high = (arriving.narrow(dim, i, more.shape[dim]) for i in (0, 1))
-                here, behind = (high, low) if drift > 0 else (low, high)
-                arriving = torch.lerp(here, behind, abs(drift))
-    arriving, leaving = (torch.stack(each[:: course.forward]) for each in (entered, left))
-    return arriving, leaving
+                way, size = 1 if drift > 0 else -1, arriving.shape[dim]
+                beyond.append(arriving.select(dim, size - 1 if drift > 0 else 0))
+                kept = arriving.narrow(dim, int(drift < 0), size - 1)
+                edge = (side if ends is None else side[k]).unsqueeze(dim)
+                arriving = torch.lerp(arriving, torch.cat([edge, kept][::way], dim), abs(drift))
+    rows, columns = (torch.stack(one[:: course.forward]) if one else first for one in gone)
+    arrived, leaving = (torch.stack(one[:: course.forward]) for one in (entered, left))
+    return arrived, leaving, (arriving, rows, columns)

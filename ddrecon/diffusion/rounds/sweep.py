@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.diffusion.rounds.characteristics import Course, Direction, radiance_along
+from ddrecon.diffusion.rounds.characteristics import Course, Direction, Ends, radiance_along
+from ddrecon.diffusion.rounds.mirror import Mirror
 from ddrecon.engine import has_kernels
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -42,13 +43,19 @@ def count_directions(degree: int, rounds: int) -> int:
 
 
 def sweep(
-    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, directions: int
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    directions: int,
+    mirror: Mirror | None = None,
 ) -> Tensor:
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `gradient` [3, C, z, y, x]:
     of the first, as of `cell_gradient`; `inflow`: light from
-    outside, as of `radiance_along`; `directions`: how many (`count_directions`).
+    outside, as of `radiance_along`; `directions`: how many (`count_directions`); `mirror`: what
+    faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
     courses, weights, values = sweep_rule(directions, count)
@@ -63,14 +70,17 @@ def sweep(
     moments = source.new_zeros(count, colors * math.prod(shape))
 
     def add(number: int, entering: Tensor) -> Tensor:
-        row = values[number]
+        row, ends = values[number], None if mirror is None else mirror.entering(number)
 
-        def follow() -> tuple[Tensor, Tensor]:
+        def follow() -> tuple[Tensor, Tensor, Ends]:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            return radiance_along(medium, scatters, gradient, inflow, courses[number], entering)
+            way = courses[number]
+            return radiance_along(medium, scatters, gradient, inflow, way, entering, ends)
 
-        radiance, leaving = recompute(follow)
+        radiance, leaving, gone = recompute(follow)
+        if mirror is not None:
+            mirror.left.append(gone)
         moments.addr_(weights[number] * row, radiance.flatten())
         return leaving.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
 
@@ -113,12 +123,16 @@ def _pass_on(
 
 
 def sweep_change(
-    medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, directions: int
+    medium: Medium,
+    light: Moments,
+    source: Moments,
+    inflow: Tensor | None,
+    directions: int,
+    mirror: Mirror | None = None,
 ) -> Moments:
     """By how much the first two moments of light change in a sweep, and those of higher degree.
 
-    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). `inflow` and `directions` as of
-    `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). What follows is as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
@@ -126,7 +140,7 @@ def sweep_change(
         factors = factors[: medium.degree + 1]
     gradient = cell_gradient(light.mean + source.mean)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    if is_fused() and has_kernels("transport rounds", *where):
+    if mirror is None and is_fused() and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
@@ -135,8 +149,18 @@ def sweep_change(
             factors = torch.zeros_like(factors[..., :1, :1, :1])
         return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    swept = Moments.of_harmonics(sweep(medium, scatters, gradient, inflow, directions))
-    return swept.plus(replace(light, higher=None).scaled(-1.0, -1.0))
+    if mirror is not None:
+        mirror.begin(_without(light.harmonics(medium.degree), inflow))
+    swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
+    if mirror is not None:
+        mirror.end(_without(swept, inflow))
+    change = Moments.of_harmonics(swept)
+    return change.plus(replace(light, higher=None).scaled(-1.0, -1.0))
+
+
+def _without(light: Tensor, inflow: Tensor | None) -> Tensor:
+    """`light` [K, C, z, y, x] less what enters without a medium."""
+    return light if inflow is None else torch.cat([light[:1] - inflow, light[1:]])
 
 
 def cell_gradient(q: Tensor) -> Tensor:

@@ -18,13 +18,15 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import count_directions, sweep_change
+from ddrecon.diffusion.rounds.mirror import Mirror
+from ddrecon.diffusion.rounds.sweep import count_directions, sweep_change, sweep_rule
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.decay import decay_terms
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.slabs.exchange import add_halo
@@ -52,15 +54,27 @@ def run_rounds(
         return light
     medium, grid = problem.medium, problem.medium.grid
     directions, light = count_directions(degree, rounds), _renewed(light, grid)
-    emitted = None if medium.emission is None else sweep_emission(medium, directions)
+    emitted, glow = None, face_mirror(medium, directions)
+    if medium.emission is not None:
+        emitted = sweep_emission(medium, directions, glow)
+    mirror = face_mirror(medium, directions, None if emitted is None else glow)
     for round_index, factor in enumerate(_blending(medium, rounds), 1):
         cosine = _flux_factor(medium, round_index == rounds)
-        made = _round(problem, light, emitted, solve, directions, round_index, cosine, factor)
+        given = round_index, cosine, factor, mirror
+        made = _round(problem, light, emitted, solve, directions, *given)
         light = _renewed(made, grid)
     return light
 
 
-def sweep_emission(medium: Medium, directions: int) -> Moments:
+def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:
+    """What the faces of `medium` are to sweeps, None where they reflect nothing."""
+    if medium.index == 1:
+        return None
+    courses, _, values = sweep_rule(directions, count_harmonics(medium.degree))
+    return Mirror(medium.grid, medium.index, courses, values, besides)
+
+
+def sweep_emission(medium: Medium, directions: int, mirror: Mirror | None = None) -> Moments:
     """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
 
     It is the same in all rounds, and swept once. Like kappa_a, j is even within cells.
@@ -68,7 +82,7 @@ def sweep_emission(medium: Medium, directions: int) -> Moments:
     emitting = medium.emitting
     nothing = torch.zeros_like(medium.extinction.value.detach() * emitting.remaining.value.detach())
     even = Moments(torch.ones_like(nothing))
-    return sweep_change(emitting, Moments(nothing), even, None, directions)
+    return sweep_change(emitting, Moments(nothing), even, None, directions, mirror)
 
 
 def _renewed(light: Moments, grid: Grid) -> Moments:
@@ -88,6 +102,7 @@ def _round(
     round_index: int,
     cosine: Tensor,
     factor: Tensor | None,
+    mirror: Mirror | None,
 ) -> Moments:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
@@ -98,7 +113,7 @@ def _round(
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(medium, light, problem.source, inflow, directions)
+    change = sweep_change(medium, light, problem.source, inflow, directions, mirror)
     change = change if emitted is None else change.plus(emitted)
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None

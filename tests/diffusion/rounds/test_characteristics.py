@@ -45,7 +45,7 @@ def test_slices_at_once_are_cells_one_by_one(direction):
     grid = box_grid((3, 4, 5))
     medium, scatters = medium_of(4 * random_values(3, 4, 5), grid), random_source(grid)
     even = random_values(*grid.shape, seed=2)
-    found, _ = radiance_along(medium, scatters, cell_gradient(even[None]), outside(0.3), direction)
+    found, *_ = radiance_along(medium, scatters, cell_gradient(even[None]), outside(0.3), direction)
     expected = by_cells(medium, scatters[0], even, direction, 0.3)
     torch.testing.assert_close(found[0], expected, rtol=1e-12, atol=0)
 
@@ -71,7 +71,7 @@ def test_along_an_axis_a_linear_source_follows_the_closed_form(axis: int, sign: 
         (line if sign > 0 else line.flip(0)).view(layout).expand(grid.shape) for line in lines
     )
     direction = tuple(float(sign * (a == axis)) for a in range(3))
-    found, _ = radiance_along(
+    found, *_ = radiance_along(
         medium, scatters[None], cell_gradient(scatters[None]), None, direction
     )
     torch.testing.assert_close(found[0], expected, rtol=1e-9, atol=0)
@@ -83,7 +83,7 @@ def test_a_white_medium_in_a_white_room_stays_white(direction):
     medium = medium_of(30 * half_empty(5, 4, 6), grid, albedo=1.0, colors=3)
     room = outside(2, 3, 5)
     white = room.expand(3, *grid.shape)
-    found, leaving = radiance_along(medium, white, cell_gradient(white), room, direction)
+    found, leaving, _ = radiance_along(medium, white, cell_gradient(white), room, direction)
     torch.testing.assert_close(found, white, rtol=1e-13, atol=0)
     torch.testing.assert_close(leaving, torch.zeros_like(white), rtol=0, atol=1e-13)
 
@@ -95,7 +95,7 @@ def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: flo
     grid = box_grid((4, 5, 3))
     medium = medium_of(thickness * half_empty(4, 5, 3), grid)
     scatters, room = random_source(grid), outside(0.7)
-    mean, leaving = radiance_along(medium, scatters, cell_gradient(scatters), room, direction)
+    mean, leaving, _ = radiance_along(medium, scatters, cell_gradient(scatters), room, direction)
     speed = [c / h for c, h in zip(direction, grid.spacing, strict=True)]
     fastest = max(map(abs, speed))
     # the part of what leaves a cell that goes on to others
@@ -116,8 +116,8 @@ def test_what_a_cell_is_to_another_this_is_to_it_on_the_way_back(direction):
     medium, one = medium_of(6 * half_empty(4, 5, 3), grid), random_source(grid)
     other, even = one.flip(2), torch.zeros(3, *one.shape, dtype=torch.float64)
     back = tuple(-c for c in direction)
-    there, _ = radiance_along(medium, one, even, None, direction)
-    here, _ = radiance_along(medium, other, even, None, back)
+    there, *_ = radiance_along(medium, one, even, None, direction)
+    here, *_ = radiance_along(medium, other, even, None, back)
     strength = medium.remaining.value
     torch.testing.assert_close(
         (strength * other * there).sum(), (strength * one * here).sum(), rtol=1e-13, atol=0
@@ -171,7 +171,7 @@ def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int
     def radiance(density: Tensor, g: Tensor, scatters: Tensor, inflow: Tensor) -> Tensor:
         extinction = density.new_tensor([3.0, 9.0, 20.0][:colors])
         medium = scale_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
-        return radiance_along(medium, scatters, cell_gradient(scatters), inflow, direction)
+        return radiance_along(medium, scatters, cell_gradient(scatters), inflow, direction)[:2]
 
     assert torch.autograd.gradcheck(
         radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True

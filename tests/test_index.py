@@ -1,0 +1,184 @@
+"""A refractive index inside the box: closed forms, no light lost or made, derivatives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+from torch import Tensor
+from torch.autograd import forward_ad
+
+import ddrecon
+from ddrecon.balance import find_balance
+from ddrecon.cameras import Pane
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.light.lights import BeamLight
+from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transmitted_moments
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+BEAM = (
+    torch.tensor([0.1, 2.0, 0.0], dtype=torch.float64),
+    torch.tensor([-0.2, -2.0, 0.1], dtype=torch.float64),
+    torch.tensor([2.0], dtype=torch.float64),
+    torch.tensor(0.3, dtype=torch.float64),
+)
+
+
+def within(index: float, density: Tensor, **changes: Any) -> Scene:
+    """A scene of `make_scene` in a box of that `index`."""
+    scene = make_scene(density, **changes)
+    return replace(scene, volume=replace(scene.volume, index=index))
+
+
+def within_one(scene: Scene) -> Scene:
+    return replace(scene, volume=replace(scene.volume, index=1.0))
+
+
+@pytest.mark.parametrize("n", [1.1, 1.4, 2.0])
+def test_fresnel_has_its_closed_forms(n: float) -> None:
+    brewster, critical = n / math.hypot(1, n), math.sqrt(1 - 1 / n**2)
+    cosines = torch.tensor([1.0, brewster, critical, critical / 2], dtype=torch.float64)
+    polarized = ((n**2 - 1) / (n**2 + 1)) ** 2 / 2
+    expected = cosines.new_tensor([((n - 1) / (n + 1)) ** 2, polarized, 1.0, 1.0])
+    torch.testing.assert_close(reflectance(cosines, n), expected, rtol=1e-6, atol=0)
+    # Into the box and out of it again; and what comes in of even light is n^2 times what goes out.
+    way = torch.nn.functional.normalize(cosines[:3], dim=0)
+    normal = cosines.new_tensor([0.0, 1.0, 0.0])
+    torch.testing.assert_close(refract(refract(way, normal, 1 / n), normal, n), way)
+    outside = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
+    inside = (1 - (1 - outside**2) / n**2).sqrt()
+    entering = 2 * (outside * (1 - reflectance(inside, n))).mean()
+    assert float(entering) == pytest.approx(n**2 * transmitted_moments(n)[0], rel=1e-6)
+
+
+def test_a_pane_bends_light_by_snells_law() -> None:
+    eye = torch.tensor([0.3, 2.0, -0.2], dtype=torch.float64)
+    pane, point = Pane(1, 0.6, 1.4), torch.tensor([-1.5, -0.4, 0.7], dtype=torch.float64)
+    way = torch.nn.functional.normalize(torch.stack(pane.bend(eye, [*(point - eye)])), dim=0)
+    out = refract(way, eye.new_tensor([0.0, 1.0, 0.0]), 1.4)
+    met = point + (0.6 - point[1]) / way[1] * way
+    torch.testing.assert_close(met + (2.0 - 0.6) / out[1] * out, eye)
+
+
+@pytest.mark.parametrize("changes", [{}, {"g": 0.6, "transport_rounds": 2, "degree": 5}])
+def test_an_index_of_nearly_one_changes_nearly_nothing(changes: dict[str, Any]) -> None:
+    density, down = random_values(4, 5, 6), (0.0, -1.0, 0.0)
+    one, other = (
+        within(n, density, travel=down, ambient=(0.3,), **changes) for n in (1.0, 1 + 1e-9)
+    )
+    torch.testing.assert_close(ddrecon.render(other), ddrecon.render(one), rtol=1e-5, atol=1e-6)
+    assert face_resistance(1 + 1e-9) == pytest.approx(2, rel=1e-6)
+
+
+@pytest.mark.parametrize("changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}])
+def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any]) -> None:
+    medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "directional": None, "ambient": (0.7,)}
+    camera = make_camera((0.0, 0.0, 2.5), is_perspective=False)
+    scene = within(1.4, random_values(5, 4, 6), camera=camera, **medium, **changes)
+    expected = torch.full((1, 5, 4, 6), 4 * math.pi * 0.7 * 1.4**2, dtype=torch.float64)
+    torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
+    seen = ddrecon.render(scene)
+    passed = 1 - (0.4 / 2.4) ** 2
+    torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("light", ["down", "slanted", "ambient", "beam"])
+def test_no_power_is_lost_or_made(light: str) -> None:
+    travel = (0.0, -1.0, 0.0) if light == "down" else (-2.0, -2.1, -1.0)
+    lights: dict[str, Any] = {"travel": travel, "directional": (3.0,)}
+    lights = {"directional": None, "ambient": (1.0,)} if light == "ambient" else lights
+    medium = {"sigma_a": (1.0,), "sigma_s": (4.0,), "g": 0.3, "degree": 5}
+    density = 0.5 + random_values(6, 7, 5)
+    scene = within(1.4, density, **lights, **medium, transport_rounds=12)
+    scene = replace(scene, lights=[BeamLight(*BEAM)]) if light == "beam" else scene
+    report, plain = (find_balance(one) for one in (scene, within_one(scene)))
+    assert abs(report["defect_percent"]) < abs(plain["defect_percent"]) + 0.5
+    if light == "down":
+        assert report["fractions"]["reflected"] == pytest.approx((0.4 / 2.4) ** 2)
+    if light == "ambient":
+        outer = 1 - 1.4**2 * transmitted_moments(1.4)[0]
+        assert report["fractions"]["reflected"] == pytest.approx(outer)
+
+
+def test_layers_reflect_and_transmit_as_by_adding_and_doubling() -> None:
+    iadpython = pytest.importorskip("iadpython", reason="adding and doubling is an extra (`dev`)")
+    grid = Grid((1, 24, 1), (-500.0, -0.5, -500.0), (500.0, 0.5, 500.0))
+    changes = {"sigma_a": (0.5,), "sigma_s": (0.5,), "g": 0.9, "grid": grid, "degree": 5}
+    density, sun = torch.ones(grid.shape, dtype=torch.float64), {"travel": (0.0, -1.0, 0.0)}
+    scene = within(1.4, density, **changes, **sun, transport_rounds=8)
+    leaves, found = (report := find_balance(scene)["fractions"])["leaves"], []
+    for face, more in (("+y", report["reflected"]), ("-y", 0.0)):
+        found.append(more + leaves[face]["unscattered"] + leaves[face]["scattered"])
+    expected = iadpython.Sample(a=0.5, b=1, g=0.9, n=1.4, quad_pts=32).rt()[:2]
+    assert found == pytest.approx([float(one) for one in expected], abs=0.003)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+@pytest.mark.parametrize("rounds", [{}, {"transport_rounds": 2, "degree": 3}], ids=str)
+def test_images_have_tangent_adjoint_and_differences(
+    is_perspective: bool, rounds: dict[str, Any]
+) -> None:
+    camera = make_camera((0.9, 1.3, 2.5), is_perspective=is_perspective)
+    density = 0.2 + random_values(4, 5, 6)
+    world = within(1.4, density, ambient=(0.3,), camera=camera, g=0.5, **rounds)
+    world = replace(world, lights=[*world.lights, BeamLight(*BEAM)])
+    lights = [f"lights.0.{name}" for name in vars(world.lights[0])]
+    lights += [f"lights.2.{name}" for name in vars(world.lights[2])]
+    names = ["density", "sigma_a", "sigma_s", "g", "views.view.camera", *lights]
+    values = {name: value_of(world, name) for name in names}
+    weights = random_values(1, 3, *camera.size, seed=1)
+
+    def loss(named: dict[str, Tensor]) -> Tensor:
+        return (weights * ddrecon.render(with_values(world, named))).sum()
+
+    shifts = {n: random_values(*v.shape, seed=2).view(v.shape) - 0.4 for n, v in values.items()}
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    bars = torch.autograd.grad(loss(leaves), list(leaves.values()))
+    adjoint = sum((bar * shifts[n]).sum() for n, bar in zip(names, bars, strict=True))
+    with forward_ad.dual_level():
+        duals = {n: forward_ad.make_dual(v.clone(), shifts[n]) for n, v in values.items()}
+        tangent = forward_ad.unpack_dual(loss(duals)).tangent
+    with torch.no_grad():
+        up, down = (
+            loss({n: v + step * shifts[n] for n, v in values.items()}) for step in (1e-6, -1e-6)
+        )
+    torch.testing.assert_close(adjoint, tangent, rtol=1e-11, atol=0)
+    torch.testing.assert_close(tangent, (up - down) / 2e-6, rtol=1e-6, atol=0)
+
+
+SCENE = """
+volume: {{density: 1, sigma_a: 1, sigma_s: 1, index: 1.4, resolution: [2, 2, 2],
+  bounds: {{min: [-1, -1, -1], max: [1, 1, 1]}}}}
+lights: [{light}]
+{more}
+views: [{{name: v, camera: {{type: perspective, origin: [0, 0, {away}], target: [0, 0, 0], fov: 30,
+  resolution: [4, 4]}}}}]
+"""
+SUN = "{type: directional, direction: [0, -1, 0], irradiance: 1}"
+LAMP = "{type: point, position: [0, 3, 0], intensity: 1}"
+REFUSED = {
+    "a camera inside": (SUN, "", 0.5),
+    "point lights": (LAMP, "", 4),
+    "a ground": (SUN, "ground: {height: -1, albedo: 0.3}", 4),
+    "diffusion.scheme: printed": (SUN, "diffusion: {scheme: printed}", 4),
+    "diffusion.model: flux_limited": (SUN, "diffusion: {model: flux_limited}", 4),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_not_computed_is_refused_in_one_line(what: str, tmp_path: Path) -> None:
+    light, more, away = REFUSED[what]
+    path = tmp_path / "scene.yaml"
+    path.write_text(SCENE.format(light=light, more=more, away=away))
+    with pytest.raises(SceneError) as caught:
+        ddrecon.load_scene(path)
+    message = str(caught.value)
+    assert message.count("\n") == 0
+    assert "2:" in message and "volume.index" in message and what.split()[-1] in message
