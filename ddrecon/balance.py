@@ -29,8 +29,8 @@ from ddrecon.light.moments import Moments
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.profile import mean_profile, seen_radius
 from ddrecon.light.sky import Sky, Source, decompose_lights
-from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.periods import absorb
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Medium, keep_medium
 from ddrecon.medium.remaining import remaining_moments
@@ -129,9 +129,7 @@ def _follow_out(light: Beamed, media: Sequence[Medium]) -> Tensor:
         outward = (rays.direction[:, axis] * (2 * side - 1)).clamp(min=0)
         leaving, sight = [area * irradiance * outward], look_along(grid, rays, RAY_BY_RAY)
         for medium in media:
-            dark = (), torch.zeros_like(field[:1]), medium.seen, None
-            emission = Emission(grid, medium.extinction, medium.scattering, *dark)
-            seen = march(emission, sight, RAY_BY_RAY, torch.ones_like(outward[None]))
+            seen = march(absorb(medium), sight, RAY_BY_RAY, torch.ones_like(outward[None]))
             leaving.append(leaving[0] * seen)
         powers.append(torch.stack(torch.broadcast_tensors(*leaving)).sum(2, dtype=torch.float64))
     return torch.stack(powers, 1)

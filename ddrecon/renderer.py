@@ -7,6 +7,7 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -46,12 +47,14 @@ from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.emission import Emission
 from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
+from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
 from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.periods import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -81,6 +84,19 @@ class LightField:
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
+
+    @functools.cached_property
+    def unrolled(self) -> tuple[Unrolled, LightField]:
+        """What view rays meet on their way through one period of the medium."""
+        period = unroll(self.medium.grid, HALO)
+        if not self.medium.grid.periodic:
+            return period, self
+        beams = (replace(beam, mass=period.extend(beam.mass)) for beam in self.beams)
+        turned = (replace(one, radiance=period.extend(one.radiance)) for one in self.turned)
+        medium = self.medium.put(period.wide, period.extend)
+        light = self.diffuse.mapped(period.extend)
+        wide = replace(self, medium=medium, beams=tuple(beams), diffuse=light, turned=tuple(turned))
+        return period, wide
 
 
 @dataclass(frozen=True)
@@ -247,6 +263,7 @@ def _glow(
     scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
     if not medium.is_cellwise:
         scattered = (1 - medium.forward_fraction) * scattered
+    scattered = light_field.unrolled[0].extend(scattered)
 
     def glow(rays: Rays, number: int) -> Emission:
         emission = _emission(others, rays)
@@ -391,18 +408,19 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11)."""
-    medium = light_field.medium
-    diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
+    period, wide = light_field.unrolled
+    medium = wide.medium
+    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned)
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
-        diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
+        diffuse = diffuse + scatter_sky(light_field.medium, light_field.skies, towards, period)
     if light_field.has_means:
         diffuse = sharpen(medium, diffuse)
-    return Emission(
+    emission = Emission(
         medium.grid,
         medium.extinction,
         medium.scattering,
-        light_field.beams,
+        wide.beams,
         diffuse,
         medium.seen,
         medium.peak,
@@ -410,6 +428,14 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.support,
         medium.emission,
     )
+    if not light_field.medium.grid.periodic:
+        return emission
+    depends = light_field.diffuse.flux is not None or light_field.skies
+
+    def from_eye(eye: Tensor) -> Emission:
+        return _emission(light_field, replace(bundle, eye=eye))
+
+    return replace(emission, period=period, from_eye=from_eye if depends else None)
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor | None:

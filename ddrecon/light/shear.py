@@ -21,6 +21,7 @@ from torch.nn.functional import pad
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.slabs.exchange import add_halo, sum_before
@@ -46,6 +47,10 @@ def sum_masses(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
+    if grid.periodic:
+        parts = [_sum_unrolled(field, grid, one, bound) for one in directions.split(1)]
+        masses, steps = zip(*parts, strict=True)
+        return torch.cat(masses), torch.cat(steps)
     if is_fused_whole(grid, directions):
         from ddrecon.light.fused import shear
 
@@ -59,6 +64,15 @@ def sum_masses(
         masses.append(torch.cat([entered for entered, _ in each]))
         steps.append(each[0][1])
     return torch.stack(masses), torch.stack(steps)
+
+
+def _sum_unrolled(
+    field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """What `sum_masses` returns, of one beam [1, 3] through periods."""
+    period = unroll_along(grid, direction[0])
+    masses, steps = sum_masses(period.extend(field), period.wide, direction, bound)
+    return period.crop(masses), steps
 
 
 def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:

@@ -22,6 +22,7 @@ from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.periods import absorb
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
@@ -118,12 +119,8 @@ def _rays_against(grid: Grid, points: Tensor, travel: Tensor) -> Rays:
 
 def _passed(medium: Medium, rays: Rays, settings: RenderSettings) -> Tensor:
     """The transmittance [C, R] of `medium` along all of `rays`."""
-    extinction, dark = medium.extinction, torch.zeros_like(medium.extinction.field[:1])
-    absorbing = Emission(
-        medium.grid, extinction, extinction, (), dark, medium.seen, None, support=medium.support
-    )
-    one = dark.new_ones(1, len(rays.direction))
-    return march(absorbing, look_along(medium.grid, rays, settings), settings, one)
+    one = rays.direction.new_ones(1, len(rays.direction))
+    return march(absorb(medium), look_along(medium.grid, rays, settings), settings, one)
 
 
 def _direct_irradiance(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -173,6 +173,27 @@ class Medium:
     def is_anisotropic(self) -> bool:
         """Whether the phase function differs from that of isotropic scattering, or may come to."""
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
+
+    def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
+        """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
+        names = "extinction", "scattering", "remaining", "absorption"
+        fields = {name: getattr(self, name).field for name in names}
+        # A field that coefficients share, they share there as well.
+        moved = {id(field): put(field) for field in fields.values()}
+        changed: dict[str, Any] = {
+            name: replace(getattr(self, name), field=moved[id(field)])
+            for name, field in fields.items()
+        }
+        cellwise = "g", "mean_cosine", "forward_fraction"
+        names = ("support", "emission", "peak", *(cellwise if self.is_cellwise else ()))
+        for name in names:
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape[-3:]) == self.grid.shape:
+                changed[name] = put(value)
+        if self.is_cellwise:
+            phase = self.seen.phase
+            changed["seen"] = SeenPhase(phase.with_cells(put(phase.cells)), self.seen.degree)
+        return replace(self, grid=grid, **changed)
 
 
 def cut_volume(volume: Volume) -> Volume:

@@ -149,9 +149,11 @@ class VolumeSection(MediumSection):
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
+    periodic: tuple[str, ...] = one_of((), ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
+        yield from _wrong_periods(self.periodic)
         if self.emission is not None and self.temperature is not None:
             yield "temperature", "says what is emitted as well: give only one of it or emission"
         x, y, z = self.resolution or (1, 1, 1)
@@ -167,13 +169,22 @@ class MixtureSection:
     bounds: Bounds | None = None
     resolution: Count | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
+    periodic: tuple[str, ...] = one_of((), ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
+        yield from _wrong_periods(self.periodic)
         if len(self.media) != 2:
             yield "media", f"expected two media, found {len(self.media)}"
         for name in self.media:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
+
+
+def _wrong_periods(axes: tuple[str, ...]) -> Iterator[Violation]:
+    if len(set(axes)) < len(axes):
+        yield "periodic", "names an axis twice"
+    elif len(axes) > 2:
+        yield "periodic", "light leaves by no face then; name one axis or two"
 
 
 @dataclass(frozen=True)
@@ -501,9 +512,25 @@ class SceneTree:
                 yield "optimize", f"parameters.{name} is called {medium}g here"
         if self.ground is not None and self.diffusion.scheme == "printed":
             yield "ground", "the printed scheme has none; leave diffusion.scheme out"
+        if self.volume.periodic:
+            yield from self._cannot_repeat()
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:
             yield "views", f"{counted[0]} is of a film; say which frames: {{first: 0, last: 99}}"
         if self.frames is not None and not counted:
             yield "frames", "no picture changes: put {frame:04d} into the names of pictures"
+
+    def _cannot_repeat(self) -> Iterator[Violation]:
+        """What there is not in a volume that is periodic."""
+        if self.diffusion.scheme == "printed" or self.diffusion.model == "flux_limited":
+            yield "diffusion", "volume.periodic is for model p1 with scheme conservative, or none"
+        for index, light in enumerate(self.lights):
+            if isinstance(light, PointSection | BeamSection):
+                what = "does not repeat as the volume does; leave volume.periodic out"
+                yield "lights", f"{index}: a light of type {light.type} {what}"
+        if self.ground is not None and self.volume.up in self.volume.periodic:
+            yield "ground", f"lies across {self.volume.up}, along which the volume is periodic"
+        settings = self.optimize.parameters.values() if self.optimize else ()
+        if any(one.support is not None for one in settings):
+            yield "optimize", "support is for volumes that do not repeat: leave support out"

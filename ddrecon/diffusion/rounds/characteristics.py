@@ -22,15 +22,19 @@ from torch.nn.functional import pad
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.decay import decay_terms
-from ddrecon.numerics.slicing import Slicing, across
+from ddrecon.numerics.slicing import NEARLY, Slicing, across
 from ddrecon.slabs.slab import Slab, whole_of
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
 Direction = tuple[float, float, float]
 """A unit vector in array order, the way light travels."""
-NEARLY = 1e-9
-"""Drifts this near to none or to a whole cell are taken as that: they need no interpolation."""
+DOUBLINGS, MOST_LAPS = 10, 64
+"""Light that goes around is followed for 2^10 periods where it keeps to whole cells; else until
+nothing more comes, or for so many.
+"""
+LEFT = 1e-9
+"""What is nothing, as a part of the most light."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +43,15 @@ class Course:
 
     `order`: the array axes, slices first; `forward`: 1 or -1, the way the slice number changes;
     `drift`: by how many rows and columns light moves from one slice to the next, with signs, at
-    most 1; `step`: the length of its path between them [u].
+    most 1; `step`: the length of its path between them [u]; `wraps`: whether what leaves the last
+    slice, row or column enters the first.
     """
 
     order: tuple[int, int, int, int]
     forward: int
     drift: tuple[float, float]
     step: float
+    wraps: tuple[bool, bool, bool]
 
     @staticmethod
     def of(grid: Grid, direction: Direction) -> Course:
@@ -53,11 +59,15 @@ class Course:
         speed = [
             component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)
         ]
-        slicing = Slicing.of(speed)
+        slicing = Slicing.of(speed, grid.periodic)
         fastest = abs(speed[slicing.axis])
         drifts = (speed[other] / fastest for other in across(slicing.axis))
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
-        return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), 1 / fastest)
+        slices, rows, columns = (
+            slicing.order[dim] - 1 in grid.periodic for dim in (SLICES, ROWS, COLUMNS)
+        )
+        forward, wraps = -1 if slicing.is_reversed else 1, (slices, rows, columns)
+        return Course(slicing.order, forward, (row, column), 1 / fastest, wraps)
 
     @property
     def moved(self) -> list[float]:
@@ -140,18 +150,53 @@ def follow(passed: Tensor, source: Tensor, course: Course) -> tuple[Tensor, Tens
 
     `[slices, C, rows, columns]`; I is zero before the first slice and beyond the faces of the box.
     """
+    entering = torch.zeros_like(source[0])
+    if course.wraps[0]:
+        entering = _enter_again(passed, source, course)
+    entered, left, _ = _follow_once(passed, source, course, entering)
+    arriving, leaving = (torch.stack(each[:: course.forward]) for each in (entered, left))
+    return arriving, leaving
+
+
+def _follow_once(
+    passed: Tensor, source: Tensor, course: Course, arriving: Tensor
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """I_in and I_out by slice, for what is `arriving` at the first; and what is beyond the last."""
     rows, columns = course.drift
+    _, *wraps = course.wraps
+    drifts = [each for each in zip((1, 2), course.drift, wraps, strict=True) if each[1]]
     # A row and a column of zeros where light comes from.
     zeros = int(columns > 0), int(columns < 0), int(rows > 0), int(rows < 0)
-    entered, left, arriving = [], [], torch.zeros_like(source[0])
+    entered, left = list[Tensor](), list[Tensor]()
     for share, more in list(zip(passed.unbind(), source.unbind(), strict=True))[:: course.forward]:
         entered.append(arriving)
         left.append(torch.addcmul(more, share, arriving))
         arriving = pad(left[-1], zeros)
-        for dim, drift in ((1, rows), (2, columns)):
-            if drift:
-                low, high = (arriving.narrow(dim, i, more.shape[dim]) for i in (0, 1))
-                here, behind = (high, low) if drift > 0 else (low, high)
-                arriving = torch.lerp(here, behind, abs(drift))
-    arriving, leaving = (torch.stack(each[:: course.forward]) for each in (entered, left))
-    return arriving, leaving
+        for dim, drift, is_around in drifts:
+            low, high = (arriving.narrow(dim, i, more.shape[dim]) for i in (0, 1))
+            here, behind = (high, low) if drift > 0 else (low, high)
+            if is_around:
+                behind = here.roll(1 if drift > 0 else -1, dim)
+            arriving = torch.lerp(here, behind, abs(drift))
+    return entered, left, arriving
+
+
+def _enter_again(passed: Tensor, source: Tensor, course: Course) -> Tensor:
+    """What enters the first slice where the last comes before it: light from all periods."""
+    nothing, count = torch.zeros_like(source[0]), len(passed)
+    _, _, entering = _follow_once(passed, source, course, nothing)
+    if any(drift % 1 for drift in course.drift):
+        for _ in range(MOST_LAPS):
+            before = entering
+            _, _, entering = _follow_once(passed, source, course, before)
+            if bool((entering - before).abs().max() <= LEFT * entering.abs().max()):
+                break
+        return entering
+    # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
+    _, _, share = _follow_once(passed, torch.zeros_like(source), course, torch.ones_like(nothing))
+    moved = [count * int(drift) for drift in course.drift]
+    for _ in range(DOUBLINGS):
+        entering = entering + share * entering.roll(moved, (1, 2))
+        share = share * share.roll(moved, (1, 2))
+        moved = [2 * cells for cells in moved]
+    return entering

@@ -25,6 +25,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.slabs.exchange import add_halo, swap_layers
@@ -119,9 +120,10 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = cell_gradient(light.mean + source.mean)
+    gradient = apply_around(cell_gradient, light.mean + source.mean, medium.grid)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    if is_fused() and has_kernels("transport rounds", *where):
+    is_periodic = bool(medium.grid.periodic)
+    if is_fused() and has_kernels("transport rounds", *where) and not is_periodic:
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:

@@ -170,7 +170,7 @@ def _gain(
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
-    if is_fused():
+    if is_fused() and not operator.is_periodic:
         from ddrecon.diffusion.fused.product import find_imbalance
 
         return find_imbalance(operator, right, mean)
@@ -180,7 +180,9 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     imbalance = right - operator.loss * mean
     for axis, conductance in zip(AXES, operator.conductances, strict=True):
-        imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
+        imbalance = imbalance - accumulate(
+            conductance * difference(mean, conductance, axis), mean, axis
+        )
     return imbalance
 
 
