@@ -64,6 +64,9 @@ from ddrecon.slabs.slab import Slab
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
 
+EXCHANGES = 2
+"""How often it does where the volume repeats, and so little of it leaves sideways."""
+
 
 @dataclass(frozen=True)
 class LightField:
@@ -157,9 +160,10 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return light_from_below(cells, plane, even - ambient, texels)
 
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
-    first = _find_light(coarse, sources, settings, replace(memory, last={}), from_below(lit))
-    glow = _glow(first, plane, multiply_scatters(medium, settings))
-    lit = light_texels(lit, sources, medium, glow, render_settings)
+    for _ in range(EXCHANGES if coarse.grid.periodic else 1):
+        found = _find_light(coarse, sources, settings, replace(memory, last={}), from_below(lit))
+        glow = _glow(found, plane, multiply_scatters(medium, settings))
+        lit = light_texels(lit, sources, medium, glow, render_settings)
     below = from_below(lit).mapped(lambda field: resample(field, volume.grid))
     return replace(_find_light(volume, sources, settings, memory, below), ground=lit)
 

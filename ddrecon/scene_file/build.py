@@ -307,6 +307,9 @@ def choose_rounds(
     if is_flat or _turns_back(phase):
         thick_rounds = sum(depth > bound for bound in THICK)
         rounds, degree = rounds + max(left > MORE_ROUNDS[1], thick_rounds), 5
+    if tree.volume.periodic:
+        # With fewer directions too much light goes exactly along the axes that repeat.
+        rounds, degree = max(rounds, 2), 5
     return replace(
         settings,
         transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,
