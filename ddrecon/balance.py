@@ -54,6 +54,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     a number, else a list of three. Raises UsageError where no light enters, or where nobody follows
     light that is scattered.
     """
+    if scene.volume.grid.periodic:
+        raise UsageError("volume.periodic: of a volume that repeats there is no balance")
     light_field = solve_light(scene, SolveMemory())
     medium, angles = light_field.medium, scene.diffusion.angles
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, scene.diffusion):

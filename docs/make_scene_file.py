@@ -61,6 +61,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "resolution": "Cells along x, y and z; those of the field's file where left out.",
             "up": "The axis that the height of a `ground` is measured along.",
+            "periodic": (
+                "The axes, one or two, along which the volume repeats without end, as `[x, z]` "
+                "([E2.13](theory.md#2-the-forward-model)). Lights are directional, ambient or "
+                "maps; the diffusion is `p1` by the scheme `conservative`, or none."
+            ),
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -94,6 +99,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "bounds": "As of one medium.",
             "resolution": "As of one medium.",
             "up": "As of one medium.",
+            "periodic": "As of one medium.",
         },
     ),
     (
