@@ -142,8 +142,8 @@ def test_a_period_is_the_middle_of_many():
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        (["volume.periodic=[x,y,z]"], "volume.periodic: light leaves by no face then"),
-        (["volume.periodic=[x,x]"], "volume.periodic: names an axis twice"),
+        (["volume.periodic=[x,y,z]"], "volume: periodic: name one axis or two"),
+        (["volume.periodic=[x,x]"], "volume: periodic: name one axis or two"),
         (["volume.periodic=[w]"], "volume.periodic.0: expected one of x, y, z"),
         (["volume.periodic=[x]", "diffusion.model=flux_limited"], "diffusion: volume.periodic is"),
         (["volume.periodic=[x]", "diffusion.scheme=printed"], "diffusion: volume.periodic is"),

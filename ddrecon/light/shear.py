@@ -48,9 +48,12 @@ def sum_masses(
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
-        parts = [_sum_unrolled(field, grid, one, bound) for one in directions.split(1)]
-        masses, steps = zip(*parts, strict=True)
-        return torch.cat(masses), torch.cat(steps)
+        found = list[tuple[Tensor, Tensor]]()
+        for one in directions.split(1):
+            period = unroll_along(grid, one[0])
+            mass, path = sum_masses(period.extend(field), period.wide, one, bound)
+            found.append((period.crop(mass), path))
+        return torch.cat([mass for mass, _ in found]), torch.cat([path for _, path in found])
     if is_fused_whole(grid, directions):
         from ddrecon.light.fused import shear
 
@@ -64,15 +67,6 @@ def sum_masses(
         masses.append(torch.cat([entered for entered, _ in each]))
         steps.append(each[0][1])
     return torch.stack(masses), torch.stack(steps)
-
-
-def _sum_unrolled(
-    field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
-) -> tuple[Tensor, Tensor]:
-    """What `sum_masses` returns, of one beam [1, 3] through periods."""
-    period = unroll_along(grid, direction[0])
-    masses, steps = sum_masses(period.extend(field), period.wide, direction, bound)
-    return period.crop(masses), steps
 
 
 def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:

@@ -184,15 +184,15 @@ class Medium:
             name: replace(getattr(self, name), field=moved[id(field)])
             for name, field in fields.items()
         }
-        cellwise = "g", "mean_cosine", "forward_fraction"
-        names = ("support", "emission", "peak", *(cellwise if self.is_cellwise else ()))
-        for name in names:
+        others = ["support", "emission", "peak"]
+        phase = self.seen.phase
+        if phase.cells is not None:
+            others += ["g", "mean_cosine", "forward_fraction"]
+            changed["seen"] = SeenPhase(phase.with_cells(put(phase.cells)), self.seen.degree)
+        for name in others:
             value = getattr(self, name)
             if value is not None and tuple(value.shape[-3:]) == self.grid.shape:
                 changed[name] = put(value)
-        if self.is_cellwise:
-            phase = self.seen.phase
-            changed["seen"] = SeenPhase(phase.with_cells(put(phase.cells)), self.seen.degree)
         return replace(self, grid=grid, **changed)
 
 

@@ -1,6 +1,6 @@
-"""What repeats without end, laid out as far as a computation reaches: where a grid is periodic.
+"""What repeats without end (E2.13), laid out as far as a computation reaches.
 
-What knows no periods then works in a wider grid, and gives up what stands beyond the first one.
+What knows no periods works in a wider grid, and gives up what stands beyond the first one.
 """
 
 from __future__ import annotations

@@ -153,7 +153,6 @@ class VolumeSection(MediumSection):
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
-        yield from _wrong_periods(self.periodic)
         if self.emission is not None and self.temperature is not None:
             yield "temperature", "says what is emitted as well: give only one of it or emission"
         x, y, z = self.resolution or (1, 1, 1)
@@ -172,19 +171,11 @@ class MixtureSection:
     periodic: tuple[str, ...] = one_of((), ("x", "y", "z"))
 
     def violations(self) -> Iterator[Violation]:
-        yield from _wrong_periods(self.periodic)
         if len(self.media) != 2:
             yield "media", f"expected two media, found {len(self.media)}"
         for name in self.media:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
-
-
-def _wrong_periods(axes: tuple[str, ...]) -> Iterator[Violation]:
-    if len(set(axes)) < len(axes):
-        yield "periodic", "names an axis twice"
-    elif len(axes) > 2:
-        yield "periodic", "light leaves by no face then; name one axis or two"
 
 
 @dataclass(frozen=True)
@@ -523,6 +514,9 @@ class SceneTree:
 
     def _cannot_repeat(self) -> Iterator[Violation]:
         """What there is not in a volume that is periodic."""
+        axes = self.volume.periodic
+        if len(set(axes)) < len(axes) or len(axes) > 2:
+            yield "volume", "periodic: name one axis or two, each once; by a face light must leave"
         if self.diffusion.scheme == "printed" or self.diffusion.model == "flux_limited":
             yield "diffusion", "volume.periodic is for model p1 with scheme conservative, or none"
         for index, light in enumerate(self.lights):
