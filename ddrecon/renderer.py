@@ -7,7 +7,6 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -88,7 +87,6 @@ class LightField:
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
 
-    @functools.cached_property
     def unrolled(self) -> tuple[Unrolled, LightField]:
         """What view rays meet on their way through one period of the medium."""
         period = unroll(self.medium.grid, HALO)
@@ -267,7 +265,7 @@ def _glow(
     scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
     if not medium.is_cellwise:
         scattered = (1 - medium.forward_fraction) * scattered
-    scattered = light_field.unrolled[0].extend(scattered)
+    scattered = unroll(medium.grid, HALO).extend(scattered)
 
     def glow(rays: Rays, number: int) -> Emission:
         emission = _emission(others, rays)
@@ -410,9 +408,14 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     return radiance.expand(3, -1).unflatten(-1, camera.size)
 
 
-def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11)."""
-    period, wide = light_field.unrolled
+def _emission(
+    light_field: LightField, bundle: Rays, unrolled: tuple[Unrolled, LightField] | None = None
+) -> Emission:
+    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11).
+
+    `unrolled`: that of `light_field`, where it is known.
+    """
+    period, wide = unrolled or light_field.unrolled()
     medium = wide.medium
     diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned)
     if light_field.skies:
@@ -437,7 +440,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     depends = light_field.diffuse.flux is not None or light_field.skies
 
     def from_eye(eye: Tensor) -> Emission:
-        return _emission(light_field, replace(bundle, eye=eye))
+        return _emission(light_field, replace(bundle, eye=eye), (period, wide))
 
     return replace(emission, period=period, from_eye=from_eye if depends else None)
 
