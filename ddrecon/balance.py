@@ -60,6 +60,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     Of one color each is a number, else a list of three. Raises UsageError where no light enters, or
     where nobody follows light that is scattered.
     """
+    if scene.volume.grid.periodic:
+        raise UsageError("volume.periodic: of a volume that repeats there is no balance")
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
     medium, lit = light_field.medium, light_field.ground
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):

@@ -7,7 +7,7 @@ file that turns one into the other; inside the physics, vectors are in array ord
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -21,18 +21,22 @@ class Grid:
     """A box of `shape` cells between the corners `lower` and `upper`, all in array order (z, y, x).
 
     `shape` counts cells, at least one along each axis; `lower` and `upper` are in world units u,
-    `lower < upper`.
+    `lower < upper`. Along `periodic` axes, two at most, it repeats without end.
     """
 
     shape: tuple[int, int, int]
     lower: Triple
     upper: Triple
+    periodic: tuple[int, ...] = field(default=(), kw_only=True)
 
     @staticmethod
-    def from_xyz(resolution: tuple[int, int, int], lower: Triple, upper: Triple) -> Grid:
+    def from_xyz(
+        resolution: tuple[int, int, int], lower: Triple, upper: Triple, periodic: str = ""
+    ) -> Grid:
         """The grid of `resolution` = (nx, ny, nz) cells between world corners (x, y, z)."""
-        x, y, z = resolution
-        return Grid((z, y, x), (lower[2], lower[1], lower[0]), (upper[2], upper[1], upper[0]))
+        (z, y, x), axes = reversed(resolution), tuple(map("zyx".index, sorted(periodic)[::-1]))
+        low, high = (lower[2], lower[1], lower[0]), (upper[2], upper[1], upper[0])
+        return Grid((z, y, x), low, high, periodic=axes)
 
     @property
     def extent(self) -> Triple:
@@ -78,7 +82,7 @@ class Grid:
     def coarsen(self, factor: float) -> Grid:
         """The same box with about `factor` times fewer cells along each axis (at least one)."""
         z, y, x = (max(1, round(cells / factor)) for cells in self.shape)
-        return Grid((z, y, x), self.lower, self.upper)
+        return replace(self, shape=(z, y, x))
 
 
 def array_order(vector: Tensor) -> Tensor:

@@ -158,7 +158,8 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     box, sides = torch.stack([middle - reach, middle + reach]), torch.zeros(3)
     cube = box
     while bool((sides < SHRINKS).any()):
-        grid = Grid.from_xyz((BOX_CELLS,) * 3, *map(tuple, box.tolist()))
+        low, high = box.tolist()
+        grid = Grid.from_xyz((BOX_CELLS,) * 3, tuple(low), tuple(high))
         hulls = [
             hull_of(camera, each, grid, margin / factor)[0]
             for camera, each, factor in zip(cameras, shown, factors, strict=True)

@@ -48,6 +48,7 @@ from ddrecon.light.sky import Sky, Source, decompose_lights
 from ddrecon.march.emission import Emission
 from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
+from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.march.windows import look_inside, see_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
@@ -55,6 +56,7 @@ from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.periods import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -63,6 +65,9 @@ from ddrecon.slabs.slab import Slab, own_slab
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
+
+EXCHANGES = 2
+"""How often it does where the volume repeats, and so little of it leaves sideways."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,18 @@ class LightField:
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
+
+    def unrolled(self) -> tuple[Unrolled, LightField]:
+        """What view rays meet on their way through one period of the medium."""
+        period = unroll(self.medium.grid, HALO)
+        if not self.medium.grid.periodic:
+            return period, self
+        beams = (replace(beam, mass=period.extend(beam.mass)) for beam in self.beams)
+        turned = (replace(one, radiance=period.extend(one.radiance)) for one in self.turned)
+        medium = self.medium.put(period.wide, period.extend)
+        light = self.diffuse.mapped(period.extend)
+        wide = replace(self, medium=medium, beams=tuple(beams), diffuse=light, turned=tuple(turned))
+        return period, wide
 
 
 @dataclass(frozen=True)
@@ -144,10 +161,11 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return light_from_below(cells, plane, even - ambient, texels)
 
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
-    begun = from_below(*reflect(lit, medium, render_settings))
-    first = _find_light(coarse, sources, settings, replace(memory, last={}), begun)
-    glow = _glow(first, plane, multiply_scatters(medium, settings))
-    lit = light_texels(lit, sources, medium, glow, render_settings)
+    for _ in range(EXCHANGES if coarse.grid.periodic else 1):
+        begun = from_below(*reflect(lit, medium, render_settings))
+        first = _find_light(coarse, sources, settings, replace(memory, last={}), begun)
+        glow = _glow(first, plane, multiply_scatters(medium, settings))
+        lit = light_texels(lit, sources, medium, glow, render_settings)
     sent = reflect(lit, medium, render_settings)
     below = from_below(*sent).mapped(lambda field: resample(field, volume.grid))
     light_field = _find_light(volume, sources, settings, memory, below)
@@ -274,6 +292,7 @@ def _glow(
     scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
     if not medium.is_cellwise:
         scattered = (1 - medium.forward_fraction) * scattered
+    scattered = unroll(medium.grid, HALO).extend(scattered)
 
     def glow(rays: Rays, number: int) -> Emission:
         emission = _emission(others, rays)
@@ -433,20 +452,26 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     return radiance.expand(3, -1).unflatten(-1, camera.size)
 
 
-def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11)."""
-    medium = light_field.medium
-    diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
+def _emission(
+    light_field: LightField, bundle: Rays, unrolled: tuple[Unrolled, LightField] | None = None
+) -> Emission:
+    """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11).
+
+    `unrolled`: that of `light_field`, where it is known.
+    """
+    period, wide = unrolled or light_field.unrolled()
+    medium = wide.medium
+    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned)
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
-        diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
+        diffuse = diffuse + scatter_sky(light_field.medium, light_field.skies, towards, period)
     if light_field.has_means:
         diffuse = sharpen(medium, diffuse)
-    return Emission(
+    emission = Emission(
         medium.grid,
         medium.extinction,
         medium.scattering,
-        light_field.beams,
+        wide.beams,
         diffuse,
         medium.seen,
         medium.peak,
@@ -454,6 +479,14 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.support,
         medium.emission,
     )
+    if not light_field.medium.grid.periodic:
+        return emission
+    depends = light_field.diffuse.flux is not None or light_field.skies
+
+    def from_eye(eye: Tensor) -> Emission:
+        return _emission(light_field, replace(bundle, eye=eye), (period, wide))
+
+    return replace(emission, period=period, from_eye=from_eye if depends else None)
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor | None:

@@ -37,6 +37,7 @@ def needed_terms(scene: Scene) -> list[str]:
     return [
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
+        *_period_terms(scene.volume.grid),
         *_light_terms(scene, is_diffuse),
         *_glow_terms(scene.volume, is_diffuse),
         *_face_terms(scene.volume.index),
@@ -54,7 +55,8 @@ def engine_of_scene(scene: Scene, has_slabs: bool) -> dict[str, str]:
 def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str, ...]:
     """The parts that are torch's with every engine, for what `scene` asks of them.
 
-    `has_slabs`: ranks share out its cells. Of point lights that is all but the mass on the way to
+    `has_slabs`: ranks share out its cells. Of diffusion in a volume that repeats that is the solve.
+    Of point lights that is all but the mass on the way to
     them; of phase functions by cell, what light and rounds are at cells: view rays look them up.
     """
     settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
@@ -62,10 +64,15 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
     is_fused = is_fused and settings.solver == "multigrid" and has_kernels("diffusion", is_on_gpu)
     has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
     is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
+    repeats = bool(scene.volume.grid.periodic)
     parts = {
-        "diffusion": not is_fused or (has_slabs and is_diffuse),
+        "diffusion": not is_fused or ((has_slabs or repeats) and is_diffuse),
         "transport rounds": has_rounds
-        and (scene.volume.index != 1 or not has_kernels("transport rounds", is_on_gpu, has_slabs)),
+        and (
+            repeats
+            or scene.volume.index != 1
+            or not has_kernels("transport rounds", is_on_gpu, has_slabs)
+        ),
         "beams": has_slabs and (has_skies or _has_beams(scene)),
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),
         "pairs of beams": is_diffuse and _has_pairs(medium, scene),
@@ -91,6 +98,11 @@ def _glow_terms(volume: Volume, is_diffuse: bool) -> list[str]:
         return []
     what = "emission" if volume.black_body is None else "emission of a black body"
     return [f"{what}, {'scattered and seen' if is_diffuse else 'only seen: it is not scattered'}"]
+
+
+def _period_terms(grid: Grid) -> list[str]:
+    axes = " and ".join("zyx"[axis] for axis in reversed(grid.periodic))
+    return [f"the volume repeats without end along {axes}"] if axes else []
 
 
 def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:

@@ -68,6 +68,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Refractive index inside the box, whose flat faces refract and reflect light; "
                 "outside it is 1. Not with a ground, point lights or cameras inside."
             ),
+            "periodic": (
+                "The axes, one or two, along which the volume repeats without end, as `[x, z]` "
+                "([E2.15](theory.md#2-the-forward-model)). Lights are directional, ambient or "
+                "maps; the diffusion is `p1` by the scheme `conservative`, or none."
+            ),
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
             "sigma_t": (
@@ -105,6 +110,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "bounds": "As of one medium.",
             "resolution": "As of one medium.",
             "up": "As of one medium.",
+            "periodic": "As of one medium.",
         },
     ),
     (

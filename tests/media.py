@@ -122,12 +122,11 @@ def dense_matrix(operator: Operator) -> Tensor:
         place = [cell // strides[0], cell // strides[1] % shape[1], cell % shape[2]]
         matrix[:, cell, cell] += operator.loss[:, place[0], place[1], place[2]]
         for axis in range(3):
-            if place[axis] + 1 == shape[axis]:
+            faces, is_last = operator.conductances[axis], place[axis] + 1 == shape[axis]
+            if place[axis] == faces.shape[1 + axis]:
                 continue
-            conductance, neighbor = (
-                operator.conductances[axis][:, place[0], place[1], place[2]],
-                cell + strides[axis],
-            )
+            conductance = faces[:, place[0], place[1], place[2]]
+            neighbor = cell + strides[axis] * (1 - shape[axis] * is_last)
             matrix[:, cell, cell] += conductance
             matrix[:, neighbor, neighbor] += conductance
             matrix[:, cell, neighbor] -= conductance

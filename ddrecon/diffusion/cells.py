@@ -15,6 +15,7 @@ from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.third_order import second_difference
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab
@@ -31,15 +32,19 @@ def average_cells(medium: Medium) -> Medium:
     names = "extinction", "scattering", "remaining", "absorption"
     fields = {name: getattr(medium, name).field for name in names}
     different = {id(field): field for field in fields.values()}
-    means = {key: _whole(average(field), medium.grid) for key, field in different.items()}
+    means = {key: _average(field, medium.grid) for key, field in different.items()}
     coefficients = {
         name: replace(getattr(medium, name), field=means[id(field)])
         for name, field in fields.items()
     }
     emission = medium.emission
     if emission is not None:
-        emission = _whole(average(emission), medium.grid)
+        emission = _average(emission, medium.grid)
     return replace(medium, emission=emission, **coefficients)
+
+
+def _average(field: Tensor, grid: Grid) -> Tensor:
+    return _whole(apply_around(average, field, grid), grid)
 
 
 def average(field: Tensor) -> Tensor:
@@ -65,12 +70,13 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
 
         numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
         given = "diffusion/fused/sharp.h", "Sharp", 1, numbers
-        (light,) = apply_cell(*given, means, bend(means), extinction.field)
+        bends = apply_around(bend, means, grid)
+        (light,) = apply_cell(*given, means, bends, extinction.field)
         return _whole(light, grid)
 
     def find() -> Tensor:
         share = thinness(grid, extinction.value, THIN) / 8
-        return (means - share * bend(means)).clamp(min=0)
+        return (means - share * apply_around(bend, means, grid)).clamp(min=0)
 
     return _whole(recompute(find), grid)
 

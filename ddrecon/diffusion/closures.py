@@ -34,6 +34,10 @@ COARSE_CELLS = 32
 """
 
 
+GAP = 1.0
+"""In a box that repeats light spreads in gaps of so many times its thickness."""
+
+
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
     """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
     least = least_extinction(grid, floor)
@@ -65,9 +69,13 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
 
     The weight is a sum of coefficients >= 0: a field that colors share is transformed once for all.
     It is computed on a coarse grid and interpolated. Outside a sphere this is
-    1 / (distance to its center), exactly: Newton's shell theorem.
+    1 / (distance to its center), exactly: Newton's shell theorem. Where the box repeats without end
+    all matter is infinitely far in the mean: the distance is that of gaps, as thick as the box.
     """
     whole = whole_of(grid)
+    if grid.periodic:
+        sides = (side for axis, side in enumerate(grid.extent) if axis not in grid.periodic)
+        return weight[0].field.new_full((1, *grid.shape), 1 / (GAP * min(sides)))
     coarse, even = coarse_grid(whole), haze(whole)
     masses = [(term.scale, _coarse_mean(term.field, grid)) for term in weight]
     like = masses[0][1]

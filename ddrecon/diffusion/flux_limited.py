@@ -35,7 +35,6 @@ from ddrecon.diffusion.operator import (
     boundary_loss,
     cell_average,
     conductance,
-    difference,
     face_fluxes,
 )
 from ddrecon.diffusion.solvers.scaled import Solution
@@ -123,7 +122,7 @@ def steepness_square(u: Tensor, grid: Grid) -> Tensor:
     total = torch.zeros_like(u)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         if u.shape[axis] > 1:
-            slopes = difference(u, axis) / step
+            slopes = u.diff(dim=axis) / step
             ends = slopes.narrow(axis, 0, 1), slopes.narrow(axis, slopes.shape[axis] - 1, 1)
             total = total + cell_average(torch.cat([ends[0], slopes, ends[1]], axis), axis) ** 2
     dark = DARKNESS * u.mean((1, 2, 3), keepdim=True)

@@ -33,7 +33,8 @@ class Operator:
     """A symmetric positive definite M-matrix per color.
 
     `conductances`: c [1/u] on the interior faces along z, y, x, each one entry shorter than a cell
-    array along its axis; `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that
+    array along its axis, or as long where that is periodic: the last face is that between the last
+    cell and the first. `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that
     all colors share may be given once. `prepared`: what solvers have computed from these numbers;
     to be handed on with them only. With `ghosts`, its cells are a rank's own and those of its
     neighbors beside them; rows and columns of all ranks' own cells are one matrix.
@@ -62,9 +63,16 @@ class Operator:
         """The diagonal of A [1/u]."""
         total = self.loss.clone()
         for axis, conductance in zip(AXES, self.conductances, strict=True):
-            lower_cells(total, axis).add_(conductance)
-            upper_cells(total, axis).add_(conductance)
+            for part, below, above in sides(conductance, total, axis):
+                below.add_(part)
+                above.add_(part)
         return total
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether the last cells along an axis are neighbors of the first."""
+        sizes = zip(AXES, self.conductances, strict=True)
+        return any(c.shape[axis] == self.loss.shape[axis] for axis, c in sizes)
 
     def apply(self, u: Tensor) -> Tensor:
         """A u, `[C, z, y, x]`."""
@@ -93,12 +101,12 @@ class Operator:
         if self.ghosts is not None:
             # Each rank has the rows of its own cells: so a face that two have is counted once.
             adjoint = self.ghosts.without(adjoint)
-        if is_fused():
+        if is_fused() and not self.is_periodic:
             from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
 
             return find_cotangents(self, adjoint, u)
         conductance_bars = (
-            difference(adjoint, axis).mul_(difference(u, axis)).neg_().sum_to_size(c.shape)
+            difference(adjoint, c, axis).mul_(difference(u, c, axis)).neg_().sum_to_size(c.shape)
             for axis, c in zip(AXES, self.conductances, strict=True)
         )
         return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
@@ -110,7 +118,7 @@ class Operator:
             yield d_loss * u
         for axis, d_conductance in zip(AXES, d_conductances, strict=True):
             if d_conductance is not None:
-                yield accumulate(d_conductance * difference(u, axis), axis)
+                yield accumulate(d_conductance * difference(u, d_conductance, axis), u, axis)
 
 
 def lower_cells(u: Tensor, axis: int) -> Tensor:
@@ -123,8 +131,21 @@ def upper_cells(u: Tensor, axis: int) -> Tensor:
     return u.narrow(axis, 1, u.shape[axis] - 1)
 
 
-def difference(u: Tensor, axis: int) -> Tensor:
-    """G u along `axis`: the cell above minus the cell below every interior face."""
+def sides(faces: Tensor, u: Tensor, axis: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """`faces` along `axis` with the cells of `u` below and above them (views).
+
+    Those between neighbors come first; then, where the axis is periodic, that at its ends.
+    """
+    count = u.shape[axis]
+    yield faces.narrow(axis, 0, count - 1), lower_cells(u, axis), upper_cells(u, axis)
+    if faces.shape[axis] == count:
+        yield _last(faces, axis), _last(u, axis), _first(u, axis)
+
+
+def difference(u: Tensor, faces: Tensor, axis: int) -> Tensor:
+    """G u along `axis`: the cell above minus the cell below each of `faces`."""
+    if faces.shape[axis] == u.shape[axis]:
+        return u.roll(-1, axis) - u
     return upper_cells(u, axis) - lower_cells(u, axis)
 
 
@@ -133,13 +154,17 @@ def subtract_neighbors(
 ) -> Tensor:
     """`result`, changed in place, minus `times` conductance times neighbor at interior faces."""
     for axis, conductance in zip(AXES, conductances, strict=True):
-        lower_cells(result, axis).addcmul_(conductance, upper_cells(u, axis), value=-times)
-        upper_cells(result, axis).addcmul_(conductance, lower_cells(u, axis), value=-times)
+        both = zip(sides(conductance, result, axis), sides(conductance, u, axis), strict=True)
+        for (part, below, above), (_, low, high) in both:
+            below.addcmul_(part, high, value=-times)
+            above.addcmul_(part, low, value=-times)
     return result
 
 
-def accumulate(faces: Tensor, axis: int) -> Tensor:
-    """G^T f along `axis`: what each cell's lower face holds minus what its upper face does."""
+def accumulate(faces: Tensor, cells: Tensor, axis: int) -> Tensor:
+    """G^T f along `axis`: in `cells`, what a lower face holds minus what the upper one does."""
+    if faces.shape[axis] == cells.shape[axis]:
+        return faces.roll(1, axis) - faces
     wall = faces.new_zeros([1 if other == axis else n for other, n in enumerate(faces.shape)])
     return torch.cat([wall, faces], axis) - torch.cat([faces, wall], axis)
 
@@ -200,7 +225,7 @@ def face_fluxes(
     if radiance is not None:
         # inside -grad L0; on the box the cell's own L0, which flows outwards (down at the low end)
         low = -_first(radiance, axis)
-        inside = difference(radiance, axis) / -step
+        inside = radiance.diff(dim=axis) / -step
         high = _last(radiance, axis)
     if source_flux is not None:
         # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E2.6's numerator

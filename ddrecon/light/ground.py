@@ -109,11 +109,13 @@ def texel_centers(grid: Grid, plane: Plane, like: Tensor) -> Tensor:
     """The middles of all texels of `plane` [rows, columns, 3] [u], in array order (E5.2)."""
     places: list[Tensor] = []
     for axis in plane.across:
-        # so many that none is centered where a face of the box is
-        count = 4 * math.ceil(grid.shape[axis] / 4)
+        # so many that none is centered where a face of the box is; of what repeats, one period
+        is_periodic = axis in grid.periodic
+        count = grid.shape[axis] if is_periodic else 4 * math.ceil(grid.shape[axis] / 4)
         part = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (4 / count) - 2
         size = part.abs()
         place = torch.where(size > 1, part.sign() / (2 - size), part)
+        place = part / 2 if is_periodic else place
         places.append((grid.lower[axis] + grid.upper[axis] + place * grid.extent[axis]) / 2)
     places = [*torch.meshgrid(*places, indexing="ij")]
     places.insert(plane.axis, torch.full_like(places[0], plane.height))
@@ -126,8 +128,15 @@ def look_up_texels(texels: Tensor, grid: Grid, plane: Plane, *points: Tensor) ->
     Returns `[C, ...]`.
     """
     parts = []
-    for axis, place in zip(plane.across, points, strict=True):
+    for dim, (axis, place) in enumerate(zip(plane.across, points, strict=True), 1):
         part = _place(place, grid, axis)
+        if axis in grid.periodic:
+            # a texel more on both sides
+            count = texels.shape[dim]
+            ends = texels.narrow(dim, count - 1, 1), texels.narrow(dim, 0, 1)
+            texels = torch.cat([ends[0], texels, ends[1]], dim)
+            parts.append((torch.remainder(part + 1, 2) - 1) * (count / (count + 2)))
+            continue
         size = part.abs()
         parts.append(torch.where(size > 1, part.sign() * (2 - 1 / size.clamp(min=1)), part) / 2)
     rows, columns = torch.broadcast_tensors(*parts)

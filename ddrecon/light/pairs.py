@@ -32,6 +32,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
+from ddrecon.numerics.periods import unroll_along
 from ddrecon.slabs.exchange import gather_slabs
 from ddrecon.slabs.slab import Slab
 
@@ -103,7 +104,10 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> Pair:
         if is_uniform:
             return tau, *_pair(medium, entered, behind[0], step, turned)
         back = turned * medium.scattering.value
-        forth, against = turn_in_cells(extinction.value, back, medium.grid, direction)
+        period = unroll_along(medium.grid, direction, is_both=True)
+        fields = period.extend(extinction.value), period.extend(back)
+        pair = turn_in_cells(*fields, period.wide, direction)
+        forth, against = map(period.crop, pair)
         return tau, tau * forth, tau * against
 
     received, along, against = (

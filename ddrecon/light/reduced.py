@@ -25,6 +25,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.periods import Unrolled
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import remember
 
@@ -162,20 +163,21 @@ def moment_weights(sky: Sky, degree: int) -> Tensor:
     return torch.cat(weights, 1) / (4 * math.pi)
 
 
-def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
+def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector, period: Unrolled) -> Tensor:
     """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
     That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact
-    phase function p. `towards`: unit, its components broadcast to cells.
+    phase function p. `towards`: unit, its components broadcast to cells; these, and the result, are
+    those of a `period` of the medium.
     """
 
     def scatter(travel: Tensor, irradiance: Tensor) -> Tensor:
         """p E tau of the light that goes along `travel`."""
         (visible,) = attenuate_few(medium, travel[None], irradiance[None, None])
         z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-        return visible * medium.seen.value(torch.atleast_3d(z + y + x))
+        return period.extend(visible) * medium.seen.value(torch.atleast_3d(z + y + x))
 
-    total = torch.zeros_like(medium.extinction.value)
+    total = period.extend(torch.zeros_like(medium.extinction.value))
     for sky in _lit_skies(skies):
         if medium.index != 1:
             for one, profile in refract_sky(medium.grid, medium.index, sky):

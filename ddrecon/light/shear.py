@@ -21,6 +21,7 @@ from torch.nn.functional import pad
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.slabs.exchange import add_halo, sum_before
@@ -46,6 +47,13 @@ def sum_masses(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
+    if grid.periodic:
+        found = list[tuple[Tensor, Tensor]]()
+        for one in directions.split(1):
+            period = unroll_along(grid, one[0])
+            mass, path = sum_masses(period.extend(field), period.wide, one, bound)
+            found.append((period.crop(mass), path))
+        return torch.cat([mass for mass, _ in found]), torch.cat([path for _, path in found])
     if is_fused_whole(grid, directions):
         from ddrecon.light.fused import shear
 

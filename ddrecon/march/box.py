@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
+from ddrecon.numerics.periods import FARTHEST
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,21 @@ def cross_box(grid: Grid, rays: Rays) -> Crossing:
 def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
     """Distances [u] at which `rays` enter the box of `grid`, in front of the camera, and leave it.
 
-    A ray that misses leaves no later than it enters. The slab test of Kay and Kajiya 1986,
+    A ray that misses leaves no later than it enters. Along periodic axes there are no faces, and
+    rays end far away. The slab test of Kay and Kajiya 1986,
     doi:10.1145/15922.15916.
     """
     low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    tiny = torch.finfo(rays.direction.dtype).tiny
+    tiny, origin, way = torch.finfo(rays.direction.dtype).tiny, rays.origin, rays.direction
+    if grid.periodic:
+        faced = [axis for axis in range(3) if axis not in grid.periodic]
+        low, high, origin, way = low[faced], high[faced], origin[:, faced], way[:, faced]
     # Along a slab a ray stays within it for ever, or never enters it.
-    is_along = rays.direction.abs() < tiny
-    direction = torch.where(is_along, torch.full_like(rays.direction, tiny), rays.direction)
-    one, other = (low - rays.origin) / direction, (high - rays.origin) / direction
-    return torch.minimum(one, other).amax(-1).clamp(min=0), torch.maximum(one, other).amin(-1)
+    is_along = way.abs() < tiny
+    direction = torch.where(is_along, torch.full_like(way, tiny), way)
+    one, other = (low - origin) / direction, (high - origin) / direction
+    near = torch.minimum(one, other).amax(-1).clamp(min=0)
+    far = torch.maximum(one, other).amin(-1)
+    if grid.periodic:
+        far = torch.minimum(far, near + FARTHEST * max(grid.extent))
+    return near, far

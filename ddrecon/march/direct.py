@@ -12,8 +12,8 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.beam import unit_directions
 from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
 from ddrecon.light.profile import mean_profile, seen_radius
-from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.periods import absorb
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.settings import RenderSettings
@@ -58,9 +58,5 @@ def rays_against(grid: Grid, points: Tensor, travel: Tensor) -> Rays:
 
 def transmittance(medium: Medium, rays: Rays, settings: RenderSettings) -> Tensor:
     """What of light [C, R] passes `medium` along all of `rays`."""
-    extinction, dark = medium.extinction, torch.zeros_like(medium.extinction.field[:1])
-    absorbing = Emission(
-        medium.grid, extinction, extinction, (), dark, medium.seen, None, support=medium.support
-    )
-    one = dark.new_ones(1, len(rays.direction))
-    return march(absorbing, look_along(medium.grid, rays, settings), settings, one)
+    one = rays.direction.new_ones(1, len(rays.direction))
+    return march(absorb(medium), look_along(medium.grid, rays, settings), settings, one)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.periods import Unrolled
 from ddrecon.numerics.third_order import ThirdOrder
 
 
@@ -26,7 +28,9 @@ class Emission:
     does to p (E8.7). `remaining`, where given, scatters diffuse light in place of kappa_s: where
     the phase function differs from cell to cell, that is interpolated as the extinction is. Where
     `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for. `emitted`
-    [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11).
+    [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11). Where the
+    volume repeats, fields are those of an unrolled `period`; `from_eye`, if given, is what is seen
+    from another place, as other periods are.
     """
 
     grid: Grid
@@ -39,6 +43,8 @@ class Emission:
     remaining: Coefficient | None = None
     support: Tensor | None = None
     emitted: Tensor | None = None
+    period: Unrolled | None = None
+    from_eye: Callable[[Tensor], Emission] | None = None
 
     @property
     def diffusing(self) -> Coefficient:

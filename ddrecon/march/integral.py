@@ -16,6 +16,7 @@ from ddrecon.engine import current_engine
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
 from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
+from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
 from ddrecon.march.slabs import march_slabs
@@ -85,10 +86,12 @@ def _march_part(
 
 
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
-    """As `march_rays`, by the engine in use, and through all slabs of a grid that has some."""
+    """As `march_rays`, by the engine in use, through all slabs of a grid, or all periods."""
     march_own = march_rays
     if current_engine() == "warp":
         from ddrecon.march.fused.integrate import march_rays as march_own
+    if sampler.emission.period is not None:
+        return march_periods(march_own, sampler, rays, crossing)
     if isinstance(sampler.emission.grid, Slab):
         return march_slabs(march_rays, march_own, sampler, rays, crossing)
     return march_own(sampler, rays, crossing)

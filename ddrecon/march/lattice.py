@@ -101,7 +101,8 @@ def _lattice_rays(
     if like.eye is None:
         # They begin outside of the box.
         way = like.direction[0]
-        return Rays(points - 2 * math.hypot(*grid.extent) * way, way.expand_as(points), None)
+        far = 2 * math.hypot(*grid.extent) / (way[axis].abs() if grid.periodic else 1)
+        return Rays(points - far * way, way.expand_as(points), None)
     return Rays(like.eye.expand_as(points), normalize(points - like.eye, dim=-1), like.eye)
 
 

@@ -116,6 +116,18 @@ class Sampler:
         return sample_slices(values, points, third_order), within
 
 
+def next_node(grid: Grid, rays: Rays, distance: Tensor, sampler: Sampler) -> Tensor:
+    """The distance [R] of the node on each of `rays` in `grid` nearest to `distance` [u]."""
+    axis, like = sampler.way.axis, rays.direction
+    if axis is None:
+        return distance
+    planes = planes_across(grid, Way(axis), sampler.steps, like.dtype, like.device)
+    origin, direction = rays.origin[:, axis], rays.direction[:, axis]
+    place = (origin + distance * direction).detach()
+    nearest = planes[torch.searchsorted(0.5 * (planes[1:] + planes[:-1]), place)]
+    return (nearest - origin) / direction
+
+
 @remember
 def order_of_slices(count: int, way: Way, device: torch.device) -> Tensor:
     """Which of `count` slices lies in each plane, before cells are subdivided."""

@@ -37,7 +37,7 @@ def look_along(grid: Grid, rays: Rays, settings: RenderSettings) -> Sight:
     if crossing.hit.numel() == 0:
         return Sight(rays, crossing, None)
     way = choose_way(grid, rays, crossing)
-    if settings.tolerance == 0 or way.axis is None:
+    if settings.tolerance == 0 or way.axis is None or way.axis in grid.periodic:
         return Sight(rays, crossing, way)
     return Sight(rays, crossing, way, choose_lattice(grid, way.axis, rays.select(crossing.hit)))
 

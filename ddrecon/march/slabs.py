@@ -15,7 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
-from ddrecon.march.samplers import Sampler, Way, planes_across
+from ddrecon.march.samplers import Sampler, next_node
 from ddrecon.slabs.exchange import sum_before, sum_slabs
 from ddrecon.slabs.slab import Slab
 
@@ -89,21 +89,9 @@ def clip_to_slab(
     low, high = (
         torch.where(is_upwards, outside, -outside)
         if end is None
-        else _next_node(slab, rays, (end - origin) / direction, sampler)
+        else next_node(slab.whole, rays, (end - origin) / direction, sampler)
         for end, outside in zip(slab.ends, (-beyond, beyond), strict=True)
     )
     enter, leave = torch.where(is_upwards, low, high), torch.where(is_upwards, high, low)
     near, far = (torch.minimum(torch.maximum(end, near), far) for end in (enter, leave))
     return near, far
-
-
-def _next_node(slab: Slab, rays: Rays, distance: Tensor, sampler: Sampler) -> Tensor:
-    """The distance [R] of the node on each of `rays` that is nearest to `distance` [u]."""
-    axis, like = sampler.way.axis, rays.direction
-    if axis is None:
-        return distance
-    planes = planes_across(slab.whole, Way(axis), sampler.steps, like.dtype, like.device)
-    origin, direction = rays.origin[:, axis], rays.direction[:, axis]
-    place = (origin + distance * direction).detach()
-    nearest = planes[torch.searchsorted(0.5 * (planes[1:] + planes[:-1]), place)]
-    return (nearest - origin) / direction

@@ -184,6 +184,27 @@ class Medium:
         """Whether the phase function differs from that of isotropic scattering, or may come to."""
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
 
+    def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
+        """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
+        names = "extinction", "scattering", "remaining", "absorption"
+        fields = {name: getattr(self, name).field for name in names}
+        # A field that coefficients share, they share there as well.
+        moved = {id(field): put(field) for field in fields.values()}
+        changed: dict[str, Any] = {
+            name: replace(getattr(self, name), field=moved[id(field)])
+            for name, field in fields.items()
+        }
+        others = ["support", "emission", "peak"]
+        phase = self.seen.phase
+        if phase.cells is not None:
+            others += ["g", "mean_cosine", "forward_fraction"]
+            changed["seen"] = SeenPhase(phase.with_cells(put(phase.cells)), self.seen.degree)
+        for name in others:
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape[-3:]) == self.grid.shape:
+                changed[name] = put(value)
+        return replace(self, grid=grid, **changed)
+
 
 def cut_volume(volume: Volume) -> Volume:
     """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""

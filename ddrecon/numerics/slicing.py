@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+NEARLY = 1e-9
+"""Drifts this near to none or to a whole cell are taken as that: they need no interpolation."""
+
 
 def across(axis: int) -> tuple[int, int]:
     """The axes along which rows and columns of the slices across `axis` are counted."""
@@ -30,12 +33,13 @@ class Slicing:
     is_reversed: bool
 
     @staticmethod
-    def of(speed: Sequence[float]) -> Slicing:
+    def of(speed: Sequence[float], periodic: tuple[int, ...] = ()) -> Slicing:
         """Slices across the axis along which light of `speed` [cells/u] along z, y, x is fastest.
 
-        Light meets the slices in their order. Of axes crossed equally fast it is the first.
+        Light meets the slices in their order. Of axes crossed equally fast it is the first, those
+        that are `periodic` last.
         """
-        axis = max(range(3), key=lambda a: abs(speed[a]))
+        axis = max(range(3), key=lambda a: abs(speed[a]) * (1 - NEARLY * (a in periodic)))
         row, column = across(axis)
         return Slicing(axis, (1 + axis, 0, 1 + row, 1 + column), speed[axis] < 0)
 

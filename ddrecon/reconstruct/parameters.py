@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -147,7 +148,7 @@ class Parameter:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
-        self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
+        self.grid = replace(self.grid, shape=tuple(state["shape"]))
         self.value = state["value"].to(self.value).clone().requires_grad_()
         self.steps = int(state["steps"])
         first, second = (moment.to(self.value) for moment in state["moments"])

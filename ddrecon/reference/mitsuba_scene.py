@@ -64,6 +64,8 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
     some start inside the volume.
     """
     grid = scene.volume.grid
+    if grid.periodic:
+        raise SceneError("volume.periodic: Mitsuba's volumes do not repeat")
     return {
         "type": "scene",
         "integrator": {

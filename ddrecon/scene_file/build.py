@@ -338,6 +338,9 @@ def choose_rounds(
         rounds, degree = rounds + max(left > MORE_ROUNDS[0], thick_rounds), 5
     elif depth > SOFT:
         rounds = 1
+    if tree.volume.periodic:
+        # With fewer directions too much light goes exactly along the axes that repeat.
+        rounds, degree = max(rounds, 2), 5
     return replace(
         settings,
         transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,

@@ -238,7 +238,7 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
     problems.raise_any()
     size = next(size for size in sizes.values() if size is not None)
     low, high = next(box for box in boxes.values() if box is not None).tolist()
-    return Grid.from_xyz(size, tuple(low), tuple(high))
+    return Grid.from_xyz(size, tuple(low), tuple(high), "".join(section.periodic))
 
 
 def _show(value: np.ndarray) -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, Triple
 from ddrecon.ranks import cells_are_shared, own_rank, rank_count
 
@@ -116,6 +117,10 @@ def own_slab(grid: Grid) -> Grid:
     """
     if not cells_are_shared():
         return grid
+    if grid.periodic:
+        raise UsageError(
+            "volume.periodic: not where processes share out cells; leave --share cells out"
+        )
     axis = max(range(3), key=lambda a: grid.shape[a])
     cuts = cut_evenly(grid.shape[axis], rank_count())
     slab = Slab.of(grid, axis, cuts, own_rank())

@@ -82,9 +82,12 @@ def test_a_cycle_in_single_precision_is_symmetric_to_rounding():
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("cells", [2, 5, 6])
-def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(axis: int, cells: int):
+@pytest.mark.parametrize("wraps", [False, True])
+def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
+    axis: int, cells: int, wraps: bool
+):
     shape = tuple(cells if a == axis else 3 for a in AXES)
-    operator = patchy_box(shape)
+    operator = patchy_box(shape, wraps)
     way, coarse = coarsen(operator, axis)
     fine, u = random_values(2, *shape, seed=5), random_values(2, *coarse.loss.shape[1:], seed=6)
     torch.testing.assert_close(
@@ -96,13 +99,28 @@ def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(axis:
     torch.testing.assert_close(coarse.loss.sum(), operator.loss.sum())
 
 
-def patchy_box(shape: tuple[int, ...]) -> Operator:
+def patchy_box(shape: tuple[int, ...], wraps: bool = False) -> Operator:
+    sizes = (
+        [n - (a == axis and not wraps) for a, n in zip(AXES, shape, strict=True)] for axis in AXES
+    )
     faces = [
-        random_values(2, *(n - (a == axis) for a, n in zip(AXES, shape, strict=True)), seed=axis)
-        + 0.01
-        for axis in AXES
+        random_values(2, *size, seed=axis) + 0.01 for axis, size in zip(AXES, sizes, strict=True)
     ]
     return Operator((faces[0], faces[1], faces[2]), random_values(2, *shape, seed=9))
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 4), (7, 6, 5)])
+def test_a_box_whose_ends_are_neighbors_is_solved(shape: tuple[int, ...]):
+    operator = patchy_box(shape, wraps=True)
+    u = random_values(2, *shape, seed=3)
+    source = operator.apply(u)
+    by_matrix = (dense_matrix(operator) @ u.flatten(1)[..., None]).view_as(u)
+    torch.testing.assert_close(source, by_matrix, rtol=1e-13, atol=1e-13)
+    matrix = matrix_of(Level.of(operator).cycle, operator.loss.shape)
+    assert float((matrix - matrix.mT).abs().max()) < 1e-13 * float(matrix.abs().max())
+    solution = multigrid(operator, source, None, 1e-13)
+    torch.testing.assert_close(solution.value, u, rtol=1e-10, atol=1e-10)
+    assert solution.iterations < 20
 
 
 def test_few_cells_are_solved_directly():

@@ -13,6 +13,7 @@ light comes from one neighbor and leaves for the other.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.shear import cross_grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.decay import decay_terms
-from ddrecon.numerics.slicing import Slicing, across
+from ddrecon.numerics.slicing import NEARLY, Slicing, across
 from ddrecon.slabs.slab import Slab, whole_of
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
@@ -34,8 +35,12 @@ Ends = tuple[Tensor, Tensor, Tensor]
 """Light on faces of the box, in the layout of a course: across slices [C, rows, columns], rows
 [slices, C, columns] and columns [slices, C, rows].
 """
-NEARLY = 1e-9
-"""Drifts this near to none or to a whole cell are taken as that: they need no interpolation."""
+DOUBLINGS, MOST_LAPS = 10, 64
+"""Light that goes around is followed for 2^10 periods where it keeps to whole cells; else until
+nothing more comes, or for so many.
+"""
+LEFT = 1e-9
+"""What is nothing, as a part of the most light."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +50,15 @@ class Course:
     `order`: the array axes, slices first; `forward`: 1 or -1, the way the slice number changes;
     `drift`: by how many rows and columns light moves from one slice to the next, with signs, at
     most 1; `step`: the length of its path between them [u]. Both are numbers, or tensors of a
-    direction that may be varied.
+    direction that may be varied. `wraps`: whether what leaves the last slice, row or column enters
+    the first.
     """
 
     order: tuple[int, int, int, int]
     forward: int
     drift: tuple[Any, Any]
     step: Any
+    wraps: tuple[bool, bool, bool] = (False, False, False)
 
     @staticmethod
     def of(grid: Grid, direction: Direction) -> Course:
@@ -59,11 +66,15 @@ class Course:
         speed = [
             component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)
         ]
-        slicing = Slicing.of(speed)
+        slicing = Slicing.of(speed, grid.periodic)
         fastest = abs(speed[slicing.axis])
         drifts = (speed[other] / fastest for other in across(slicing.axis))
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
-        return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), 1 / fastest)
+        slices, rows, columns = (
+            slicing.order[dim] - 1 in grid.periodic for dim in (SLICES, ROWS, COLUMNS)
+        )
+        forward, wraps = -1 if slicing.is_reversed else 1, (slices, rows, columns)
+        return Course(slicing.order, forward, (row, column), 1 / fastest, wraps)
 
     @staticmethod
     def along(grid: Grid, direction: Tensor) -> Course:
@@ -164,23 +175,59 @@ def follow(
     `[slices, C, rows, columns]`; and what leaves the box. Through its faces enters what is at the
     `ends`, None for nothing.
     """
-    first = torch.zeros_like(source[0])
-    across, *sides = ends or (first, first[:, 0], first[:, :, 0])
+    across, *sides = ends or (torch.zeros_like(source[0]), None, None)
+    if course.wraps[0]:
+        across = _enter_again(passed, source, course)
+    entered, left, gone = _follow_once(passed, source, course, across, sides)
+    arrived, leaving = (torch.stack(one[:: course.forward]) for one in (entered, left))
+    return arrived, leaving, gone
+
+
+def _follow_once(
+    passed: Tensor,
+    source: Tensor,
+    course: Course,
+    arriving: Tensor,
+    sides: Sequence[Tensor | None] = (None, None),
+) -> tuple[list[Tensor], list[Tensor], Ends]:
+    """I_in and I_out by slice, for what is `arriving` at the first; and what leaves the box."""
     entered, left, gone = list[Tensor](), list[Tensor](), (list[Tensor](), list[Tensor]())
-    arriving = across
-    order = range(len(source))[:: course.forward]
-    for k in order:
+    ways = list(zip((1, 2), sides, gone, course.drift, course.wraps[1:], strict=True))
+    for k in range(len(source))[:: course.forward]:
         entered.append(arriving)
         arriving = torch.addcmul(source[k], passed[k], arriving)
         left.append(arriving)
-        # Part of each row goes on to the next and of the last leaves the box; so of columns.
-        for dim, (side, beyond, drift) in enumerate(zip(sides, gone, course.drift, strict=True), 1):
+        # Part of each row goes on to the next, and of the last leaves the box; so of columns.
+        for dim, side, beyond, drift, is_around in ways:
             if drift:
                 way, size = 1 if drift > 0 else -1, arriving.shape[dim]
-                beyond.append(arriving.select(dim, size - 1 if drift > 0 else 0))
+                last = arriving.select(dim, size - 1 if drift > 0 else 0)
+                beyond.append(last)
                 kept = arriving.narrow(dim, int(drift < 0), size - 1)
-                edge = (side if ends is None else side[k]).unsqueeze(dim)
-                arriving = torch.lerp(arriving, torch.cat([edge, kept][::way], dim), abs(drift))
-    rows, columns = (torch.stack(one[:: course.forward]) if one else first for one in gone)
-    arrived, leaving = (torch.stack(one[:: course.forward]) for one in (entered, left))
-    return arrived, leaving, (arriving, rows, columns)
+                edge = last if is_around else torch.zeros_like(last) if side is None else side[k]
+                behind = torch.cat([edge.unsqueeze(dim), kept][::way], dim)
+                arriving = torch.lerp(arriving, behind, abs(drift))
+    nothing = torch.zeros_like(source[0])
+    rows, columns = (torch.stack(one[:: course.forward]) if one else nothing for one in gone)
+    return entered, left, (arriving, rows, columns)
+
+
+def _enter_again(passed: Tensor, source: Tensor, course: Course) -> Tensor:
+    """What enters the first slice where the last comes before it: light from all periods."""
+    nothing, count = torch.zeros_like(source[0]), len(passed)
+    _, _, (entering, *_) = _follow_once(passed, source, course, nothing)
+    if any(drift % 1 for drift in course.drift):
+        for _ in range(MOST_LAPS):
+            before = entering
+            _, _, (entering, *_) = _follow_once(passed, source, course, before)
+            if bool((entering - before).abs().max() <= LEFT * entering.abs().max()):
+                break
+        return entering
+    # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
+    _, _, (share, *_) = _follow_once(passed, 0 * source, course, torch.ones_like(nothing))
+    moved = [count * int(drift) for drift in course.drift]
+    for _ in range(DOUBLINGS):
+        entering = entering + share * entering.roll(moved, (1, 2))
+        share = share * share.roll(moved, (1, 2))
+        moved = [2 * cells for cells in moved]
+    return entering

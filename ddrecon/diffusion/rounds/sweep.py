@@ -26,6 +26,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.slabs.exchange import add_halo, swap_layers
@@ -138,9 +139,10 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = cell_gradient(light.mean + source.mean)
+    gradient = apply_around(cell_gradient, light.mean + source.mean, medium.grid)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
-    if mirror is None and is_fused() and has_kernels("transport rounds", *where):
+    is_apart = mirror is None and not medium.grid.periodic
+    if is_apart and is_fused() and has_kernels("transport rounds", *where):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:

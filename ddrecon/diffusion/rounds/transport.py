@@ -182,7 +182,7 @@ def _gain(
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
-    if is_fused():
+    if is_fused() and not operator.is_periodic:
         from ddrecon.diffusion.fused.product import find_imbalance
 
         return find_imbalance(operator, right, mean)
@@ -192,7 +192,9 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     imbalance = right - operator.loss * mean
     for axis, conductance in zip(AXES, operator.conductances, strict=True):
-        imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
+        imbalance = imbalance - accumulate(
+            conductance * difference(mean, conductance, axis), mean, axis
+        )
     return imbalance
 
 
@@ -220,13 +222,14 @@ def _mean_step(grid: Grid, directions: int) -> tuple[float, float]:
     """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     total = weight_of_steps = 0.0
+    varies = [n > 1 or axis in grid.periodic for axis, n in enumerate(grid.shape)]
     shared = [0.0, 0.0, 0.0]
     for point, weight in zip(points.tolist(), weights.tolist(), strict=True):
         course = Course.of(grid, tuple(point))
-        if grid.shape[course.order[0] - 1] > 1:
+        if varies[course.order[0] - 1]:
             total, weight_of_steps = total + weight * course.step, weight_of_steps + weight
         for axis, moved in enumerate(course.moved):
-            if grid.shape[axis] > 1:
+            if varies[axis]:
                 spread = abs(moved) * (1 - abs(moved)) * grid.spacing[axis] ** 2
                 shared[axis] += 1.5 * weight * spread / course.step
     # a grid of one cell has no steps, and then theta is 1

@@ -17,14 +17,14 @@ doi:10.1137/0902035).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, upper_cells
+from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, sides, upper_cells
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.slabs.ghosts import Ghosts
@@ -53,7 +53,8 @@ No eigenvalue of a scaled M-matrix is above 2.
 class Coarsening:
     """Pairs of neighbors along `axis` become one cell; a last one without a neighbor stays alone.
 
-    `cells`: how many there were. On the faces between pairs, `below` and `above` say where the
+    `cells`: how many there were. On the faces between pairs, last of them the one at the ends of a
+    periodic axis, `below` and `above` say where the
     cells next to the face stand between the coarse cells on either side: 0 is their own coarse
     cell, 1 the other, and evenly spread resistors make 1/4.
     """
@@ -66,38 +67,46 @@ class Coarsening:
     def restrict(self, residual: Tensor) -> Tensor:
         """The residual of the coarse cells, by the transpose of `prolong`."""
         total = _sum_of_pairs(residual, self.axis)
-        moved = self.below * _below(residual, self.axis)
-        moved.addcmul_(self.above, _above(residual, self.axis), value=-1)
-        lower_cells(total, self.axis).sub_(moved)
-        upper_cells(total, self.axis).add_(moved)
+        parts = zip(
+            fine_sides(self.below, residual, self.axis),
+            fine_sides(self.above, residual, self.axis),
+            sides(self.below, total, self.axis),
+            strict=True,
+        )
+        for (below, low, _), (above, _, high), (_, to_low, to_high) in parts:
+            moved = (below * low).addcmul_(above, high, value=-1)
+            to_low.sub_(moved)
+            to_high.add_(moved)
         return total
 
     def prolong(self, u: Tensor) -> Tensor:
         """`u` of the coarse cells, interpolated; what is the same everywhere stays so."""
-        rise = difference(u, self.axis)
+        rise = difference(u, self.below, self.axis)
         result = u.new_empty(
             [self.cells if axis == self.axis else size for axis, size in enumerate(u.shape)]
         )
         _first(result, self.axis).copy_(u)
         _second(result, self.axis).copy_(u.narrow(self.axis, 0, self.cells // 2))
-        _below(result, self.axis).addcmul_(self.below, rise)
-        _above(result, self.axis).addcmul_(self.above, rise, value=-1)
+        weights = (fine_sides(faces, result, self.axis) for faces in (self.below, self.above, rise))
+        for (below, low, high), (above, *_), (part, *_) in zip(*weights, strict=True):
+            low.addcmul_(below, part)
+            high.addcmul_(above, part, value=-1)
         return result
 
 
 def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     """`operator` on half as many cells along `axis`, and the way there and back."""
-    along = operator.conductances[axis - 1]
-    half = 0.5 / _first(along, axis)
+    along, cells = operator.conductances[axis - 1], operator.loss.shape[axis]
+    inner = along.narrow(axis, 0, cells - 1)
+    half, between = 0.5 / _first(inner, axis), 1 / _second(inner, axis)
     # Zeros after it, where the last cell stands alone.
-    half = pad(half, [0, 0] * (3 - axis) + [0, (along.shape[axis] + 2) // 2 - half.shape[axis]])
-    resistance = lower_cells(half, axis) + 1 / _second(along, axis) + upper_cells(half, axis)
-    way = Coarsening(
-        axis,
-        along.shape[axis] + 1,
-        lower_cells(half, axis) / resistance,
-        upper_cells(half, axis) / resistance,
-    )
+    half = pad(half, [0, 0] * (3 - axis) + [0, (cells + 1) // 2 - half.shape[axis]])
+    lower, upper = lower_cells(half, axis), upper_cells(half, axis)
+    if cells > 2 and along.shape[axis] == cells:
+        between = torch.cat([between, 1 / along.narrow(axis, cells - 1, 1)], axis)
+        lower, upper = half, half.roll(-1, axis)
+    resistance = lower + between + upper
+    way = Coarsening(axis, cells, lower / resistance, upper / resistance)
     coarse = [_sum_of_pairs(c, axis) for c in operator.conductances]
     coarse[axis - 1] = _stiffened(1 / resistance, way, operator)
     z, y, x = coarse
@@ -121,11 +130,16 @@ def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
         if across != way.axis:
             conductance = operator.conductances[across - 1]
             # c (w - w')^2, of the cells below and of those above the faces between pairs
-            energy = _below(conductance, way.axis) * difference(way.below, across) ** 2
-            energy += _above(conductance, way.axis) * difference(way.above, across) ** 2
-            # half of it to each of the two coarse faces, whose weights are w and w'
-            lower_cells(along, across).add_(energy, alpha=0.5)
-            upper_cells(along, across).add_(energy, alpha=0.5)
+            parts = (
+                fine_sides(faces, conductance, way.axis) for faces in (way.below, way.above, along)
+            )
+            for (below, low, high), (above, *_), (faces, *_) in zip(*parts, strict=True):
+                energy = low * difference(below, low, across) ** 2
+                energy += high * difference(above, high, across) ** 2
+                # half of it to each of the two coarse faces, whose weights are w and w'
+                for part, one, other in sides(energy, faces, across):
+                    one.add_(part, alpha=0.5)
+                    other.add_(part, alpha=0.5)
     return along
 
 
@@ -145,14 +159,14 @@ def _second(u: Tensor, axis: int) -> Tensor:
     return u[(slice(None),) * axis + (slice(1, None, 2),)]
 
 
-def _below(u: Tensor, axis: int) -> Tensor:
-    """The cells on the low side of every face between pairs (a view)."""
-    return _second(u, axis).narrow(axis, 0, (u.shape[axis] - 1) // 2)
-
-
-def _above(u: Tensor, axis: int) -> Tensor:
-    """The cells on the high side of every face between pairs (a view)."""
-    return upper_cells(_first(u, axis), axis)
+def fine_sides(faces: Tensor, u: Tensor, axis: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """As `sides`, of `faces` between pairs of the cells of `u`."""
+    count = (u.shape[axis] - 1) // 2
+    below = _second(u, axis).narrow(axis, 0, count)
+    yield faces.narrow(axis, 0, count), below, upper_cells(_first(u, axis), axis)
+    if faces.shape[axis] > count:
+        last, first = u.narrow(axis, u.shape[axis] - 1, 1), u.narrow(axis, 0, 1)
+        yield faces.narrow(axis, count, 1), last, first
 
 
 @dataclass(frozen=True)
@@ -170,8 +184,10 @@ class Coarsest:
         diagonal = Operator.of({}, *(tensor.double() for tensor in given)).diagonal
         matrix = torch.diag_embed(diagonal.flatten(1))
         for axis, conductance in zip(AXES, operator.conductances, strict=True):
-            low, high = lower_cells(number, axis).flatten(), upper_cells(number, axis).flatten()
-            matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
+            for part, below, above in sides(conductance, number, axis):
+                low, high = below.flatten(), above.flatten()
+                matrix[:, low, high] -= part.flatten(1).double()
+                matrix[:, high, low] -= part.flatten(1).double()
         # Of no medium, as in a rehearsal, it is not finite; no error.
         return Coarsest(torch.linalg.inv_ex(matrix).inverse.to(operator.loss.dtype))
 

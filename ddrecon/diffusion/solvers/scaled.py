@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, lower_cells, subtract_neighbors, upper_cells
+from ddrecon.diffusion.operator import AXES, Operator, sides, subtract_neighbors
 from ddrecon.errors import SolveError
 from ddrecon.slabs.ghosts import Ghosts
 
@@ -39,10 +39,10 @@ class ScaledMatrix:
     def of(operator: Operator) -> ScaledMatrix:
         """The scaled form of `operator`."""
         scale = fill(operator.ghosts, operator.diagonal.rsqrt())
-        scaled = tuple(
-            c * lower_cells(scale, axis) * upper_cells(scale, axis)
-            for axis, c in zip(AXES, operator.conductances, strict=True)
-        )
+        scaled = tuple(c.expand(len(scale), -1, -1, -1).clone() for c in operator.conductances)
+        for axis, conductance in zip(AXES, scaled, strict=True):
+            for part, below, above in sides(conductance, scale, axis):
+                part.mul_(below).mul_(above)
         return ScaledMatrix(scale, scaled, operator.ghosts)
 
     def apply(self, y: Tensor) -> Tensor:

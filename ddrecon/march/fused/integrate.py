@@ -58,7 +58,9 @@ def march_rays(
         packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
         *fields,
     )
-    return _compose(emission, out, along.factors), masses
+    # The walk's masses begin with what is in front.
+    own = masses if front is None else masses - front
+    return _compose(emission, out, along.factors), own
 
 
 def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]) -> Tensor:

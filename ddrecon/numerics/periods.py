@@ -1,0 +1,102 @@
+"""What repeats without end (E2.15), laid out as far as a computation reaches.
+
+What knows no periods works in a wider grid, and gives up what stands beyond the first one.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid, Triple
+
+FARTHEST = 16
+"""Light is followed through periods for so many times the longest side of the box: light that goes
+nearly along all periodic axes comes by no face.
+"""
+MARGIN = 4
+"""Cells beyond those that a beam passes, which interpolation reaches."""
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """So many cells more `before` and `after` a period of a `grid`, along z, y and x."""
+
+    grid: Grid
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+
+    @functools.cached_property
+    def wide(self) -> Grid:
+        """All of these cells, as a grid that does not repeat; where nothing does, the same."""
+        grid = self.grid
+        if not any(self.before + self.after):
+            return grid
+        sizes = zip(self.before, grid.shape, self.after, strict=True)
+        z, y, x = (sum(cells) for cells in sizes)
+        lower, upper = (
+            _moved(grid, self.before, grid.lower, -1),
+            _moved(grid, self.after, grid.upper),
+        )
+        return Grid((z, y, x), lower, upper)
+
+    def extend(self, field: Tensor) -> Tensor:
+        """`field` [..., z, y, x] of a period in all cells."""
+        for axis, (low, high) in enumerate(zip(self.before, self.after, strict=True)):
+            if low or high:
+                count = field.shape[axis - 3]
+                places = torch.arange(-low, count + high, device=field.device) % count
+                field = field.index_select(axis - 3, places)
+        return field
+
+    def crop(self, field: Tensor) -> Tensor:
+        """The first period of what is in all cells."""
+        for axis, (low, count) in enumerate(zip(self.before, self.grid.shape, strict=True)):
+            field = field.narrow(axis - 3, low, count)
+        return field
+
+
+def _moved(grid: Grid, cells: tuple[int, ...], corner: Triple, sign: int = 1) -> Triple:
+    steps = zip(corner, cells, grid.spacing, strict=True)
+    z, y, x = (place + sign * count * step for place, count, step in steps)
+    return z, y, x
+
+
+@functools.lru_cache(maxsize=64)
+def unroll(grid: Grid, reach: int) -> Unrolled:
+    """So many cells more on both sides of a period."""
+    around = tuple(reach * (axis in grid.periodic) for axis in range(3))
+    return Unrolled(grid, around, around)
+
+
+def unroll_along(grid: Grid, direction: Tensor, is_both: bool = False) -> Unrolled:
+    """What light along `direction` [3] passes on its way to the cells of a period of `grid`.
+
+    And, if `is_both`, on its way from there.
+    """
+    speed = [part / step for part, step in zip(direction.tolist(), grid.spacing, strict=True)]
+    times = [
+        n / max(abs(s), 1e-30)
+        for axis, (n, s) in enumerate(zip(grid.shape, speed, strict=True))
+        if axis not in grid.periodic
+    ]
+    time = min(*times, FARTHEST * max(grid.extent))
+    before, after = [0, 0, 0], [0, 0, 0]
+    for axis in grid.periodic:
+        drift = math.ceil(abs(speed[axis]) * time)
+        before[axis] = MARGIN + drift * (is_both or speed[axis] > 0)
+        after[axis] = MARGIN + drift * (is_both or speed[axis] < 0)
+    return Unrolled(grid, tuple(before), tuple(after))
+
+
+def apply_around(function: Callable[[Tensor], Tensor], field: Tensor, grid: Grid) -> Tensor:
+    """`function` of a `field` [..., z, y, x], which sees cells and those beside them."""
+    if not grid.periodic:
+        return function(field)
+    period = unroll(grid, 1)
+    return period.crop(function(period.extend(field)))

@@ -1,0 +1,164 @@
+"""A volume that repeats: one period is as good as two, wherever it begins, in both engines."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from media import half_empty, make_scene, render_tangent
+from torch import Tensor
+
+from ddrecon import load_scene
+from ddrecon.cameras import Camera, look_at
+from ddrecon.engine import ENGINES, use_engine
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.light.ground import Ground, Plane
+from ddrecon.light.lights import EnvironmentLight
+from ddrecon.renderer import fluence, render
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+SHAPE, CELL = (6, 5, 7), 0.2
+STEEP, SLANTED, LOW = (-1.0, -3.0, 0.5), (-2.0, -2.5, -1.0), (-3.1, -1.0, 0.5)
+KINDS: dict[str, dict[str, Any]] = {
+    "isotropic": {"travel": STEEP},
+    "fine angles": {"travel": SLANTED, "g": 0.6, "transport_rounds": 2, "degree": 5},
+    "white sky": {"transport_rounds": 1, "ambient": (0.3,), "directional": None},
+    "backward": {"travel": SLANTED, "g": -0.8, "transport_rounds": 1},
+    "map": {"directional": None, "is_map": True, "model": "none"},
+    "low sun": {"travel": LOW, "g": 0.4, "transport_rounds": 1},
+    "ground": {"travel": STEEP, "g": 0.4, "transport_rounds": 1, "has_ground": True},
+}
+
+
+def repeated(
+    density: Tensor, shift: tuple[int, int] = (0, 0), is_perspective: bool = True, **kind: Any
+) -> Scene:
+    """A scene of cubes, periodic along z and x, seen aslant; cells and camera may be shifted."""
+    shape = tuple(density.shape)
+    grid = Grid(shape, (0.0, 0.0, 0.0), tuple(CELL * n for n in shape), periodic=(0, 2))
+    z, x = (CELL * cells for cells in shift)
+    middle = torch.tensor([0.7 + x, 0.5, 0.6 + z], dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    pose = look_at(middle + torch.tensor([0.3, 1.8, 0.5]), middle, up)
+    camera = Camera(pose, (6, 7), 0.5 if is_perspective else 0.7, is_perspective)
+    has_ground, is_map = kind.pop("has_ground", False), kind.pop("is_map", False)
+    scene = make_scene(
+        density.roll(shift, (0, 2)),
+        grid=grid,
+        camera=camera,
+        sigma_a=(0.5,),
+        sigma_s=(8.0,),
+        **kind,
+    )
+    if has_ground:
+        scene.ground = Ground(density.new_tensor([0.5]), Plane(-0.1, 1))
+    if is_map:
+        numbers = density.new_tensor(1.0), density.new_tensor(20.0), 6
+        scene.lights.append(EnvironmentLight(half_empty(1, 4, 8), *numbers))
+    return scene
+
+
+def assert_near(found: Tensor, known: Tensor, close: float) -> None:
+    assert float((found - known).norm()) <= close * float(known.norm())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
+    """Low light that goes along x or z most is followed from between cells: moved along that, it is
+    not exactly the same.
+    """
+    use_engine(engine)
+    density, settings = half_empty(*SHAPE), KINDS[kind]
+    close = 0.05 if kind in ("ground", "map") else 1e-10
+    shift = (2, 3) if kind != "low sun" else (2, 0)
+    twice = torch.cat([density, density])
+    for is_perspective in (True, False):
+        one = repeated(density, is_perspective=is_perspective, **settings)
+        two = repeated(twice, shift, is_perspective, **settings)
+        assert_near(render(two), render(one), close)
+        known = fluence(one)
+        twofold = torch.cat([known, known], 1).roll(shift, (1, 3))
+        assert_near(fluence(two), twofold, close)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_engines_tangents_and_adjoints_agree(kind: str):
+    density, settings = half_empty(*SHAPE), KINDS[kind]
+    scene, found = repeated(density, **settings), dict[tuple[str, str], Tensor]()
+    names = ["density", *(["g"] if settings.get("g") else [])]
+    for engine in ENGINES:
+        use_engine(engine)
+        for name in names:
+            value = value_of(scene, name).detach().clone().requires_grad_()
+            image = render(with_values(scene, {name: value}))
+            weights = half_empty(*image.shape, seed=1) + 0.1
+            (bar,) = torch.autograd.grad((weights * image).sum(), value)
+            images = render_tangent(scene, name, lambda world: {"": render(world)})
+            torch.testing.assert_close(
+                (weights * images[""][1]).sum(), bar.sum(), rtol=1e-10, atol=1e-10
+            )
+            found[engine, name], found[engine, "image"] = bar, image.detach()
+    for name in (*names, "image"):
+        one, other = (found[engine, name] for engine in ENGINES)
+        assert_near(one, other, 1e-11)
+
+
+def even(*shape: int) -> Tensor:
+    return torch.full(shape, 0.3, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("travel", [STEEP, SLANTED])
+@pytest.mark.parametrize("shape", [(1, 8, 1), (4, 8, 3)])
+def test_an_even_layer_has_one_dimension(shape: tuple[int, int, int], travel: tuple[float, ...]):
+    """Of whatever period; and a beam falls off by Beer's law, averaged over each cell."""
+    light, column = (
+        fluence(repeated(even(*size), travel=travel, g=0.5, transport_rounds=2))
+        for size in (shape, (2, 8, 5))
+    )
+    torch.testing.assert_close(light, column[:, :1, :, :1].expand_as(light), rtol=1e-9, atol=0)
+    settings = {"travel": travel, "model": "none"}
+    beam = fluence(repeated(even(*shape), **settings))[0, 0, :, 0]
+    step = 0.3 * 8.5 * CELL * math.hypot(*travel) / abs(travel[1])
+    passed = torch.exp(-step * torch.arange(8, dtype=torch.float64)).flip(0)
+    torch.testing.assert_close(beam, 3 * passed * (1 - math.exp(-step)) / step, rtol=1e-9, atol=0)
+
+
+def test_a_period_is_the_middle_of_many():
+    """Light that is scattered once; of seven copies in a box, the outer ones are far off."""
+    use_engine("torch")
+    density, settings = half_empty(*SHAPE), {"travel": SLANTED, "model": "none"}
+    one = repeated(density, **settings)
+    many = repeated(density.repeat(7, 1, 7), **settings)
+    many.volume.grid = Grid((42, 5, 49), (-3.6, 0.0, -4.2), (4.8, 1.0, 5.6))
+    torch.testing.assert_close(render(many), render(one), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (["volume.periodic=[x,y,z]"], "volume: periodic: name one axis or two"),
+        (["volume.periodic=[x,x]"], "volume: periodic: name one axis or two"),
+        (["volume.periodic=[w]"], "volume.periodic.0: expected one of x, y, z"),
+        (["volume.periodic=[x]", "diffusion.model=flux_limited"], "diffusion: volume.periodic is"),
+        (["volume.periodic=[x]", "diffusion.scheme=printed"], "diffusion: volume.periodic is"),
+        (
+            ["volume.periodic=[x]", "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"],
+            "lights: 0: a light of type point does not repeat",
+        ),
+        (
+            ["volume.periodic=[y]", "ground={height: -2, albedo: 0.3}"],
+            "ground: lies across y, along which the volume is periodic",
+        ),
+    ],
+)
+def test_what_cannot_repeat_is_said(changes: list[str], problem: str):
+    path = Path(__file__).parents[1] / "configs/ball.yaml"
+    with pytest.raises(SceneError) as caught:
+        load_scene(path, overrides=changes)
+    assert problem in str(caught.value)
