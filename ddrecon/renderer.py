@@ -429,13 +429,13 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         return given
 
     if medium.index == 1:
-        sight = look_through(camera, medium.grid, scene.render)
+        sight = look_through(camera, scene.volume.grid, scene.render)
         behind = look_behind(sight.rays, given)
         if light_field.ground is not None:
             behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
         radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     else:
-        rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
+        rays, windows = look_inside(camera, scene.volume.grid, medium.index, scene.render)
         beside = look_behind(rays, given)
         radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
         for window in windows:

@@ -104,7 +104,7 @@ render.background=yes => render.background: expected true or false, found 'yes'
 render={{background: true, background: true}} => render.background: repeated key
 diffusion.model=p2 => diffusion.model: expected one of none, p1, flux_limited, found 'p2'
 diffusion={{model: flux_limited, scheme: printed}} => 'printed' is for diffusion.model p1
-diffusion.transport_directions=50 => directions follow from diffusion.degree: write degree: 3
+diffusion.transport_directions=50 => directions follow from diffusion.transport_rounds and degree
 diffusion.degree=4 => diffusion.degree: expected one of 1, 3, 5, 7, found 4
 diffusion={{model: flux_limited, transport_rounds: 1}} => rounds begin at model p1 with scheme
 diffusion={{scheme: printed, transport_rounds: 1}} => rounds begin at model p1 with scheme

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
-from ddrecon.io.files.arrays import check_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,7 +20,10 @@ def read_frame(path: Path, number: int = 0) -> np.ndarray:
 
     Raises FormatError where there is none, or the film is damaged.
     """
-    import numpy as np  # here, as scene files know suffixes without it
+    # here, as scene files know suffixes without NumPy
+    import numpy as np
+
+    from ddrecon.io.files.arrays import check_size
 
     read = load_for_file("imageio_ffmpeg", path).read_frames
     asked = ["-f", FILMS[path.suffix.lower()]]
