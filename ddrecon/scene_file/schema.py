@@ -40,6 +40,7 @@ Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
 Backdrop = Color | Path
 Paths = Path | tuple[Path, ...]
+AXES = {"choices": ("x", "y", "z"), "may_be_empty": True}
 
 MAX_CELLS = 2**30
 FRAME = re.compile(r"\{frame(:0?[1-9]?d)?\}")
@@ -189,7 +190,7 @@ class VolumeSection(MediumSection):
     bounds: Bounds | Auto | None = None
     resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
-    periodic: tuple[str, ...] = one_of((), ("x", "y", "z"))
+    periodic: tuple[str, ...] = field(default=(), metadata=AXES)
 
     def violations(self) -> Iterator[Violation]:
         yield from super().violations()
@@ -208,7 +209,7 @@ class MixtureSection:
     bounds: Bounds | Auto | None = None
     resolution: Count | Auto | None = bounded(None, minimum=1, maximum=4096)
     up: str = one_of("y", ("x", "y", "z"))
-    periodic: tuple[str, ...] = one_of((), ("x", "y", "z"))
+    periodic: tuple[str, ...] = field(default=(), metadata=AXES)
 
     def violations(self) -> Iterator[Violation]:
         if len(self.media) != 2:
