@@ -82,9 +82,9 @@ class DiffusionSettings:
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
-    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 7). Light is computed
-    and seen in cells a `refine`th as wide. A scene file that leaves these out gets what its medium
-    deserves.
+    P1 towards transport, and keep angles to `degree`; with a `transport_tolerance` they end where
+    one changes light by less of it (docs/theory.md, section 7). Light is computed and seen in cells
+    a `refine`th as wide. A scene file that leaves these out gets what its medium deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -101,6 +101,7 @@ class DiffusionSettings:
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = bounded(True, expert=True)
     transport_rounds: int | None = bounded(None, minimum=0, maximum=16)
+    transport_tolerance: float | None = bounded(None, above=0, below=1)
     degree: int | None = one_of(None, (1, 3, 5, 7))
     refine: int | None = one_of(None, (1, 3, 9), expert=True)
 
@@ -118,7 +119,7 @@ class DiffusionSettings:
 
     @property
     def rounds(self) -> int:
-        """How many transport rounds there are: left out, one where there can be any."""
+        """How many transport rounds there are at most: left out, one where there can be any."""
         can_have_rounds = (self.model, self.scheme) == ("p1", "conservative")
         return int(can_have_rounds) if self.transport_rounds is None else self.transport_rounds
 
@@ -130,6 +131,8 @@ class DiffusionSettings:
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",
             )
+        if self.transport_tolerance is not None and not self.rounds:
+            yield "transport_tolerance", "there are no transport rounds to end; leave it out"
 
 
 @dataclass(frozen=True)

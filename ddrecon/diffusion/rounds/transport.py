@@ -10,12 +10,13 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import replace
+from time import perf_counter
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
-from ddrecon.diffusion.implicit import SolverWithMemory
+from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.mirror import Mirror
@@ -29,6 +30,7 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.ranks import sum_numbers
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
@@ -44,11 +46,14 @@ def run_rounds(
     solve: SolverWithMemory,
     rounds: int,
     degree: int,
+    tolerance: float = 0.0,
 ) -> Moments:
     """Light after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
 
     `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
-    the quadrature. Only the mean is kept where light's direction does not matter.
+    the quadrature. Only the mean is kept where light's direction does not matter. With a
+    `tolerance` rounds end where one changes light by less of it (E7.3). What the last one changes
+    is recorded.
     """
     if rounds == 0:
         return light
@@ -58,12 +63,31 @@ def run_rounds(
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
     mirror = face_mirror(medium, directions, None if emitted is None else glow)
-    for round_index, factor in enumerate(_blending(medium, rounds), 1):
-        cosine = _flux_factor(medium, round_index == rounds)
+    began, is_open = perf_counter(), tolerance > 0
+    factors = [None] * rounds if is_open else _blending(medium, rounds)
+    for round_index, factor in enumerate(factors, 1):
+        is_last, before = round_index == rounds, light.mean
+        cosine = _flux_factor(medium, is_last and not is_open)
         given = round_index, cosine, factor, mirror
         made = _round(problem, light, emitted, solve, directions, *given)
         light = _renewed(made, grid)
+        residual = _residual(light.mean, before, grid) if is_open or is_last else 1.0
+        if is_last or residual < tolerance:
+            break
+    record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
+    solve.memory.records.append(record)
     return light
+
+
+@torch.no_grad()
+def _residual(new: Tensor, old: Tensor, grid: Grid) -> float:
+    """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
+    squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
+    if isinstance(grid, Slab):
+        # halos count as well, alike in both
+        squares = squares.new_tensor(sum_numbers(squares.flatten().tolist())).view_as(squares)
+    changed, whole = squares
+    return float((changed / whole.clamp(min=1e-300)).amax().sqrt())
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:

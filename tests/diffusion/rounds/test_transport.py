@@ -18,6 +18,7 @@ from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.engine import use_engine
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import receive_light
@@ -79,6 +80,25 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
     assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(first.norm())
     changes = [float((light_after(scene, n + 1) - light_after(scene, n)).norm()) for n in (3, 6)]
     assert changes[1] < 0.5 * changes[0] or changes[1] < 0.05 * float(later.norm()), changes
+
+
+@pytest.mark.parametrize("engine", ["torch", "warp"])
+@pytest.mark.parametrize("g", [0.0, 0.6, 0.85])
+def test_a_tolerance_ends_rounds_where_one_changes_light_by_less(g: float, engine: str):
+    """And light is as near to its limit as that says, in fewer rounds the larger it is."""
+    scene = make_scene(ball(), sigma_a=(1.0,), sigma_s=(20.0,), g=g, directional=(3.0,))
+    records, found = [], []
+    use_engine(engine)
+    limit = light_after(scene, 16)
+    for tolerance in (1e-1, 1e-3):
+        settings = replace(scene.diffusion, transport_rounds=16, transport_tolerance=tolerance)
+        memory = SolveMemory()
+        found.append(solve_light(replace(scene, diffusion=settings), memory).diffuse.mean)
+        records.append(next(one for one in memory.records if one.kind == "rounds"))
+    for record, tolerance, light in zip(records, (1e-1, 1e-3), found, strict=True):
+        assert record.residual < tolerance
+        assert float((light - limit).norm() / limit.norm()) < 3 * tolerance
+    assert 1 <= records[0].iterations < records[1].iterations < 16
 
 
 def left_of_noise(
