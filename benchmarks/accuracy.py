@@ -77,6 +77,18 @@ def slab(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return fade(height, 0.11, 0.07) * fade(x.abs(), 0.45, 0.1) * fade(z.abs(), 0.45, 0.1)
 
 
+def limbs(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Two thin bent limbs that cross, with soft edges."""
+    one, other = (
+        fade((across * across + (z + bend) ** 2).sqrt(), 0.09, 0.06) * fade(along.abs(), 0.42, 0.1)
+        for across, bend, along in (
+            (x - 0.2 * y, 0.1 * torch.sin(6 * y), y),
+            (y - 0.3 * x, -0.1 * x, x),
+        )
+    )
+    return 1 - (1 - one) * (1 - other)
+
+
 BALL, SMALL = around((0.0, 0.0, 0.0), 0.38), around((0.22, -0.18, 0.12), 0.17, 0.06)
 CLOUD = together(around((-0.13, -0.08, 0.05), 0.3), around((0.17, 0.1, -0.05), 0.25))
 DEPTH_OF_BALL = 0.65
@@ -176,6 +188,7 @@ VOLUMES = (
         camera=perspective((0.0, 1.6, 2.8)),
     ),
     Case("small ball off center", SMALL, 60.0, 0.99),
+    *(Case(f"thin limbs, g {g}", limbs, 40.0, g=g) for g in (-0.8, 0.85)),
     Case(
         "plume, g 0.5",
         plume_density,

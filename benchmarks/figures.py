@@ -30,6 +30,8 @@ COMMANDS = {
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
     "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
     "thick": "python benchmarks/thick_cells.py",
+    "layers": "python benchmarks/dial.py --only step,half,slab,phantom",
+    "boxes": "python benchmarks/dial.py --only box",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
     "rounds": "python benchmarks/rounds.py",
     "plume": "python benchmarks/reconstruction.py plume",

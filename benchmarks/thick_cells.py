@@ -3,7 +3,9 @@
     python benchmarks/thick_cells.py
 
 The truth is our own, on a grid six times as fine: the same density, linear between the centers of
-the coarse grid, with angles to degree 5 and five rounds. `default` is what a scene file gets.
+the coarse grid, with angles to degree 5 and five rounds. `default` is what a scene file gets; the
+others have cells as given, or `a third` as wide. Merged balls are lit from the side or the eye;
+`block` fills its box.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from accuracy import (
     FRONT,
     SIDE,
     Case,
+    Field,
     Vector,
     around,
     perspective,
@@ -38,18 +41,27 @@ from ddrecon.settings import RenderSettings
 
 CELLS, FINER, PIXELS = 12, 6, 16
 BALLS = together(around((-0.13, -0.08, 0.05), 0.32, 0.2), around((0.17, 0.1, -0.05), 0.27, 0.2))
-LIGHTS: dict[str, tuple[Vector, Vector]] = {
-    "side": (SIDE, FRONT),
-    "eye": ((2.0, -1.2, 2.2), FAR),
+SHOWN: dict[str, tuple[Field, Vector, Vector]] = {
+    "side": (BALLS, SIDE, FRONT),
+    "eye": (BALLS, (2.0, -1.2, 2.2), FAR),
+    "block": (lambda x, y, z: torch.ones_like(x * y * z), (-1.0, -1.2, -1.5), (1.3, 1.1, 2.6)),
 }
-"""By where light comes from, the way it travels and the eye."""
-EXACT = "diffusion.transport_rounds=5", "diffusion.degree=5"
+"""By a name, what is lit, the way light travels and the eye."""
+
+
+def by_dial(rounds: int, degree: int, times: int = 1) -> tuple[str, ...]:
+    keys = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    return tuple(f"diffusion.{key}={value}" for key, value in keys.items())
+
+
+EXACT = by_dial(5, 5)
 MODELS = {
-    "n = 0": ("diffusion.transport_rounds=0",),
-    "n = 1, L = 1": ("diffusion.transport_rounds=1", "diffusion.degree=1"),
-    "n = 1, L = 3": ("diffusion.transport_rounds=1", "diffusion.degree=3"),
-    "n = 3, L = 3": ("diffusion.transport_rounds=3", "diffusion.degree=3"),
-    "default, one sample": ("render.steps_per_voxel=1",),
+    "n = 0": by_dial(0, 1),
+    "n = 1, L = 1": by_dial(1, 1),
+    "n = 1, L = 3": by_dial(1, 3),
+    "n = 3, L = 3": by_dial(3, 3),
+    "n = 1, L = 3, a third": by_dial(1, 3, 3),
+    "n = 3, L = 3, a third": by_dial(3, 3, 3),
     "default": (),
 }
 """Overrides by column: n transport rounds of degree L, samples of rays as by default."""
@@ -70,9 +82,9 @@ def error(image: Tensor, truth: Tensor) -> float:
 
 
 def print_case(g: float, depth: float, lit: str, folder: Path) -> None:
-    """A row: merged balls with `depth` optical depths a cell, lit from the `side` or the `eye`."""
-    travel, eye = LIGHTS[lit]
-    case = Case(lit, BALLS, depth * CELLS, 0.95, g, (sun(travel),), perspective(eye, 22.0))
+    """A row: what is `SHOWN` so with `depth` optical depths a cell."""
+    field, travel, eye = SHOWN[lit]
+    case = Case(lit, field, depth * CELLS, 0.95, g, (sun(travel),), perspective(eye, 22.0))
     path = case.write(folder, CELLS)
     views = f"views.0.camera.resolution={[PIXELS] * 2}"
     truth = render(refine(load_scene(path, overrides=(views, *EXACT))))
@@ -85,11 +97,11 @@ def print_case(g: float, depth: float, lit: str, folder: Path) -> None:
 
 def main() -> None:
     """Prints the table."""
-    print_header("g", "depth of a cell", "lit from the", *MODELS)
+    print_header("g", "depth of a cell", "lit from", *MODELS)
     with tempfile.TemporaryDirectory() as name, torch.no_grad():
         for g in (-0.8, 0.0, 0.6, 0.8):
             for depth in (1.0, 4.0, 8.0):
-                for lit in LIGHTS:
+                for lit in SHOWN:
                     print_case(g, depth, lit, Path(name))
 
 

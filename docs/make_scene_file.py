@@ -439,9 +439,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "refine": (
                 "Light is computed and seen in cells so many times as narrow; the medium is the "
-                "same. Left out, it is 3 where a cell is thicker than 1.5 optical depths, or 9 "
-                "where a third of it is, if there are no more than 1,048,576 cells then and "
-                "density is not sought; else 1."
+                "same. Left out, it is 3 where a cell is thicker than 1.5 optical depths (0.75 "
+                "where a face of the box is dense), or 9 where a third of it is, if there are no "
+                "more than 1,048,576 cells then and density is not sought; else 1."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "

@@ -66,9 +66,10 @@ THICK = 1.5, 4.0
 """Where a cell has more optical depths than one of these, a round more: theta of E7.2 is less than
 1. Measured on half-spaces and slabs (docs/accuracy.md).
 """
-FINER, MOST_CELLS = 1.5, 2**20
-"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths and
-there are no more cells then. Measured on blocks and merged balls (docs/accuracy.md).
+FINER, FINER_FLAT, MOST_CELLS = 1.5, 0.75, 2**20
+"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
+in a flat medium has more than the second, and there are no more cells then. Measured on blocks,
+half-spaces and merged balls (docs/accuracy.md).
 """
 SOFT = 3.0
 """Where no face is dense and a cell has more optical depths, one round: later ones darken soft
@@ -350,11 +351,12 @@ def choose_diffusion(
     if any(name.endswith("density") for name in optimized):
         depth, is_flat = 0.0, False
     times = 1 if settings.refine is None else settings.refine
-    while settings.refine is None and times < 9 and depth / times > FINER:
+    thin = FINER_FLAT if is_flat else FINER
+    while settings.refine is None and times < 9 and depth / times > thin:
         if grid.refine(3 * times).cells > MOST_CELLS:
             break
         times *= 3
-    if depth > FINER:
+    if depth > thin:
         reasons.append(f"cells of {depth:.2g} optical depths")
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     if is_flat or _turns_back(phase):

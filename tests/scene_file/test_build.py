@@ -60,18 +60,19 @@ def test_constants(write: Write):
 @pytest.mark.parametrize(
     "g, depth, is_flat, expected",
     [
-        (0.3, 0.5, False, (1, 1)),
-        (0.3, 0.5, True, (1, 5)),
-        (0.8, 0.5, False, (3, 3)),
-        (0.8, 4, False, (1, 3)),
-        (0.8, 0.5, True, (4, 5)),
-        (0.8, 3, True, (4, 5)),
-        (-0.8, 3, False, (4, 5)),
+        (0.3, 0.5, False, (1, 1, 1)),
+        (0.3, 0.5, True, (1, 5, 1)),
+        (0.8, 0.5, False, (3, 3, 1)),
+        (0.8, 4, False, (3, 3, 3)),
+        (0.8, 50, False, (1, 3, 9)),
+        (0.8, 0.5, True, (4, 5, 1)),
+        (0.8, 50, True, (5, 5, 9)),
+        (-0.8, 3, False, (4, 5, 3)),
     ],
     ids=str,
 )
 def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
-    tmp_path: Path, write: Write, g: float, depth: float, is_flat: bool, expected: tuple[int, int]
+    tmp_path: Path, write: Write, g: float, depth: float, is_flat: bool, expected: tuple[int, ...]
 ):
     """Cells are `depth` optical depths thick; all of them, or one that no face of the box has."""
     values = np.full((5, 5, 5), depth, np.float32)
@@ -80,10 +81,14 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
     write_field(tmp_path / "body.npz", "density", values, BOUNDS)
     density, size = {"file": "body.npz"}, (0.2 + 0.3 + 0.2) / 3
     text = volume(g=g, sigma_a=0.1 / size, sigma_s=0.9 / size, density=density, resolution=[5] * 3)
-    found = load_scene(write(text)).diffusion
-    assert (found.rounds, found.angles) == expected
+    scene = load_scene(write(text))
+    found = scene.diffusion
+    assert (found.rounds, found.angles, found.times) == expected
+    assert f"refine {found.times}: a second moment of {g * g:.2g}" in scene.reason
     chosen = load_scene(write(text), overrides=("diffusion.degree=5",)).diffusion
     assert (chosen.rounds, chosen.angles) == (expected[0], 5)
+    fixed = load_scene(write(text), overrides=("diffusion.refine=1",))
+    assert fixed.diffusion.times == 1 and "refine" not in fixed.reason
 
 
 def test_every_tensor_has_the_type_asked_for(write: Write):

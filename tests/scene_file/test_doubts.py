@@ -44,17 +44,20 @@ def test_a_box_in_kilometers() -> None:
 def test_thick_cells_at_the_faces() -> None:
     """They are told where a medium fills its box, scatters, and is coarse; empty layers help."""
     filled = "volume.density=1", "volume.sigma_a=1", "volume.sigma_s=89", "optimize=null"
+    filled = *filled, "diffusion.refine=1"
     grid = "volume.resolution=[{0}, {0}, {0}]"
     size = load_scene(BALL).volume.grid.extent[0]
     (line,) = doubts(*filled, grid.format(10))
     assert f"are up to {9 * size:.3g} optical depths thick" in line
     assert doubts(*filled, grid.format(10), "volume.sigma_s=0") == []
     assert doubts(*filled, grid.format(math.ceil(60 * size))) == []
+    assert doubts(*filled, grid.format(math.ceil(20 * size)), "diffusion.refine=3") == []
 
 
 def test_a_thick_face_is_told_by_what_it_costs() -> None:
     """Absorption makes a depth worse, a forward peak better; tissue is told of similarity."""
     cells = "volume.density=1", "optimize=null", "volume.resolution=[10, 10, 10]"
+    cells = *cells, "diffusion.refine=1"
     size = load_scene(BALL).volume.grid.extent[0] / 10
     for albedo, g, words in (
         (1, 0, None),
