@@ -338,7 +338,9 @@ def solve_diffuse(
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(problem, light, solve, settings.rounds, settings.angles)
+    return run_rounds(
+        problem, light, solve, settings.rounds, settings.angles, settings.transport_tolerance
+    )
 
 
 def view_picture(

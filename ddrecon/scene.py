@@ -51,7 +51,8 @@ class Scene(Displayed):
     """A loaded scene.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
-    optimized parameter starts from; `ground` lies under the volume, where there is any.
+    optimized parameter starts from; `ground` lies under the volume, where there is any. `reason` is
+    what its transport rounds and their degree were chosen by, if its file left out one of them.
     """
 
     volume: Volume
@@ -63,6 +64,7 @@ class Scene(Displayed):
     starts: dict[str, Tensor] = field(default_factory=dict)
     path: Path | None = None
     ground: Ground | None = None
+    reason: str = ""
 
     def view(self, name: str) -> View:
         """The view called `name`; raises UsageError with the known names."""

@@ -123,12 +123,16 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     terms.append(f"multiple scattering by {settings.model} diffusion, {method}")
     if settings.rounds:
         rounds = _count(settings.rounds, "transport round")
+        if settings.transport_tolerance is not None:
+            rounds = f"at most {rounds}, until the residual is {settings.transport_tolerance:g},"
         directions = count_directions(settings.angles, settings.rounds)
         rounds += f" of sweeps along {directions} directions, each with a diffusion solve"
         if medium.degree > 1:
             left = remaining_moments(medium)[2].abs().max().item()
             rounds += f"; each leaves up to {left:.2g} of what diffusion lacks"
         terms.append(rounds)
+        if scene.reason:
+            terms.append(scene.reason)
         if _has_pairs(medium, scene):
             part = _listed(backward_fraction(medium), medium.is_cellwise)
             terms.append(f"beams in pairs: a backward peak turns {part} of scattering back")

@@ -433,6 +433,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "least one more in cells thicker than 1.5 optical depths, two from 4 on. Where "
                 "none is, it is 1 in cells thicker than 3."
             ),
+            "transport_tolerance": (
+                "Sweeps end where what one of them changes, relative to the light, is so small "
+                "([E7.3](theory.md#transport-rounds)): after `transport_rounds` at most, or 64."
+            ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "
                 "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not "

@@ -28,7 +28,10 @@ from ddrecon.numerics.autodiff import keep, run_plainly
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative."""
+    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative.
+
+    Or, of the kind `round`, transport rounds up to one, where a tolerance ends them (E7.3).
+    """
 
     kind: str
     iterations: int

@@ -11,6 +11,8 @@ namespace ddrecon {
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;
 #else
+// No packet crosses into code that was compiled for other vector registers.
+#pragma GCC diagnostic ignored "-Wpsabi"
 constexpr int LANES = 16;
 constexpr unsigned ALL_LANES = (1u << LANES) - 1;
 #endif

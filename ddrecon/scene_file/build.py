@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -131,7 +132,7 @@ def build_scene(
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     is_flat = _is_flat(media.values())
-    diffusion = choose_rounds(tree, _phase_of(media), is_flat)
+    diffusion, _ = choose_rounds(tree, _phase_of(media), is_flat)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -140,11 +141,20 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, render = choose_rounds(tree, volume.phase, is_flat, volume), tree.render
+    diffusion, reason = choose_rounds(tree, volume.phase, is_flat, volume)
+    render = tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(
-        volume, lights, views, render, diffusion, optimize, path=scene_file.path, ground=ground
+        volume,
+        lights,
+        views,
+        render,
+        diffusion,
+        optimize,
+        path=scene_file.path,
+        ground=ground,
+        reason=reason,
     )
     try:
         require_refracting(scene)
@@ -314,21 +324,26 @@ def _varied(
 
 def choose_rounds(
     tree: SceneTree, phase: PhaseFunction, is_flat: bool, volume: Volume | None = None
-) -> DiffusionSettings:
+) -> tuple[DiffusionSettings, str]:
     """The diffusion settings of `tree`, with rounds and degree as `phase` deserves if left out.
+
+    And the reason for what was left out.
 
     A phase function that is optimized may become any: it starts as one of strong peaks does.
     `is_flat`: whether the medium goes up to a face of the box, if its density is not optimized.
     `volume`: None where it is not known yet; fewer rounds and moments may do in it.
     """
     settings = tree.diffusion
-    if not settings.rounds:
-        return settings
+    if settings.transport_tolerance is not None:
+        settings = replace(settings, transport_rounds=settings.rounds)
+    if not settings.rounds or None not in (settings.transport_rounds, settings.degree):
+        return settings, ""
     moments = phase.moments(3)
     left = float(moments[:, 2].abs().max())
+    reasons = [f"a second moment of scattering of {left:.2g}"]
     optimized = tree.optimize.parameters if tree.optimize else {}
     if any(name == "g" or name.startswith(PHASE) for name in optimized):
-        left = max(left, OPTIMIZED)
+        left, reasons = max(left, OPTIMIZED), ["a phase function that is optimized"]
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     has_density = not any(name.endswith("density") for name in optimized)
     is_flat &= has_density
@@ -336,16 +351,21 @@ def choose_rounds(
     if is_flat or _turns_back(phase):
         thick_rounds = sum(depth > bound for bound in THICK)
         rounds, degree = rounds + max(left > MORE_ROUNDS[0], thick_rounds), 5
+        reasons.append("density up to a face of the box" if is_flat else "a backward peak")
+        reasons += [f"cells of {depth:.2g} optical depths"] * (thick_rounds > 0)
     elif depth > SOFT:
         rounds = 1
+        reasons.append(f"soft cells of {depth:.2g} optical depths")
     if tree.volume.periodic:
         # With fewer directions too much light goes exactly along the axes that repeat.
         rounds, degree = max(rounds, 2), 5
-    return replace(
-        settings,
-        transport_rounds=rounds if settings.transport_rounds is None else settings.transport_rounds,
-        degree=degree if settings.degree is None else settings.degree,
-    )
+        reasons.append("a volume that repeats")
+    both = {"transport_rounds": rounds, "degree": degree}
+    chosen: dict[str, Any] = {
+        name: value for name, value in both.items() if getattr(settings, name) is None
+    }
+    what = " and ".join(f"{name} {value}" for name, value in chosen.items())
+    return replace(settings, **chosen), f"{what}: chosen by {', '.join(reasons)}"
 
 
 def _turns_back(phase: PhaseFunction) -> bool:

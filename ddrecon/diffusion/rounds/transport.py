@@ -8,14 +8,16 @@ real geometry, and takes the moments of what arrives. What it changes is passed 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import replace
+from time import perf_counter
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
-from ddrecon.diffusion.implicit import SolverWithMemory
+from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.mirror import Mirror
@@ -29,6 +31,7 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.ranks import sum_over_ranks
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
@@ -36,6 +39,8 @@ SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
 DAMPING = 0.7
 """Sigma of E7.2: with less, waves from cell to cell grow where cells are thick."""
+CYCLE = 4
+"""Rounds that are blended together where a tolerance ends them (E7.1)."""
 
 
 def run_rounds(
@@ -44,11 +49,14 @@ def run_rounds(
     solve: SolverWithMemory,
     rounds: int,
     degree: int,
+    tolerance: float | None = None,
 ) -> Moments:
     """Light after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
 
     `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
-    the quadrature. Only the mean is kept where light's direction does not matter.
+    the quadrature. With a `tolerance` rounds end before, where the residual (E7.3) is no larger;
+    the memory of `solve` keeps each one's. Only the mean is kept where light's direction does not
+    matter. Derivatives are those of the rounds that were run.
     """
     if rounds == 0:
         return light
@@ -58,12 +66,35 @@ def run_rounds(
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
     mirror = face_mirror(medium, directions, None if emitted is None else glow)
-    for round_index, factor in enumerate(_blending(medium, rounds), 1):
-        cosine = _flux_factor(medium, round_index == rounds)
-        given = round_index, cosine, factor, mirror
-        made = _round(problem, light, emitted, solve, directions, *given)
-        light = _renewed(made, grid)
+    factors = itertools.cycle(_blending(medium, rounds if tolerance is None else CYCLE))
+    for round_index, factor in zip(range(1, rounds + 1), factors, strict=False):
+        began = perf_counter()
+        cosine = _flux_factor(medium, tolerance is None and round_index == rounds)
+        made = _round(problem, light, emitted, solve, directions, round_index, cosine, mirror)
+        if tolerance is None and factor is None:
+            light = _renewed(made, grid)
+            continue
+        change = made.plus(light.scaled(-1.0, -1.0, -1.0))
+        blended = made if factor is None else light.plus(change.scaled(factor, factor, factor))
+        light = _renewed(blended, grid)
+        if tolerance is not None:
+            residual = _residual(change, made, grid)
+            record = SolveRecord("round", round_index, residual, perf_counter() - began)
+            solve.memory.records.append(record)
+            if residual <= tolerance:
+                break
     return light
+
+
+def _residual(change: Moments, light: Moments, grid: Grid) -> float:
+    """How large the `change` that a round makes is, relative to `light` (E7.3): of all colors."""
+    powers = []
+    for one in (change, light):
+        phi = one.harmonics(1 if one.flux is not None else 0).detach()
+        phi = grid.own(phi) if isinstance(grid, Slab) else phi
+        powers.append(phi.square().sum((0, -3, -2, -1), dtype=torch.float64))
+    changed, whole = sum_over_ranks(powers) if isinstance(grid, Slab) else powers
+    return float((changed / whole.clamp(min=torch.finfo(torch.float64).tiny)).max().sqrt())
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:
@@ -101,10 +132,9 @@ def _round(
     directions: int,
     round_index: int,
     cosine: Tensor,
-    factor: Tensor | None,
     mirror: Mirror | None,
 ) -> Moments:
-    """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
+    """What one round makes of `light` (E2.10).
 
     `emitted`: light as of `sweep_emission`; `cosine`: as of `_flux_factor`.
     """
@@ -124,11 +154,7 @@ def _round(
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
-    if factor is None:
-        return new
-    difference = new.plus(light.scaled(-1.0, -1.0, -1.0))
-    return light.plus(difference.scaled(factor, factor, factor))
+    return Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:

@@ -134,6 +134,42 @@ def test_what_is_left_shrinks_in_hard_volumes(
     assert all(after < 0.95 * before for before, after in pairwise(left)), left
 
 
+@pytest.mark.parametrize(("g", "degree"), [(0.0, 3), (0.85, 5), (-0.7, 3)])
+def test_a_tolerance_ends_rounds_at_its_residual_near_where_they_come_to_rest(
+    g: float, degree: int
+):
+    model = {"tolerance": 1e-10, "transport_rounds": None, "degree": degree}
+    scene = make_scene(ball(8), g=g, directional=(3.0,), **model)
+
+    def light(tolerance: float) -> tuple[Tensor, list[float]]:
+        memory = SolveMemory()
+        settings = replace(scene.diffusion, transport_tolerance=tolerance)
+        found = solve_light(replace(scene, diffusion=settings), memory).diffuse.mean
+        return found, [one.residual for one in memory.records if one.kind == "round"]
+
+    rest, _ = light(1e-8)
+    for tolerance in (1e-2, 1e-4):
+        found, residuals = light(tolerance)
+        assert residuals[-1] <= tolerance < min(residuals[:-1], default=1.0), residuals
+        assert float((found - rest).norm()) < 2 * tolerance * float(rest.norm())
+
+
+def test_derivatives_are_those_of_the_rounds_that_a_tolerance_leaves():
+    model = {"tolerance": 1e-12, "transport_rounds": None, "transport_tolerance": 1e-3}
+    density, step = ball(6), 1e-5
+    way = torch.sin(torch.arange(density.numel()).double()).view_as(density)
+
+    def total(density: Tensor) -> Tensor:
+        return render(make_scene(density, g=0.6, directional=(3.0,), **model)).square().sum()
+
+    center = 0.1 + density
+    by_difference = (total(center + step * way) - total(center - step * way)) / (2 * step)
+    value, tangent = torch.func.jvp(total, (center,), (way,))
+    (adjoint,) = torch.autograd.grad(total(center.requires_grad_()), center)
+    torch.testing.assert_close((adjoint * way).sum(), tangent, rtol=1e-10, atol=0)
+    torch.testing.assert_close(tangent, by_difference, rtol=1e-6, atol=1e-9 * float(value))
+
+
 @pytest.mark.parametrize(("g", "thickness"), [(-0.8, 4.0), (0.0, 2.0), (0.8, 4.0)])
 def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
     g: float, thickness: float
