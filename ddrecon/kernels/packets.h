@@ -12,6 +12,8 @@ namespace ddrecon {
 constexpr int LANES = 1;
 #else
 constexpr int LANES = 16;
+// Packets are no part of an interface between compilers, which is what is warned of.
+#pragma GCC diagnostic ignored "-Wpsabi"
 constexpr unsigned ALL_LANES = (1u << LANES) - 1;
 #endif
 
