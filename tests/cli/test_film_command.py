@@ -133,6 +133,36 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
     assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
 
 
+def test_frames_end_by_themselves_as_runs_do(
+    film: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ddrecon.reconstruct.tuning.WINDOW", 3)
+    sizes = "-D", "optimize.iterations=auto", "-D", "frames.calibrate=0"
+    succeed(*optimize("-o", "out", "--frames", "0:1", *sizes))
+    for number in range(2):
+        summary = json.loads(Path(f"out/frames/000{number}/summary.json").read_text())
+        assert summary["ended"]["kind"] == "rest" and 12 <= summary["iterations"] < 300
+
+
+def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
+    """It begins from nothing, and its first frame moves as the second does."""
+    for name in VIEWS:
+        for number in (8, 9):
+            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_{number - 6:02d}.npy"))
+    sizes = "-D", "frames.calibrate=0", "-D", "frames.first=0", "-D", "frames.last=9"
+    for name in VIEWS:
+        for number in range(4, 8):
+            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_00.npy"))
+    succeed(*optimize("-o", "alone", "--frames", "8:9", *sizes))
+    for part in ("0:1", "8:9"):
+        succeed(*optimize("-o", "out", "--resume", "--frames", part, *sizes))
+    out, alone = volumes("out"), volumes("alone")
+    assert alone.items() <= out.items()
+    assert not [file for file in out if file.startswith("frames/0008/start")]
+    arrows = [out[f"frames/000{number}/volumes/velocity.npz"] for number in (8, 9)]
+    assert arrows[0] == arrows[1]
+
+
 @pytest.fixture
 def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
