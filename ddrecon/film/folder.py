@@ -189,6 +189,21 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
+def finished_frames(
+    path: Path, part: str | None, build: Callable[[SceneFile], Scene]
+) -> list[Path]:
+    """The runs of those frames of the film in the folder `path` that are done, of a `part` of it.
+
+    Raises UsageError where there are none.
+    """
+    film = Film(read_scene(path / "scene.yaml"), path, build)
+    done = film.done()
+    found = [film.of(number) for number in film.choose(part) if number in done]
+    if not found:
+        raise UsageError(f"{path}: no such frame is done")
+    return found
+
+
 def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
     """Prepares the folder of `film`, whose calibration may be `shared` from a file.
 

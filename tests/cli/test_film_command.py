@@ -110,7 +110,11 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
         for name in field_names(exported):
             values = read_field(run / "volumes" / f"{name}.npz", name).values
             np.testing.assert_array_equal(read_field(exported, name).values, values)
-    # Each is a run as any other.
+    # Each is a run as any other, and some are rendered together.
+    succeed("render", "out", "-o", "seen", "--frames", "1:2", "--view", "side")
+    succeed("render", "out/frames/0002", "-o", "one", "--view", "side")
+    assert sorted(path.name for path in Path("seen").iterdir()) == ["0001", "0002"]
+    np.testing.assert_array_equal(np.load("seen/0002/side.npy"), np.load("one/side.npy"))
     load_run(Path("out/frames/0002"), lambda dtype: load_scene("out/frames/0002/scene.yaml"))
     # Its calibration goes to another film.
     succeed(*optimize("-o", "other", "--shared", "out/shared.json", "--frames", "2:"))
@@ -338,8 +342,11 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     Path("strange.json").write_text(json.dumps(shared))
     strange = run(*optimize("-o", "new", "--shared", "strange.json"))
     assert strange.exit_code == 2 and "views.top.exposure: the scene has none" in strange.stderr
-    single = run("optimize", "scene.yaml", "-o", "single", "--frames", "0:1")
-    assert single.exit_code == 2 and "--frames is for films" in single.stderr
+    for command, line in (("optimize", "is for films"), ("render", "is for the folders of films")):
+        single = run(command, "scene.yaml", "-o", "single", "--frames", "0:1")
+        assert single.exit_code == 2 and f"--frames {line}" in single.stderr
+    beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
+    assert beyond.exit_code == 2 and "no such frame is done" in beyond.stderr
 
 
 def test_frames_are_spread_over_all() -> None:
