@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -93,6 +93,7 @@ def balance(session: Session, scene: Path) -> None:
 )
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
 @click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
+@click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @SHARE
 @DTYPE
 @REPORT
@@ -109,13 +110,45 @@ def render(
     count: int | None,
     has_fluence: bool,
     exported: str | None,
+    part: str | None,
 ) -> None:
-    """Render the views of SCENE, a scene file or the folder of a finished run."""
+    """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
     if exported and not has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
-    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     if lights:
         session = session.with_override(f"lights=[{', '.join(lights)}]")
+    choice = overwrite, names, components, parameter, lights, count, has_fluence, exported
+    if not (scene / "frames").is_dir():
+        if part is not None:
+            raise click.UsageError("--frames is for the folders of films: SCENE is none")
+        report, lines = _render(session, scene, output, *choice)
+        session.show(report, lines)
+        return
+    from ddrecon.film.folder import finished_frames
+
+    frames = finished_frames(scene, part, session.build)
+    found = {run.name: _render(session, run, output / run.name, *choice) for run in frames}
+    session.show(
+        {name: report for name, (report, _) in found.items()},
+        [*chain.from_iterable(lines for _, lines in found.values())],
+    )
+
+
+def _render(
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    components: bool,
+    parameter: str | None,
+    lights: tuple[str, ...],
+    count: int | None,
+    has_fluence: bool,
+    exported: str | None,
+) -> tuple[dict[str, Any], list[str]]:
+    """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
+    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -141,11 +174,11 @@ def render(
         choice = components, session.progress, parameter, kinds
         report = render_to_folder(loaded, views, output, *choice)
         if not is_first():
-            return
+            return {}, []
         if count is not None:
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
-    session.show(report, render_lines(report, output))
+    return report, render_lines(report, output)
 
 
 @click.command()
