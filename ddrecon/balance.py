@@ -36,6 +36,7 @@ from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
 from ddrecon.medium.coefficients import Medium, keep_medium
 from ddrecon.medium.fresnel import reflectance, transmitted_moments
+from ddrecon.medium.levels import refine_medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
@@ -67,7 +68,11 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
-    box = _Box((medium, keep_medium(scene.volume)), DIRECTIONS[settings.angles], lit)
+    box = _Box(
+        (medium, refine_medium(keep_medium(scene.volume), settings.times)),
+        DIRECTIONS[settings.angles],
+        lit,
+    )
     sources = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
     crossings = {name: box.cross(parts) for name, parts in sources.items()}
     if lit:

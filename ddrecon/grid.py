@@ -79,6 +79,11 @@ class Grid:
             coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
         return coordinates
 
+    def refine(self, times: int) -> Grid:
+        """The same box with so many times as many cells, but along axes of a single one."""
+        z, y, x = (cells if cells == 1 else times * cells for cells in self.shape)
+        return replace(self, shape=(z, y, x))
+
     def coarsen(self, factor: float) -> Grid:
         """The same box with about `factor` times fewer cells along each axis (at least one)."""
         z, y, x = (max(1, round(cells / factor)) for cells in self.shape)

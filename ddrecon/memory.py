@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -36,6 +37,7 @@ class Needs:
     `resolution` (x, y, z), `colors` (1 or 3), `size`: bytes of a number, `pixels` of all views.
     `moments` is how many of light rounds keep. `varied` is how many fields are optimized, each
     color counted; None where nothing is. `threads` are those of fused kernels (`count_threads`).
+    Light is computed in cells so many `times` as narrow.
     """
 
     resolution: tuple[int, int, int]
@@ -49,11 +51,18 @@ class Needs:
     varied: float | None = None
     lights: int = 1
     threads: int = 1
+    times: int = 1
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Cells along z, y and x, `times` as narrow as those of the scene."""
+        x, y, z = (count if count == 1 else self.times * count for count in self.resolution)
+        return z, y, x
 
     @property
     def cells(self) -> int:
         """Number of cells."""
-        return self.resolution[0] * self.resolution[1] * self.resolution[2]
+        return math.prod(self.shape)
 
 
 def memory_of(needs: Needs, is_short: bool = False) -> int:
@@ -99,11 +108,10 @@ def shared_memory(needs: Needs) -> int:
     """Bytes of such copies at most, beyond those of two threads."""
     if needs.threads <= 2:
         return 0
-    x, y, z = needs.resolution
     # What view rays meet: fields of matter and light, and the mass to each light.
     of_cells = needs.size * needs.cells * needs.colors * (MATTER + needs.lights)
     of_rays = min(spare.MOST_COPIED, (needs.threads - 2) * of_cells)
-    piece = needs.size * piece_numbers((z, y, x), needs.colors, needs.moments)
+    piece = needs.size * piece_numbers(needs.shape, needs.colors, needs.moments)
     pieces = spare.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
     return max(of_rays * (needs.varied is not None), pieces * piece * needs.has_rounds)
 
@@ -146,6 +154,8 @@ def _smaller(needs: Needs, free: int) -> Iterator[tuple[str, Needs]]:
     """What could be given up, in the words of the command line."""
     if needs.size == 8:
         yield "--dtype float32", replace(needs, size=4)
+    if needs.times > 1:
+        yield "-D diffusion.refine=1", replace(needs, times=1)
     if needs.has_rounds:
         yield "-D diffusion.transport_rounds=0", replace(needs, has_rounds=False)
     if needs.is_limited:

@@ -52,7 +52,7 @@ from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.march.windows import look_inside, see_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
-from ddrecon.medium.levels import resample, volume_at_level
+from ddrecon.medium.levels import refine_medium, resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.harmonics import harmonics
@@ -61,7 +61,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import Slab, own_slab
+from ddrecon.slabs.slab import Slab, own_slab, whole_of
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
@@ -151,6 +151,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
             "ground: there is none where processes share out cells; leave --share cells out"
         )
     coarse = volume_at_level(volume, exchange_grid(volume.grid))
+    as_given = replace(settings, refine=1)
     plane, render_settings = scene.ground.plane, scene.render
     medium = _medium_of(coarse, settings)
     cells = average_cells(medium)
@@ -163,18 +164,21 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
     for _ in range(EXCHANGES if coarse.grid.periodic else 1):
         begun = from_below(*reflect(lit, medium, render_settings))
-        first = _find_light(coarse, sources, settings, replace(memory, last={}), begun)
+        first = _find_light(coarse, sources, as_given, replace(memory, last={}), begun)
         glow = _glow(first, plane, multiply_scatters(medium, settings))
         lit = light_texels(lit, sources, medium, glow, render_settings)
     sent = reflect(lit, medium, render_settings)
-    below = from_below(*sent).mapped(lambda field: resample(field, volume.grid))
-    light_field = _find_light(volume, sources, settings, memory, below)
+    light_field = _find_light(volume, sources, settings, memory, from_below(*sent))
     return replace(light_field, ground=replace(lit, sent=sent))
 
 
 def require_refracting(scene: Scene) -> None:
-    """Raises UsageError for what is not computed where the volume's faces refract light."""
+    """Raises UsageError for what is not computed where faces refract light, or cells are shared."""
     settings, is_there = scene.diffusion, dict[str, bool]()
+    if settings.times > 1 and isinstance(own_slab(scene.volume.grid), Slab):
+        raise UsageError(
+            "diffusion.refine: cells are as they are where processes share them out; say refine: 1"
+        )
     if scene.volume.index != 1:
         is_there = {
             "a ground": scene.ground is not None,
@@ -211,8 +215,10 @@ def _find_light(
     memory: SolveMemory,
     below: Moments | None = None,
 ) -> LightField:
-    """The light of `lights` in `volume`, and of what comes from `below`."""
-    medium = _medium_of(volume, settings)
+    """The light of `lights` in `volume`, and of what comes from `below` on a grid of the box."""
+    medium = refine_medium(_medium_of(volume, settings), settings.times)
+    if below is not None:
+        below = below.mapped(lambda field: resample(field, medium.grid))
     if medium.index != 1:
         # With what faces reflect inside of light that is not yet scattered (E5.8).
         below = reflected_light(average_cells(medium), lights, medium.degree)
@@ -261,11 +267,12 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 
     Differentiable as `render`, and `memory` as there.
     """
-    return fluence_of(solve_light(scene, memory or SolveMemory()), scene.diffusion)
+    light_field = solve_light(scene, memory or SolveMemory())
+    return resample(fluence_of(light_field, scene.diffusion), scene.volume.grid)
 
 
 def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
-    """The fluence [C, z, y, x] >= 0, averaged over each cell: of the whole grid, also in slabs."""
+    """The fluence [C, z, y, x] >= 0, averaged over each cell of the medium, in slabs of all."""
     medium = light_field.medium
     mean = light_field.diffuse.mean + light_field.received.mean
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
@@ -431,13 +438,13 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         return given
 
     if medium.index == 1:
-        sight = look_through(camera, scene.volume.grid, scene.render)
+        sight = look_through(camera, whole_of(medium.grid), scene.render)
         behind = look_behind(sight.rays, given)
         if light_field.ground is not None:
             behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
         radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     else:
-        rays, windows = look_inside(camera, scene.volume.grid, medium.index, scene.render)
+        rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
         beside = look_behind(rays, given)
         radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
         for window in windows:

@@ -51,8 +51,8 @@ class Scene(Displayed):
     """A loaded scene.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
-    optimized parameter starts from; `ground` lies under the volume, where there is any. `reason` is
-    what its transport rounds and their degree were chosen by, if its file left out one of them.
+    optimized parameter starts from; `ground` lies under the volume, where there is any. `reason`:
+    which settings of `diffusion` its file leaves out, and what of the medium decides them.
     """
 
     volume: Volume

@@ -84,10 +84,10 @@ class DiffusionSettings:
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
-    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). A
-    scene file that leaves them out gets what its phase function deserves. With a
-    `transport_tolerance` rounds end where a residual is so small (E7.3), and are `transport_rounds`
-    at most.
+    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 7). With a
+    `transport_tolerance` they end where a residual is so small (E7.3), and are `transport_rounds`
+    at most. Light is computed and seen in cells a `refine`th as wide. A scene file that leaves
+    these out gets what its medium deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -106,6 +106,7 @@ class DiffusionSettings:
     transport_rounds: int | None = bounded(None, minimum=0, maximum=MOST_ROUNDS)
     transport_tolerance: float | None = bounded(None, above=0, maximum=0.5)
     degree: int | None = one_of(None, (1, 3, 5, 7))
+    refine: int | None = one_of(None, (1, 3, 9), expert=True)
 
     @property
     def angles(self) -> int:
@@ -113,6 +114,11 @@ class DiffusionSettings:
         if not self.rounds:
             return 1
         return 3 if self.degree is None else self.degree
+
+    @property
+    def times(self) -> int:
+        """How many times as narrow cells are in which light is computed: left out, as they are."""
+        return 1 if self.refine is None else self.refine
 
     @property
     def rounds(self) -> int:

@@ -34,6 +34,7 @@ def needed_terms(scene: Scene) -> list[str]:
     colors = medium.extinction.scale.shape[0]
     samples = _count(scene.render.steps, "sample")
     means = _listed(phase.moments(2)[:, 1], phase.cells is not None)
+    depth = greatest_depth(scene.volume) / scene.diffusion.times
     return [
         f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
         f"phase function {phase.NAME}, mean cosine {means}",
@@ -43,7 +44,7 @@ def needed_terms(scene: Scene) -> list[str]:
         *_face_terms(scene.volume.index),
         *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
         *_diffuse_terms(medium, scene, is_diffuse),
-        f"view rays: {samples} a cell of at most {greatest_depth(scene.volume):.2g} optical depths",
+        f"view rays: {samples} a cell of at most {depth:.2g} optical depths",
     ]
 
 
@@ -131,8 +132,11 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
             left = remaining_moments(medium)[2].abs().max().item()
             rounds += f"; each leaves up to {left:.2g} of what diffusion lacks"
         terms.append(rounds)
+        if settings.times > 1:
+            cells = " x ".join(map(str, reversed(scene.volume.grid.refine(settings.times).shape)))
+            terms.append(f"light in {cells} cells, {settings.times} times as narrow")
         if scene.reason:
-            terms.append(scene.reason)
+            terms.append(f"by default {scene.reason}")
         if _has_pairs(medium, scene):
             part = _listed(backward_fraction(medium), medium.is_cellwise)
             terms.append(f"beams in pairs: a backward peak turns {part} of scattering back")

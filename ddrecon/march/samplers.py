@@ -158,17 +158,21 @@ def support_of_planes(support: Tensor, way: Way, steps: int) -> Tensor:
     return subdivide(slices[:, None], steps)[:, 0] > 0
 
 
-def choose_steps(volume: Volume) -> int:
-    """Samples a cell that `volume` deserves: 2 where one is optically thick, else 1."""
-    return 2 if greatest_depth(volume) > THICK else 1
+def choose_steps(volume: Volume, times: int) -> int:
+    """Samples a cell, so many `times` as narrow, of `volume`: 2 where one is thick, else 1."""
+    return 2 if greatest_depth(volume) / times > THICK else 1
 
 
 def greatest_depth(volume: Volume) -> float:
-    """The greatest optical depth of a cell of `volume`, of any color, across its mean side."""
+    """The greatest optical depth of a cell of `volume`, of any color, across its mean side.
+
+    Along axes of a single cell nothing varies: they do not count, unless there are no others.
+    """
     absorbing, scattering = (
         sigma.detach() if sigma.ndim == 4 else along_colors(sigma).detach()
         for sigma in (volume.sigma_a, volume.sigma_s)
     )
     most = (absorbing + scattering).amax(0)
-    spacing = volume.grid.spacing
-    return float((volume.density.detach() * most).amax()) * sum(spacing) / len(spacing)
+    sides = list(zip(volume.grid.spacing, volume.grid.shape, strict=True))
+    widths = [width for width, cells in sides if cells > 1] or list(volume.grid.spacing)
+    return float((volume.density.detach() * most).amax()) * sum(widths) / len(widths)

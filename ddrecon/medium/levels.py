@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Volume, put_volume
+from ddrecon.medium.coefficients import Medium, Volume, put_volume
 from ddrecon.medium.mixture import mix_media
+from ddrecon.numerics.periods import unroll
 
 
 def volume_at_level(volume: Volume, grid: Grid) -> Volume:
@@ -24,6 +25,18 @@ def volume_at_level(volume: Volume, grid: Grid) -> Volume:
         volume.density, volume.support = volume.density * support, None
         volume.emission = None if volume.emission is None else volume.emission * support
     return put_volume(volume, grid, partial(resample, grid=grid))
+
+
+def refine_medium(medium: Medium, times: int) -> Medium:
+    """`medium` in cells an odd number of `times` as narrow.
+
+    It is the same between all its centers, which are centers there as well.
+    """
+    if times == 1:
+        return medium
+    finer, period = medium.grid.refine(times), unroll(medium.grid, 1)
+    wide, around = period.wide.refine(times), unroll(finer, times)
+    return medium.put(finer, lambda field: around.crop(resample(period.extend(field), wide)))
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

@@ -17,6 +17,7 @@ from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
 from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
 from ddrecon.losses import Target
+from ddrecon.medium.levels import resample
 from ddrecon.progress import Progress
 from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.renderer import LightField, fluence_of, solve_light, view_components, view_picture
@@ -95,7 +96,8 @@ def _write_fluence(
     light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
 ) -> list[str]:
     """The names of files of these `kinds` in `folder`, which the first rank writes."""
-    found = forward_ad.unpack_dual(fluence_of(light_field, scene.diffusion)).primal
+    found = resample(fluence_of(light_field, scene.diffusion), scene.volume.grid)
+    found = forward_ad.unpack_dual(found).primal
     stem = folder / "volumes" / "fluence"
     if not is_first():
         return []

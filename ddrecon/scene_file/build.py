@@ -64,6 +64,10 @@ THICK = 1.5, 4.0
 """Where a cell has more optical depths than one of these, a round more: theta of E7.2 is less than
 1. Measured on half-spaces and slabs (docs/accuracy.md).
 """
+FINER, MOST_CELLS = 1.5, 2**20
+"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths and
+there are no more cells then. Measured on blocks and merged balls (docs/accuracy.md).
+"""
 SOFT = 3.0
 """Where no face is dense and a cell has more optical depths, one round: later ones darken soft
 edges. Measured on merged balls (docs/accuracy.md).
@@ -131,8 +135,9 @@ def build_scene(
     problems.raise_any()
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
+    depth = sum(map(greatest_depth, media.values()))
     is_flat = _is_flat(media.values())
-    diffusion, _ = choose_rounds(tree, _phase_of(media), is_flat)
+    diffusion, _ = choose_diffusion(tree, _phase_of(media), grid, depth, is_flat)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -141,10 +146,10 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, reason = choose_rounds(tree, volume.phase, is_flat, volume)
+    diffusion, reason = choose_diffusion(tree, volume.phase, grid, depth, is_flat)
     render = tree.render
     if render.steps_per_voxel is None:
-        render = replace(render, steps_per_voxel=choose_steps(volume))
+        render = replace(render, steps_per_voxel=choose_steps(volume, diffusion.times))
     scene = Scene(
         volume,
         lights,
@@ -299,6 +304,7 @@ def needs_of_scene(
         varied=sum(varied) if varied else None,
         lights=len(lights),
         threads=count_threads(first.density.device),
+        times=diffusion.times,
     )
 
 
@@ -322,50 +328,51 @@ def _varied(
     return is_field * (colors if kind.is_color else 1)
 
 
-def choose_rounds(
-    tree: SceneTree, phase: PhaseFunction, is_flat: bool, volume: Volume | None = None
+def choose_diffusion(
+    tree: SceneTree, phase: PhaseFunction, grid: Grid, depth: float, is_flat: bool
 ) -> tuple[DiffusionSettings, str]:
-    """The diffusion settings of `tree`, with rounds and degree as `phase` deserves if left out.
+    """The diffusion settings of `tree`, where it leaves any out as a medium deserves; and why.
 
-    And the reason for what was left out.
-
-    A phase function that is optimized may become any: it starts as one of strong peaks does.
-    `is_flat`: whether the medium goes up to a face of the box, if its density is not optimized.
-    `volume`: None where it is not known yet; fewer rounds and moments may do in it.
+    By its `phase` function: one that is optimized may become any, and starts as one of strong peaks
+    does. If its density is not optimized, also by the `depth` of its thickest cell on `grid`, and
+    whether it goes up to a face of the box, `is_flat`.
     """
     settings = tree.diffusion
     if settings.transport_tolerance is not None:
         settings = replace(settings, transport_rounds=settings.rounds)
-    if not settings.rounds or None not in (settings.transport_rounds, settings.degree):
+    if not settings.rounds:
         return settings, ""
-    moments = phase.moments(3)
-    left = float(moments[:, 2].abs().max())
-    reasons = [f"a second moment of scattering of {left:.2g}"]
+    left = float(phase.moments(3)[:, 2].abs().max())
     optimized = tree.optimize.parameters if tree.optimize else {}
     if any(name == "g" or name.startswith(PHASE) for name in optimized):
-        left, reasons = max(left, OPTIMIZED), ["a phase function that is optimized"]
+        left = max(left, OPTIMIZED)
+    reasons = [f"a second moment of {left:.2g} of the phase function"]
+    if any(name.endswith("density") for name in optimized):
+        depth, is_flat = 0.0, False
+    times = 1 if settings.refine is None else settings.refine
+    while settings.refine is None and times < 9 and depth / times > FINER:
+        if grid.refine(3 * times).cells > MOST_CELLS:
+            break
+        times *= 3
+    if depth > FINER:
+        reasons.append(f"cells of {depth:.2g} optical depths")
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    has_density = not any(name.endswith("density") for name in optimized)
-    is_flat &= has_density
-    depth = greatest_depth(volume) if has_density and volume is not None else 0.0
     if is_flat or _turns_back(phase):
-        thick_rounds = sum(depth > bound for bound in THICK)
+        reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
+        thick_rounds = sum(depth / times > bound for bound in THICK)
         rounds, degree = rounds + max(left > MORE_ROUNDS[0], thick_rounds), 5
-        reasons.append("density up to a face of the box" if is_flat else "a backward peak")
-        reasons += [f"cells of {depth:.2g} optical depths"] * (thick_rounds > 0)
-    elif depth > SOFT:
+    elif depth / times > SOFT:
         rounds = 1
-        reasons.append(f"soft cells of {depth:.2g} optical depths")
     if tree.volume.periodic:
         # With fewer directions too much light goes exactly along the axes that repeat.
-        rounds, degree = max(rounds, 2), 5
         reasons.append("a volume that repeats")
-    both = {"transport_rounds": rounds, "degree": degree}
-    chosen: dict[str, Any] = {
-        name: value for name, value in both.items() if getattr(settings, name) is None
+        rounds, degree = max(rounds, 2), 5
+    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    left_out: dict[str, Any] = {
+        key: value for key, value in chosen.items() if getattr(settings, key) is None
     }
-    what = " and ".join(f"{name} {value}" for name, value in chosen.items())
-    return replace(settings, **chosen), f"{what}: chosen by {', '.join(reasons)}"
+    words = ", ".join(f"{key} {value}" for key, value in left_out.items())
+    return replace(settings, **left_out), f"{words}: {', '.join(reasons)}" if words else ""
 
 
 def _turns_back(phase: PhaseFunction) -> bool:

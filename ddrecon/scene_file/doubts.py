@@ -12,6 +12,7 @@ from ddrecon.light.ground import stay_above
 from ddrecon.light.lights import EnvironmentLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.scene import Scene
+from ddrecon.settings import DiffusionSettings
 from ddrecon.variables.values import extinction_of, with_values
 
 THICKEST, THINNEST = 3e3, 1e-3
@@ -35,7 +36,7 @@ def find_doubts(scene: Scene) -> list[str]:
     extinction = extinction_of(volume).amax(0)
     return [
         *_doubt_depth(volume, extinction),
-        *_doubt_faces(volume, extinction, scene.diffusion.angles),
+        *_doubt_faces(volume, extinction, scene.diffusion),
         *_doubt_cameras(scene),
         *_doubt_ground(scene),
     ]
@@ -53,19 +54,19 @@ def _doubt_depth(volume: Volume, extinction: Tensor) -> list[str]:
     return []
 
 
-def _doubt_faces(volume: Volume, extinction: Tensor, angles: int) -> list[str]:
+def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings) -> list[str]:
     """Whether a medium that scatters is thick in cells at the faces of the box.
 
     What counts is the depth without the forward peak, and more of it where light is absorbed.
     """
     if not bool((volume.sigma_s > 0).any()):
         return []
-    medium = scale_medium(volume, angles)
+    medium = scale_medium(volume, settings.angles)
     lost = medium.extinction.value
     lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
     thickest, whole = (
         max(
-            float(field.select(axis - 3, end).max()) * size
+            float(field.select(axis - 3, end).max()) * size / settings.times
             for axis, size in enumerate(volume.grid.spacing)
             for end in (0, -1)
         )
