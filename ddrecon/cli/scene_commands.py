@@ -7,6 +7,7 @@ scene file, are shown at once.
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -163,6 +164,10 @@ def _render(
     )
 
     loaded = session.build(scene_file)
+    if has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+        # light in empty cells, which views do not see, takes a second one
+        rounds = loaded.diffusion.rounds
+        loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
     require_sharing(loaded)
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     if lights or count is not None:

@@ -153,8 +153,8 @@ class Layer:
 class StepCloud:
     """I3RC's step cloud: optical depths 2 and 18 in turn, each 0.25 km wide and thick, g 0.85.
 
-    It does not vary along y, where it is one cell, and repeats along x: the middle of five periods
-    is seen from the zenith. Cahalan et al. 2005, doi:10.1175/BAMS-86-9-1275, case 1.
+    It does not vary along y, where it is one cell, and repeats along x. It is seen from the
+    zenith. Cahalan et al. 2005, doi:10.1175/BAMS-86-9-1275, case 1.
     """
 
     name: str
@@ -163,15 +163,16 @@ class StepCloud:
 
     def seen(self, overrides: Sequence[str] = ()) -> Seen:
         """pi I / (F mu0) above each of 32 columns, `up`."""
-        columns = np.tile(np.repeat([8.0, 72.0], 16), 5)
-        corners = np.array([[0.0, -500.0, 0.0], [2.5, 500.0, 0.25]])
-        camera = _camera([0.0, 0.0, 1.0], [1.25, 0.0, 0.25], 0.5, 128)
+        columns = np.repeat([8.0, 72.0], 16)
+        corners = np.array([[0.0, 0.0, 0.0], [0.5, 1 / 64, 0.25]])
+        camera = _camera([0.0, 0.0, 1.0], [0.25, 1 / 128, 0.25], 0.5, 128)
         with tempfile.TemporaryDirectory() as name:
             path = Path(name) / "cloud.npz"
             density = np.broadcast_to(columns, (16, 1, len(columns)))
             write_field(path, "density", density, corners)
             low, high = corners.tolist()
-            volume = {"bounds": {"min": low, "max": high}, "density": {"file": str(path)}}
+            volume = {"bounds": {"min": low, "max": high}, "periodic": ["x", "y"]}
+            volume["density"] = {"file": str(path)}
             medium = {"sigma_t": 1.0, "albedo": self.albedo, "g": 0.85}
             images = show(_scene(volume | medium, self.sun, [camera]), overrides)
         return {"up": images.reshape(32, -1).mean(1) / self.sun}
