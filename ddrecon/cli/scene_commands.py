@@ -12,11 +12,12 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from warnings import warn
 
 import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
-from ddrecon.errors import UsageError
+from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -273,12 +274,23 @@ def optimize(
 @OUTPUT
 @OVERWRITE
 @click.option(
+    "--calibrate",
+    "experiments",
+    type=click.IntRange(min=0),
+    default=2,
+    show_default=True,
+    metavar="N",
+    help="Experiments, each as long as RUN was: what it found is photographed and reconstructed, "
+    "and how far off that is are the deviations. 0: what noise alone leaves, which is far too "
+    "little. In all, also after --resume.",
+)
+@click.option(
     "--samples",
     type=click.IntRange(min=2),
     default=16,
     show_default=True,
     metavar="N",
-    help="Samples of the posterior in all, also after --resume.",
+    help="Samples of what the experiments leave open, for --keep-samples and --next-view.",
 )
 @click.option(
     "--noise",
@@ -288,11 +300,6 @@ def optimize(
     help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
     "reconstruction leaves.",
 )
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(min=0, max=1, min_open=True),
-    help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
-)
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
 @click.option(
     "--next-view",
@@ -300,7 +307,8 @@ def optimize(
     help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
     "(ring), or in directional lights that are (lights).",
 )
-@click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
+@click.option("--tolerance", type=float, hidden=True)
+@click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
 def uncertainty(
@@ -308,11 +316,12 @@ def uncertainty(
     run: Path,
     output: Path,
     overwrite: bool,
+    experiments: int,
     samples: int,
     read: float | None,
-    tolerance: float | None,
     has_samples: bool,
     next_view: str | None,
+    tolerance: float | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -326,6 +335,8 @@ def uncertainty(
     from ddrecon.uncertainty.folder import uncertainty_lines
     from ddrecon.uncertainty.next_view import FEWEST
 
+    if tolerance is not None:
+        warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
@@ -337,13 +348,12 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, noise, tolerance, next_view)
+    request = Request(session.seed, experiments, samples, noise, next_view, has_samples)
     if not is_first():
-        follow_uncertainty(taken, samples, request)
+        follow_uncertainty(taken, request)
         return
     with claim_folder(output, may_exist=overwrite or resume):
-        choice = {"has_samples": has_samples, "resume": resume, "is_quiet": session.is_quiet}
-        record = drive_uncertainty(taken, output, samples, request, **choice)
+        record = drive_uncertainty(taken, output, request, resume=resume, is_quiet=session.is_quiet)
     session.show(record, uncertainty_lines(record, output))
 
 
