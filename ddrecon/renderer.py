@@ -346,7 +346,7 @@ def solve_diffuse(
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
     return run_rounds(
-        problem, light, solve, settings.rounds, settings.angles, settings.transport_tolerance
+        problem, light, solve, settings.rounds, settings.angles, settings.transport_tolerance or 0.0
     )
 
 

@@ -20,8 +20,6 @@ FLOOR = 3.3
 
 See docs/theory.md, section 5.
 """
-MOST_ROUNDS = 64
-"""Transport rounds, where a tolerance says when they end."""
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
 
@@ -84,10 +82,9 @@ class DiffusionSettings:
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
-    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 7). With a
-    `transport_tolerance` they end where a residual is so small (E7.3), and are `transport_rounds`
-    at most. Light is computed and seen in cells a `refine`th as wide. A scene file that leaves
-    these out gets what its medium deserves.
+    P1 towards transport, and keep angles to `degree`; with a `transport_tolerance` they end where
+    one changes light by less of it (docs/theory.md, section 7). Light is computed and seen in cells
+    a `refine`th as wide. A scene file that leaves these out gets what its medium deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -103,8 +100,8 @@ class DiffusionSettings:
     solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"), expert=True)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = bounded(True, expert=True)
-    transport_rounds: int | None = bounded(None, minimum=0, maximum=MOST_ROUNDS)
-    transport_tolerance: float | None = bounded(None, above=0, maximum=0.5)
+    transport_rounds: int | None = bounded(None, minimum=0, maximum=16)
+    transport_tolerance: float | None = bounded(None, above=0, below=1)
     degree: int | None = one_of(None, (1, 3, 5, 7))
     refine: int | None = one_of(None, (1, 3, 9), expert=True)
 
@@ -122,24 +119,20 @@ class DiffusionSettings:
 
     @property
     def rounds(self) -> int:
-        """How many transport rounds there are at most.
-
-        Left out, one where there can be any, or as many as a tolerance may need.
-        """
-        if self.transport_rounds is not None:
-            return self.transport_rounds
-        if self.transport_tolerance is not None:
-            return MOST_ROUNDS
-        return int((self.model, self.scheme) == ("p1", "conservative"))
+        """How many transport rounds there are at most: left out, one where there can be any."""
+        can_have_rounds = (self.model, self.scheme) == ("p1", "conservative")
+        return int(can_have_rounds) if self.transport_rounds is None else self.transport_rounds
 
     def violations(self) -> Iterator[Violation]:
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
         if self.rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
             yield (
-                "transport_rounds" if self.transport_rounds else "transport_tolerance",
-                "rounds begin at model p1 with scheme 'conservative'; leave it out",
+                "transport_rounds",
+                "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",
             )
+        if self.transport_tolerance is not None and not self.rounds:
+            yield "transport_tolerance", "there are no transport rounds to end; leave it out"
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     if settings.rounds:
         rounds = _count(settings.rounds, "transport round")
         if settings.transport_tolerance is not None:
-            rounds = f"at most {rounds}, until the residual is {settings.transport_tolerance:g},"
+            rounds += f" at most, to a residual of {settings.transport_tolerance:g},"
         directions = count_directions(settings.angles, settings.rounds)
         rounds += f" of sweeps along {directions} directions, each with a diffusion solve"
         if medium.degree > 1:

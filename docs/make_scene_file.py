@@ -431,11 +431,17 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "where there are none: without model `p1` or scheme `conservative`. With "
                 "degree 5 it is one more beyond 0.55, and where a face of the box is dense at "
                 "least one more in cells thicker than 1.5 optical depths, two from 4 on. Where "
-                "none is, it is 1 in cells thicker than 3."
+                "none is, it is 1 in cells thicker than 3. Cells count as `refine` leaves them."
             ),
             "transport_tolerance": (
-                "Sweeps end where what one of them changes, relative to the light, is so small "
-                "([E7.3](theory.md#transport-rounds)): after `transport_rounds` at most, or 64."
+                "Rounds end where one changes light by less of it, at most `transport_rounds` of "
+                "them, left out 16. `render.json` has how many there were, and their residual."
+            ),
+            "refine": (
+                "Light is computed and seen in cells so many times as narrow; the medium is the "
+                "same. Left out, it is 3 where a cell is thicker than 1.5 optical depths, or 9 "
+                "where a third of it is, if there are no more than 1,048,576 cells then and "
+                "density is not sought; else 1."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "

@@ -284,6 +284,15 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
         "ambient": (0.5,),
     },
     "no model": {"model": "none", "g": 0.4, **BOTH},
+    "finer cells, rounds to a tolerance": {
+        "shape": (3, 2, 4),
+        "g": 0.4,
+        "transport_rounds": 16,
+        "transport_tolerance": 1e-2,
+        "degree": 3,
+        "refine": 3,
+        **BOTH,
+    },
 }
 
 

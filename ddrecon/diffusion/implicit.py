@@ -28,10 +28,7 @@ from ddrecon.numerics.autodiff import keep, run_plainly
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative.
-
-    Or, of the kind `round`, transport rounds up to one, where a tolerance ends them (E7.3).
-    """
+    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative."""
 
     kind: str
     iterations: int

@@ -83,7 +83,7 @@ def render_to_folder(
         "preview": PREVIEW,
         "psnr": quality,
     }
-    if rounds := [r for r in memory.records if r.kind == "round"]:
+    if rounds := [r for r in memory.records if r.kind == "rounds"]:
         report["rounds"] = {"count": rounds[-1].iterations, "residual": rounds[-1].residual}
     if fluence_files:
         report["fluence"] = fluence_files

@@ -54,6 +54,8 @@ from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, Par
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import component_names, name_each, value_of, variable_names
 
+MOST_ROUNDS = 16
+"""Rounds until light comes to rest; in all cases measured it has by then."""
 MORE_ROUNDS = 0.3, 0.6
 """A second moment of the phase function above one of these deserves a round more: by about so much
 a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
@@ -338,8 +340,6 @@ def choose_diffusion(
     whether it goes up to a face of the box, `is_flat`.
     """
     settings = tree.diffusion
-    if settings.transport_tolerance is not None:
-        settings = replace(settings, transport_rounds=settings.rounds)
     if not settings.rounds:
         return settings, ""
     left = float(phase.moments(3)[:, 2].abs().max())
@@ -367,6 +367,8 @@ def choose_diffusion(
         # With fewer directions too much light goes exactly along the axes that repeat.
         reasons.append("a volume that repeats")
         rounds, degree = max(rounds, 2), 5
+    if settings.transport_tolerance is not None:
+        rounds = MOST_ROUNDS
     chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
     left_out: dict[str, Any] = {
         key: value for key, value in chosen.items() if getattr(settings, key) is None

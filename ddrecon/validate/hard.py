@@ -272,7 +272,7 @@ def _render(
     (gradient,) = torch.autograd.grad(image.mean(), density)
     density.requires_grad_(False)
     balance = balance_of(scene, memory.last["forward", 0]) if memory.records else Balance()
-    iterations = sum(record.iterations for record in memory.records)
+    iterations = sum(r.iterations for r in memory.records if r.kind != "rounds")
     return image.detach(), gradient, iterations, balance
 
 

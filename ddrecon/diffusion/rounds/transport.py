@@ -8,7 +8,6 @@ real geometry, and takes the moments of what arrives. What it changes is passed 
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from dataclasses import replace
 from time import perf_counter
@@ -31,7 +30,7 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.ranks import sum_over_ranks
+from ddrecon.ranks import sum_numbers
 from ddrecon.slabs.exchange import add_halo
 from ddrecon.slabs.slab import Slab, whole_of
 
@@ -39,8 +38,6 @@ SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
 DAMPING = 0.7
 """Sigma of E7.2: with less, waves from cell to cell grow where cells are thick."""
-CYCLE = 4
-"""Rounds that are blended together where a tolerance ends them (E7.1)."""
 
 
 def run_rounds(
@@ -49,14 +46,14 @@ def run_rounds(
     solve: SolverWithMemory,
     rounds: int,
     degree: int,
-    tolerance: float | None = None,
+    tolerance: float = 0.0,
 ) -> Moments:
     """Light after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
 
     `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
-    the quadrature. With a `tolerance` rounds end before, where the residual (E7.3) is no larger;
-    the memory of `solve` keeps each one's. Only the mean is kept where light's direction does not
-    matter. Derivatives are those of the rounds that were run.
+    the quadrature. Only the mean is kept where light's direction does not matter. With a
+    `tolerance` rounds end where one changes light by less of it (E7.3). What the last one changes
+    is recorded.
     """
     if rounds == 0:
         return light
@@ -66,35 +63,31 @@ def run_rounds(
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
     mirror = face_mirror(medium, directions, None if emitted is None else glow)
-    factors = itertools.cycle(_blending(medium, rounds if tolerance is None else CYCLE))
-    for round_index, factor in zip(range(1, rounds + 1), factors, strict=False):
-        began = perf_counter()
-        cosine = _flux_factor(medium, tolerance is None and round_index == rounds)
-        made = _round(problem, light, emitted, solve, directions, round_index, cosine, mirror)
-        if tolerance is None and factor is None:
-            light = _renewed(made, grid)
-            continue
-        change = made.plus(light.scaled(-1.0, -1.0, -1.0))
-        blended = made if factor is None else light.plus(change.scaled(factor, factor, factor))
-        light = _renewed(blended, grid)
-        if tolerance is not None:
-            residual = _residual(change, made, grid)
-            record = SolveRecord("round", round_index, residual, perf_counter() - began)
-            solve.memory.records.append(record)
-            if residual <= tolerance:
-                break
+    began, is_open = perf_counter(), tolerance > 0
+    factors = [None] * rounds if is_open else _blending(medium, rounds)
+    for round_index, factor in enumerate(factors, 1):
+        is_last, before = round_index == rounds, light.mean
+        cosine = _flux_factor(medium, is_last and not is_open)
+        given = round_index, cosine, factor, mirror
+        made = _round(problem, light, emitted, solve, directions, *given)
+        light = _renewed(made, grid)
+        residual = _residual(light.mean, before, grid) if is_open or is_last else 1.0
+        if is_last or residual < tolerance:
+            break
+    record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
+    solve.memory.records.append(record)
     return light
 
 
-def _residual(change: Moments, light: Moments, grid: Grid) -> float:
-    """How large the `change` that a round makes is, relative to `light` (E7.3): of all colors."""
-    powers = []
-    for one in (change, light):
-        phi = one.harmonics(1 if one.flux is not None else 0).detach()
-        phi = grid.own(phi) if isinstance(grid, Slab) else phi
-        powers.append(phi.square().sum((0, -3, -2, -1), dtype=torch.float64))
-    changed, whole = sum_over_ranks(powers) if isinstance(grid, Slab) else powers
-    return float((changed / whole.clamp(min=torch.finfo(torch.float64).tiny)).max().sqrt())
+@torch.no_grad()
+def _residual(new: Tensor, old: Tensor, grid: Grid) -> float:
+    """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
+    squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
+    if isinstance(grid, Slab):
+        # halos count as well, alike in both
+        squares = squares.new_tensor(sum_numbers(squares.flatten().tolist())).view_as(squares)
+    changed, whole = squares
+    return float((changed / whole.clamp(min=1e-300)).amax().sqrt())
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:
@@ -132,9 +125,10 @@ def _round(
     directions: int,
     round_index: int,
     cosine: Tensor,
+    factor: Tensor | None,
     mirror: Mirror | None,
 ) -> Moments:
-    """What one round makes of `light` (E2.10).
+    """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
     `emitted`: light as of `sweep_emission`; `cosine`: as of `_flux_factor`.
     """
@@ -154,7 +148,11 @@ def _round(
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-    return Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
+    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
+    if factor is None:
+        return new
+    difference = new.plus(light.scaled(-1.0, -1.0, -1.0))
+    return light.plus(difference.scaled(factor, factor, factor))
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:

@@ -131,7 +131,9 @@ WAVES[0] = 1e-3, 0, 0
 )
 def test_a_round_shrinks_every_wave(degree: int, g: float):
     shapes = (
-        [CUBES] if degree == 7 else [CUBES, (1.0, 1.0, 4.0), (20.0, 1.0, 20.0), (0.2, 1.0, 5.0)]
+        [CUBES]
+        if degree == 7
+        else [CUBES, (1.0, 1.0, 4.0), (1.0, 1.0, 20.0), (20.0, 1.0, 20.0), (0.2, 1.0, 5.0)]
     )
     for spacing, depth, albedo in product(
         shapes, (0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9, 0.9999)
