@@ -5,7 +5,8 @@
 Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
 radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`); `once`, of that
 part of `up` that is scattered once. `half-space` is one cell across, far wider than deep; all
-others have cubes. `box`: by how much, in percent, the image of a plain box changes from 8 to 16 rounds.
+others have cubes, and a step cloud repeats. `box`: by how much, in percent, the image of a plain
+box changes from 8 to 16 rounds.
 
 NAME is part of a row's name, `-D` overrides keys of all scenes, `seconds` are those of the default.
 Slabs need PythonicDISORT.

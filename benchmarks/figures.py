@@ -37,6 +37,7 @@ COMMANDS = {
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
+    "film": "python benchmarks/reconstruction.py film",
     "replay": "python benchmarks/path_replay.py --paths 4 16",
     "engines": "python benchmarks/engines.py",
     "tangents": "python benchmarks/engines.py --tangents",

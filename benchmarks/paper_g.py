@@ -12,14 +12,14 @@ import argparse
 import math
 
 import torch
+from ddrecon.numerics.conjugate_gradients import conjugate_gradients
+from ddrecon.uncertainty.samples import Uncertainty
 from paper_page import CONFIGS, rewrite_table
 from torch import Tensor
 
-from ddrecon.numerics.conjugate_gradients import conjugate_gradients
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.samples import Uncertainty
 
 SCRIPT = "paper_g.py"
 COARSER = 4

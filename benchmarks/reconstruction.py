@@ -1,7 +1,7 @@
 """What reconstructions come to: held-out PSNR, errors of the density, seconds; of the capture also
-exposures, lamp and cameras.
+exposures, lamp and cameras; of the first frames of the film how the last of them is alone as well.
 
-    python benchmarks/reconstruction.py plume|gallery|capture [-o FOLDER]
+    python benchmarks/reconstruction.py plume|gallery|capture|film [-o FOLDER]
 
 Every run is a process of its own, `ddrecon optimize`, after one that compiled its kernels. Tables
 are Markdown. Runs are left in FOLDER.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import tempfile
 import time
@@ -23,9 +24,11 @@ import numpy as np
 from ddrecon.io.volumes.table import read_field
 
 ROOT = Path(__file__).parents[1]
-CAPTURE = ROOT / "data/capture"
-LAMP = (7.3, 7.0, 6.4)
-"""Irradiance by which the pictures of the capture were made."""
+CAPTURE, FILM = ROOT / "data/capture", ROOT / "data/film"
+LAMP, SUN = (7.3, 7.0, 6.4), (0.8, -0.45, -0.4)
+"""Irradiance and direction of the light by which pictures of the capture and film were made."""
+FRAMES = 5
+"""Frames of the film that are reconstructed, from the first on."""
 PLUME = {
     "as the config has it": (),
     "30 iterations": ("--iterations", "30", "-D", "optimize.refine_at=[0.5, 0.9]"),
@@ -101,10 +104,12 @@ def rotation_between(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.degrees(2 * np.arcsin(min(chord, 1))))
 
 
-def pixels_off(found: np.ndarray, true: np.ndarray, focal: float) -> float:
-    """How far the camera `found` sees the smoke from where `true` does [pixels], on average."""
-    density = read_density(CAPTURE / "density.npz")
-    low, high = np.load(CAPTURE / "density.npz")["bounds"]
+def pixels_off(
+    found: np.ndarray, true: np.ndarray, focal: float, smoke: Path = CAPTURE / "density.npz"
+) -> float:
+    """How far the camera `found` sees the `smoke` from where `true` does [pixels], on average."""
+    density = read_density(smoke)
+    low, high = np.load(smoke)["bounds"]
     cells = np.argwhere(density > 0)
     points = low + (cells[:, ::-1] + 0.5) / density.shape[::-1] * (high - low)
     rays = []
@@ -150,15 +155,82 @@ def print_capture(folder: Path) -> None:
     print_row("seconds of the process", "", f"{seconds:.0f}")
 
 
+def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], float, float]:
+    """What `film.json` says of the film in `folder`; seconds and peak memory [MiB] of its run."""
+    config, start = str(ROOT / "configs/film.yaml"), time.perf_counter()
+    command = ["ddrecon", "optimize", config, "-o", str(folder), "-q", "--overwrite", *options]
+    run = subprocess.Popen(command)
+    _, status, used = os.wait4(run.pid, 0)
+    if status:
+        raise SystemExit(f"{folder}: exit {os.waitstatus_to_exitcode(status)}")
+    seconds = time.perf_counter() - start
+    return json.loads((folder / "film.json").read_text()), seconds, used.ru_maxrss / 1024
+
+
+def calibration_errors(values: dict[str, Any], number: int) -> dict[str, float]:
+    """How far `values`, by variable, are from the truth, by the smoke of the frame `number`."""
+    turns, shifts = [], []
+    for frame in json.loads((FILM / "truth.json").read_text())["frames"]:
+        name = frame["file_path"].partition("_{")[0]
+        if (found := values.get(f"views.{name}.camera")) is not None:
+            poses = [np.array(each)[:3] for each in (found["matrix"], frame["transform_matrix"])]
+            turns.append(rotation_between(*poses))
+            shifts.append(pixels_off(*poses, frame["fl_x"], FILM / f"density_{number:04d}.npz"))
+    sun, true = (np.divide(one, np.linalg.norm(one)) for one in (values["lights.0.direction"], SUN))
+    return {
+        "directions of cameras, mean error [degrees]": float(np.mean(turns)),
+        "where cameras see the smoke, mean error [pixels]": float(np.mean(shifts)),
+        "direction of the lamp, error [degrees]": float(np.degrees(np.arccos(sun @ true))),
+    }
+
+
+def flicker(folder: Path, numbers: Sequence[int]) -> float:
+    """The second difference in time of the error of the film in `folder` over that of the truth."""
+    found = [read_density(folder / f"frames/{n:04d}/volumes/density.npz") for n in numbers]
+    true = [coarsened(read_density(FILM / f"density_{n:04d}.npz"), found[0].shape) for n in numbers]
+    bends = [np.diff(each, 2, axis=0) for each in (np.subtract(found, true), true)]
+    return float(np.divide(*map(np.linalg.norm, bends)))
+
+
+def print_film(folder: Path) -> None:
+    """Reconstructs the first frames of the film, and the last of them alone from nothing."""
+    last, number = f"0:{FRAMES - 1}", FRAMES - 1
+    film, seconds, memory = run_film(folder / "film", "--frames", last)
+    only = [
+        f"frames.{key}={value}"
+        for key, value in (("first", number), ("last", number), ("calibrate", 0))
+    ]
+    options = [word for text in only for word in ("-D", text)]
+    alone, seconds_alone, memory_alone = run_film(folder / "alone", *options)
+    one, other = film["frames"][-1], alone["frames"][-1]
+    print_row("what", "five frames of the film", "the last of them alone")
+    print_row("---", "---", "---")
+    for what, key in (("held out", "test_psnr"), ("the same, registered", "registered_psnr")):
+        print_row(f"{what}, last frame [dB]", f"{one[key]:.1f}", f"{other[key]:.1f}")
+    in_film = [row["seconds"] for row in film["frames"][1:]]
+    print_row(
+        "seconds of a frame, later ones", f"{np.mean(in_film):.1f}", f"{other['seconds']:.1f}"
+    )
+    print_row("seconds of the process", f"{seconds:.0f}", f"{seconds_alone:.0f}")
+    print_row("most memory of the process [MiB]", f"{memory:.0f}", f"{memory_alone:.0f}")
+    values = json.loads((folder / f"alone/frames/{number:04d}/parameters.json").read_text())
+    errors = calibration_errors(film["values"], number), calibration_errors(values, number)
+    for what in errors[0]:
+        print_row(what, *(f"{each[what]:.2f}" for each in errors))
+    print_row("flicker of cells", f"{flicker(folder / 'film', range(FRAMES)):.2f}", "")
+
+
 def main() -> None:
     """Runs what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("plume", "gallery", "capture"))
+    parser.add_argument("what", choices=("plume", "gallery", "capture", "film"))
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
     folder = given.output or Path(tempfile.mkdtemp())
     if given.what == "capture":
         print_capture(folder / "capture")
+    elif given.what == "film":
+        print_film(folder)
     elif given.what == "plume":
         optimize("plume", folder / "first", ("--iterations", "6"))
         runs = {name: ("plume", "plume", options) for name, options in PLUME.items()}

@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from ddrecon.uncertainty.posterior import TOLERANCE, Posterior, generator_of
+from ddrecon.uncertainty.prior import Prior
+from ddrecon.uncertainty.samples import Uncertainty
 from torch import Tensor
 
 from ddrecon.engine import use_engine
@@ -31,9 +34,6 @@ from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.uncertainty.posterior import TOLERANCE, Posterior, generator_of
-from ddrecon.uncertainty.prior import Prior
-from ddrecon.uncertainty.samples import Uncertainty
 
 ROOT = Path(__file__).parents[1]
 STEPS = 3

@@ -7,15 +7,17 @@ scene file, are shown at once.
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from warnings import warn
 
 import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
-from ddrecon.errors import UsageError
+from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -93,6 +95,7 @@ def balance(session: Session, scene: Path) -> None:
 )
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
 @click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
+@click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @SHARE
 @DTYPE
 @REPORT
@@ -109,13 +112,45 @@ def render(
     count: int | None,
     has_fluence: bool,
     exported: str | None,
+    part: str | None,
 ) -> None:
-    """Render the views of SCENE, a scene file or the folder of a finished run."""
+    """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
     if exported and not has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
-    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     if lights:
         session = session.with_override(f"lights=[{', '.join(lights)}]")
+    choice = overwrite, names, components, parameter, lights, count, has_fluence, exported
+    if not (scene / "frames").is_dir():
+        if part is not None:
+            raise click.UsageError("--frames is for the folders of films: SCENE is none")
+        report, lines = _render(session, scene, output, *choice)
+        session.show(report, lines)
+        return
+    from ddrecon.film.folder import finished_frames
+
+    frames = finished_frames(scene, part, session.build)
+    found = {run.name: _render(session, run, output / run.name, *choice) for run in frames}
+    session.show(
+        {name: report for name, (report, _) in found.items()},
+        [*chain.from_iterable(lines for _, lines in found.values())],
+    )
+
+
+def _render(
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    components: bool,
+    parameter: str | None,
+    lights: tuple[str, ...],
+    count: int | None,
+    has_fluence: bool,
+    exported: str | None,
+) -> tuple[dict[str, Any], list[str]]:
+    """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
+    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -130,6 +165,10 @@ def render(
     )
 
     loaded = session.build(scene_file)
+    if has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+        # light in empty cells, which views do not see, takes a second one
+        rounds = loaded.diffusion.rounds
+        loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
     require_sharing(loaded)
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     if lights or count is not None:
@@ -141,11 +180,11 @@ def render(
         choice = components, session.progress, parameter, kinds
         report = render_to_folder(loaded, views, output, *choice)
         if not is_first():
-            return
+            return {}, []
         if count is not None:
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
-    session.show(report, render_lines(report, output))
+    return report, render_lines(report, output)
 
 
 @click.command()
@@ -235,12 +274,23 @@ def optimize(
 @OUTPUT
 @OVERWRITE
 @click.option(
+    "--calibrate",
+    "experiments",
+    type=click.IntRange(min=0),
+    default=2,
+    show_default=True,
+    metavar="N",
+    help="Experiments, each as long as RUN was: what it found is photographed and reconstructed, "
+    "and how far off that is are the deviations. 0: what noise alone leaves, which is far too "
+    "little. In all, also after --resume.",
+)
+@click.option(
     "--samples",
     type=click.IntRange(min=2),
     default=16,
     show_default=True,
     metavar="N",
-    help="Samples of the posterior in all, also after --resume.",
+    help="Samples of what the experiments leave open, for --keep-samples and --next-view.",
 )
 @click.option(
     "--noise",
@@ -250,11 +300,6 @@ def optimize(
     help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
     "reconstruction leaves.",
 )
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(min=0, max=1, min_open=True),
-    help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
-)
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
 @click.option(
     "--next-view",
@@ -262,7 +307,8 @@ def optimize(
     help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
     "(ring), or in directional lights that are (lights).",
 )
-@click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
+@click.option("--tolerance", type=float, hidden=True)
+@click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
 def uncertainty(
@@ -270,11 +316,12 @@ def uncertainty(
     run: Path,
     output: Path,
     overwrite: bool,
+    experiments: int,
     samples: int,
     read: float | None,
-    tolerance: float | None,
     has_samples: bool,
     next_view: str | None,
+    tolerance: float | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -288,6 +335,8 @@ def uncertainty(
     from ddrecon.uncertainty.folder import uncertainty_lines
     from ddrecon.uncertainty.next_view import FEWEST
 
+    if tolerance is not None:
+        warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
@@ -299,13 +348,12 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, noise, tolerance, next_view)
+    request = Request(session.seed, experiments, samples, noise, next_view, has_samples)
     if not is_first():
-        follow_uncertainty(taken, samples, request)
+        follow_uncertainty(taken, request)
         return
     with claim_folder(output, may_exist=overwrite or resume):
-        choice = {"has_samples": has_samples, "resume": resume, "is_quiet": session.is_quiet}
-        record = drive_uncertainty(taken, output, samples, request, **choice)
+        record = drive_uncertainty(taken, output, request, resume=resume, is_quiet=session.is_quiet)
     session.show(record, uncertainty_lines(record, output))
 
 

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
-from ddrecon.film.shared import SHARED, hold, read_shared
+from ddrecon.film.shared import SHARED, fix, read_shared
 from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import refusals, write_json
 from ddrecon.io.volumes.table import read_field
 from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.ranks import rank_count
-from ddrecon.reconstruct import tuning
 from ddrecon.run.checkpoint import differences
 from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file, write_volume
 from ddrecon.scene import Scene
@@ -33,6 +32,8 @@ from ddrecon.variables.kinds import kind_of
 
 SHARE = 6
 """A frame that begins with another makes so many times fewer iterations."""
+FARTHEST = 3
+"""Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
 SEQUENCE = "sequence"
@@ -97,13 +98,13 @@ class Film:
         return self.path / "calibration" / f"{number:04d}"
 
     def scene_of(self, number: int, is_between: bool) -> SceneFile:
-        """The scene of the frame `number`, with what is shared held.
+        """The scene of the frame `number`, with what is shared fixed.
 
         It begins with the frames before it, or with those on both sides where it `is_between` them.
         What it begins with is written to its folder.
         """
         described = describe(at_frame(self.scene_file, number))
-        hold(described, self.shared.get("values", {}), self.path / SHARED)
+        fix(described, self.shared.get("values", {}), self.path / SHARED)
         optimize = described["optimize"]
         fields = self._start(number, [*optimize["parameters"]], is_between)
         start = self.of(number).absolute() / "start"
@@ -111,19 +112,19 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            planned = optimize["iterations"]
-            planned = tuning.PLANNED if planned == AUTO else planned
-            optimize |= {"iterations": math.ceil(planned / SHARE), "refine_at": []}
+            optimize["refine_at"] = []
+            if (planned := optimize["iterations"]) != AUTO:
+                optimize["iterations"] = math.ceil(planned / SHARE)
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
         """What the frame `number` begins with: those of the variables `names` that are fields.
 
-        They are those that it had in the calibration where no frame before it is done, nor one
-        after it where it `is_between` them; none where it had none.
+        They are those that it had in the calibration where no frame close before it is done, nor
+        one after it where it `is_between` them; none where it had none.
         """
-        before = [n for n in self.done() if n < number]
-        after = [n for n in self.done() if n > number and is_between]
+        before, after = self._near(number)
+        after = after if is_between else []
         if not before and not after:
             return _fields_in(self.calibrated(number), names)
         if not before or not after:
@@ -141,11 +142,17 @@ class Film:
         forth, back = ((number - each) * motion for each in (last, following))
         return {name: (carry(ours[name], forth) + carry(theirs[name], back)) / 2 for name in ours}
 
+    def _near(self, number: int) -> tuple[list[int], list[int]]:
+        """The frames that are done and close to the frame `number`: before it, and after it."""
+        far = FARTHEST * self.frames.step
+        near = [n for n in self.done() if 0 < abs(n - number) <= far]
+        return [n for n in near if n < number], [n for n in near if n > number]
+
     def _flow(self, number: int, other: int) -> Tensor:
         """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
         sums = []
         for each in (number, other):
-            fields = _fields_in(self.of(each), self.sought)
+            fields = _fields_in(self.of(each), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
             # Of what has colors their mean.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
@@ -153,7 +160,7 @@ class Film:
         return find_flow(*sums) / (other - number)
 
     @property
-    def sought(self) -> list[str]:
+    def optimized(self) -> list[str]:
         """The variables that the film optimizes."""
         optimize = self.scene_file.tree.optimize
         return [*optimize.parameters] if optimize else []
@@ -161,14 +168,15 @@ class Film:
     def write_velocity(self, number: int) -> None:
         """Writes the motion of the frame `number` from the one before, [u] a frame, for blur.
 
-        The first frame has that of the second.
+        The first frame of a part has that of the second.
         """
-        before = [n for n in self.done() if n < number]
+        before, _ = self._near(number)
         if not before:
             return
         motion = self._flow(before[-1], number) * self._cell
-        for each in [number, *([before[0]] if len(before) == 1 else [])]:
-            write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
+        for each in (number, before[-1]):
+            if not volume_file(self.of(each), VELOCITY).is_file():
+                write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
 
     def _velocity(self, number: int) -> Tensor | None:
         """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
@@ -181,8 +189,23 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
+def finished_frames(
+    path: Path, part: str | None, build: Callable[[SceneFile], Scene]
+) -> list[Path]:
+    """The runs of those frames of the film in the folder `path` that are done, of a `part` of it.
+
+    Raises UsageError where there are none.
+    """
+    film = Film(read_scene(path / "scene.yaml"), path, build)
+    done = film.done()
+    found = [film.of(number) for number in film.choose(part) if number in done]
+    if not found:
+        raise UsageError(f"{path}: no such frame is done")
+    return found
+
+
 def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
-    """Makes the folder of `film` ready, whose calibration may be `shared` from a file.
+    """Prepares the folder of `film`, whose calibration may be `shared` from a file.
 
     What an earlier one has left there is removed, unless this one is to `resume` it. Raises
     UsageError for a folder that is not empty, unless it may be, or that holds another film;
@@ -192,7 +215,7 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
         what = "torchrun does not share out a film: start jobs for parts of it, --frames A:B"
         raise UsageError(f"{what}, with --resume and the same -o")
     scene_file, path = film.scene_file, film.path
-    if not any(kind_of(name).is_cellwise for name in film.sought):
+    if not any(kind_of(name).is_cellwise for name in film.optimized):
         what = "optimize.parameters: none changes from frame to frame; name one, such as density"
         raise SceneError(f"{scene_file.path}: {what}")
     require_frames(scene_file)

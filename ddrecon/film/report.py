@@ -34,7 +34,7 @@ from ddrecon.run.report import registered_text
 
 RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
 KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
-"""What of a run's summary is told of each frame."""
+"""What of a run's summary is kept of each frame."""
 SHOWN = 48
 """Frames whose pictures are on the page; all are in their folders."""
 WIDEST = 768
@@ -46,10 +46,10 @@ def write_film_report(film: Film) -> dict[str, Any]:
     rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
     for number in film.done():
         summaries[number] = json.loads((film.of(number) / "summary.json").read_text())
-        told = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
+        row = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
         registered = summaries[number].get("registered", {})
-        told |= {f"registered_{key}": value for key, value in registered.items()}
-        rows.append({"frame": number, **told})
+        row |= {f"registered_{key}": value for key, value in registered.items()}
+        rows.append({"frame": number, **row})
     found = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
     record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | found
     write_json(film.path / RECORD, record)
@@ -81,13 +81,13 @@ def film_page(folder: Path) -> str:
 def _lead(record: Mapping[str, Any]) -> str:
     rows = record["frames"]
     means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
-    told = f"PSNR {means['psnr']:.2f} dB"
+    text = f"PSNR {means['psnr']:.2f} dB"
     if "test_psnr" in means:
         registered = {key: means[f"registered_{key}"] for key in ("psnr", "ssim", "shift")}
-        told += (
+        text += (
             f", test PSNR {means['test_psnr']:.2f} dB (registered {registered_text(registered)})"
         )
-    return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {told}"
+    return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {text}"
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -130,13 +130,13 @@ def _strip(path: Path) -> np.ndarray:
 def _calibration(shared: Mapping[str, Any]) -> list[str]:
     """What all frames share, and by how much those that found it disagree."""
 
-    def told(value: Any) -> str:
+    def text_of(value: Any) -> str:
         if not isinstance(value, float | list):
             return f"in {SHARED}"
         return ", ".join(f"{number:.4g}" for number in np.ravel(value))
 
     values, spread = shared["values"], shared.get("spread", {})
-    rows = [(name, told(value), told(spread.get(name, []))) for name, value in values.items()]
+    rows = [(name, text_of(value), text_of(spread.get(name, []))) for name, value in values.items()]
     frames = ", ".join(map(str, shared.get("frames", [])))
     return [
         paragraph(

@@ -1,4 +1,4 @@
-"""What does not change in a film, cameras, exposures and lights: found once, and then held.
+"""What does not change in a film, cameras, exposures and lights: found once, and then fixed.
 
 It is found from several frames together; `shared.json` keeps it, with what is known of it: by how
 much the frames disagree.
@@ -55,7 +55,7 @@ def read_shared(path: Path) -> dict[str, Any]:
     return content
 
 
-def hold(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> None:
+def fix(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> None:
     """Puts the `values`, by variable, that `source` says into the scene `described`.
 
     They are not optimized any more. Raises UsageError where these are of other cameras or lights.

@@ -11,7 +11,11 @@ namespace ddrecon {
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = 1;
 #else
+// No packet crosses into code that was compiled for other vector registers.
+#pragma GCC diagnostic ignored "-Wpsabi"
 constexpr int LANES = 16;
+// Packets are no part of an interface between compilers, which is what is warned of.
+#pragma GCC diagnostic ignored "-Wpsabi"
 constexpr unsigned ALL_LANES = (1u << LANES) - 1;
 #endif
 

@@ -7,11 +7,13 @@ optical depth at most; but it is zero on faces through which the light shines.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -38,26 +40,26 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     light stays as it is as well.
     """
     grid, extinction = emission.grid, emission.extinction
-    ends = [_is_line(grid, *face) for face in FACES]
+    is_line = [[_is_line(grid, *face) for face in FACES[2 * k : 2 * k + 2]] for k in range(3)]
     extended, matter = {}, list[Tensor]()
     for name, field in emission.fields.items():
         is_mass = name.startswith("mass ")
-        lines = [(is_mass or name == "diffuse") and is_line for is_line in ends]
+        has_lines = (is_mass or name == "diffuse") and any(map(any, is_line))
         outermost = _Outermost.apply(field)
-        pairs = list(zip(FACES, outermost[::2], outermost[1::2], strict=True))
-        layers = [_go_on(*pair, [False] * 6) for pair in pairs]
+        layers = [pad(pair[:, 0], (1, 1, 1, 1), mode="replicate") for pair in outermost]
         matter = matter or layers
-        if any(lines):
-            both = zip(layers, (_go_on(*pair, lines) for pair in pairs), strict=True)
+        if has_lines:
+            both = list(zip(layers, _go_on(outermost, field.new_tensor(is_line)), strict=True))
             if is_mass:
-                lit = shine_through(emission.beams[int(name.split()[1])], grid)
-                shades = _shades(grid, 1 - lit * lit.new_tensor(lines))
+                lit = shine_through(emission.beams[int(name.split()[1])], grid).view(3, 2)
+                shades = _shades(grid, 1 - lit * lit.new_tensor(is_line))
                 limited = (_limit(*one, extinction.mass_bound) for one in both)
                 layers = [shade * one for shade, one in zip(shades, limited, strict=True)]
             else:
                 scale = extinction.scale[: len(field), 0]
-                shares = (thinness(grid, scale * one[: len(field)], OPAQUE) for one in matter)
+                shares = (thinness(grid, scale * one[:, : len(field)], OPAQUE) for one in matter)
                 layers = [torch.lerp(*one, share) for one, share in zip(both, shares, strict=True)]
+        lines = [has_lines and is_line[k][side] for k, side in FACES]
         extended[name] = _WithLayers.apply(axis, lines, field, *layers)
     return extended
 
@@ -82,11 +84,12 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
 
 
 class _Outermost(torch.autograd.Function):
-    """The layers of `field` at each of `FACES`, and those before them; linear."""
+    """Of each axis the layers of `field` at both faces, and those before: [2, 2, ...]; linear."""
 
     @staticmethod
     def forward(field: Tensor) -> tuple[Tensor, ...]:
-        return tuple(layer.clone() for face in FACES for layer in _layers(field, face))
+        pairs = (_layers(field, (k, 0)) + _layers(field, (k, 1)) for k in range(3))
+        return tuple(torch.stack(pair).unflatten(0, (2, 2)) for pair in pairs)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -95,9 +98,9 @@ class _Outermost(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> Tensor:
         field_bar = bars[0].new_zeros(ctx.shape)
-        layers = (layer for face in FACES for layer in _layers(field_bar, face))
-        for layer, bar in zip(layers, bars, strict=True):
-            layer += bar
+        for k, side in FACES:
+            for layer, bar in zip(_layers(field_bar, (k, side)), bars[k][side], strict=True):
+                layer += bar
         return field_bar
 
     @staticmethod
@@ -112,37 +115,44 @@ def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     return goal + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1)
 
 
-def _go_on(face: tuple[int, int], last: Tensor, before: Tensor, lines: list[bool]) -> Tensor:
-    """What is on `face`, by the line through the two layers at it where it is of `lines`.
+def _go_on(outermost: Sequence[Tensor], is_line: Tensor) -> list[Tensor]:
+    """Of each axis what is on both faces, [2, channels, 2 axes, a row more on each side].
 
-    Else it stays as it is. [channels, 2 axes, a row more on each side].
+    It is on the line through the two layers at a face where that `is_line` [3, 2], and so on along
+    the face; else it stays as it is. `outermost` is of `_Outermost`.
     """
-    axis, side = face
-    layer = 1.5 * last - 0.5 * before if lines[2 * axis + side] else last
-    for dim, other in enumerate((one for one in range(3) if one != axis), 1):
-        ends = []
-        for end in range(2):
-            last = layer.narrow(dim, -end % layer.shape[dim], 1)
-            if lines[2 * other + end]:
-                last = 1.5 * last - 0.5 * layer.narrow(dim, layer.shape[dim] - 2 if end else 1, 1)
-            ends.append(last)
-        layer = torch.cat([ends[0], layer, ends[1]], dim)
-    return layer
+    layers = []
+    for axis, pair in enumerate(outermost):
+        last, before = pair.unbind(1)
+        layer = last + is_line[axis].view(2, 1, 1, 1) / 2 * (last - before)
+        for dim, other in enumerate((one for one in range(3) if one != axis), 2):
+            count, shape = layer.shape[dim], [1, 1, 1, 1]
+            shape[dim] = 2
+            ends = layer.narrow(dim, 0, 1), layer.narrow(dim, count - 1, 1)
+            if count > 1:
+                last = torch.cat(ends, dim)
+                before = torch.cat([layer.narrow(dim, k, 1) for k in (1, count - 2)], dim)
+                ends = (last + is_line[other].view(shape) / 2 * (last - before)).split(1, dim)
+            layer = torch.cat([ends[0], layer, ends[1]], dim)
+        layers.append(layer)
+    return layers
 
 
 def _shades(grid: Grid, shares: Tensor) -> list[Tensor]:
-    """Of each face the product, [2 axes, a layer more], of the `shares` [6] of faces there."""
+    """Of each axis the product of the `shares` [3, 2] of faces, [2, 1, 2 axes, a layer more]."""
     along = [
         torch.cat([low.view(1), shares.new_ones(count), high.view(1)])
-        for count, (low, high) in zip(grid.shape, shares.view(3, 2), strict=True)
+        for count, (low, high) in zip(grid.shape, shares, strict=True)
     ]
-    rest = [torch.outer(along[1], along[2]), torch.outer(along[0], along[2])]
-    rest.append(torch.outer(along[0], along[1]))
-    return [shares[k] * rest[axis] for k, (axis, _) in enumerate(FACES)]
+    pairs = ((1, 2), (0, 2), (0, 1))
+    rest = (torch.outer(along[one], along[other]) for one, other in pairs)
+    return [share.view(2, 1, 1, 1) * each for share, each in zip(shares, rest, strict=True)]
 
 
 class _WithLayers(torch.autograd.Function):
     """`field` with `layers` on its faces, beyond them but across `axis` where they are `lines`.
+
+    Layers are [2, ...], of both faces of each axis.
 
     Linear; edges have what the last of their faces says, which all say alike.
     """
@@ -151,8 +161,8 @@ class _WithLayers(torch.autograd.Function):
     def forward(axis: int | None, lines: list[bool], field: Tensor, *layers: Tensor) -> Tensor:
         longer = field.new_empty(len(field), *(count + 2 for count in field.shape[1:]))
         longer[:, 1:-1, 1:-1, 1:-1] = field
-        for face, layer in zip(FACES, layers, strict=True):
-            _layers(longer, face)[0].copy_(layer)
+        for k, side in FACES:
+            _layers(longer, (k, side))[0].copy_(layers[k][side])
         for face, is_line in zip(FACES, lines, strict=True):
             if is_line and face[0] != axis:
                 outer, last = _layers(longer, face)
@@ -177,7 +187,9 @@ class _WithLayers(torch.autograd.Function):
             outer = _layers(bar, face)[0]
             bars.append(outer.clone())
             outer.zero_()
-        return None, None, bar[:, 1:-1, 1:-1, 1:-1], *reversed(bars)
+        bars.reverse()
+        pairs = (torch.stack(bars[k : k + 2]) for k in (0, 2, 4))
+        return None, None, bar[:, 1:-1, 1:-1, 1:-1], *pairs
 
     @staticmethod
     def jvp(ctx: Any, _axis: None, _lines: None, *changes: Tensor | None) -> Tensor:

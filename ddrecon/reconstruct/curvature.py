@@ -1,9 +1,8 @@
-"""A run's second derivative by Gauss and Newton: products with J^T W J + R (E11.1).
+"""A run's second derivative by Gauss and Newton: products with J^T W J (E11.1).
 
-J is the derivative of all training pictures by all parameters, W how strongly each pixel counts, R
-what the regularizers add (E11.2). Nobody has the matrix: a product is one tangent and one adjoint,
-view by view, in one light field each, shared out over ranks. Its memory grows with the views by
-their pictures alone.
+J is the derivative of all training pictures by all parameters, W how strongly each pixel counts.
+Nobody has the matrix: a product is one tangent and one adjoint, view by view, in one light field
+each, shared out over ranks. Its memory grows with the views by their pictures alone.
 Parameters stand in one vector, entry by entry, in their own units and in their order.
 """
 
@@ -19,7 +18,6 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.reconstruct.shares import share_pictures
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
@@ -35,11 +33,10 @@ def change_of(light_field: LightField, world: Scene, name: str) -> Tensor:
 
 
 class Curvature:
-    """J^T W J + R at the values of `parameters`, which stand in `scene` with its training views.
+    """J^T W J at the values of `parameters`, which stand in `scene` with its training views.
 
-    `targets` are the views' by name, `power` is the unit of penalties, as in `add_penalties`.
-    `images` [3, h, w] are the views' as rendered, `weights` [3, h, w] is W: that of the objective,
-    unless it is replaced. `roughness` is R, by name, of the parameters that have one.
+    `targets` are the views' by name. `images` [3, h, w] are the views' as rendered, `weights`
+    [3, h, w] is W: that of the objective, unless it is replaced.
     """
 
     def __init__(
@@ -47,7 +44,6 @@ class Curvature:
         scene: Scene,
         parameters: Sequence[Parameter],
         targets: Mapping[str, Target],
-        power: float,
         solutions: Mapping[tuple[str, int], Tensor] | None = None,
     ):
         self.scene, self.parameters = scene, list(parameters)
@@ -66,13 +62,6 @@ class Curvature:
         self.weights = {
             view.name: view.weight / total * targets[view.name].weights_at(self.images[view.name])
             for view in scene.views
-        }
-        self.roughness = {
-            p.name: Roughness.about(
-                self.values[p.name] / p.unit, p.grid, power * p.tv, p.knee
-            ).times(p.unit**-2)
-            for p in parameters
-            if p.tv
         }
 
     @property
@@ -96,11 +85,6 @@ class Curvature:
         """J^T W J times `vector`."""
         changes = self.tangents(vector)
         return self.adjoint({name: self.weights[name] * changes[name] for name in changes})
-
-    def penalty_product(self, vector: Tensor) -> Tensor:
-        """R times `vector`."""
-        parts = self.split(vector)
-        return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
     def tangents(self, vector: Tensor, scene: Scene | None = None) -> dict[str, Tensor]:
         """J times `vector`: how the picture [3, h, w] of each training view changes, by name.

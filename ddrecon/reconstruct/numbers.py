@@ -230,13 +230,6 @@ def find_curvatures(
     return dict(zip(names, sum_over_ranks(matrices), strict=True))
 
 
-def number_curvature(curvature: Curvature, numbers: Sequence[Parameter]) -> Tensor:
-    """The part [k, k] of J^T W J of `curvature` between the entries of `numbers`."""
-    names = [view.name for view in curvature.scene.views] if numbers else []
-    found = find_curvatures(curvature, numbers, names, curvature.weights)
-    return _sum_between(numbers, found, numbers)
-
-
 def _sum_between(
     chosen: Sequence[Parameter], matrices: Mapping[str, Tensor], numbers: Sequence[Parameter]
 ) -> Tensor:

@@ -61,20 +61,20 @@ def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] 
     if not supports:
         return None
     kept = torch.stack([support.on(grid) for support in supports]).any(0)
-    told: dict[str, Any] = {"cells": float(kept.float().mean())}
+    described: dict[str, Any] = {"cells": float(kept.float().mean())}
     with suppress(HullError):
         frames = [(support.views, support.shown) for support in supports]
-        told["box"] = bound_smoke(frames, supports[0].margin).tolist()
-    return told
+        described["box"] = bound_smoke(frames, supports[0].margin).tolist()
+    return described
 
 
 def support_text(support: dict[str, Any]) -> str:
     """What `describe_support` says, as a line."""
-    told = f"pictures leave smoke in {100 * support['cells']:.3g} % of the cells"
+    described = f"pictures leave smoke in {100 * support['cells']:.3g} % of the cells"
     if "box" in support:
         low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in support["box"])
-        told += f", within bounds: {{min: [{low}], max: [{high}]}}"
-    return told
+        described += f", within bounds: {{min: [{low}], max: [{high}]}}"
+    return described
 
 
 def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:

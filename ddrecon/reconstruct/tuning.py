@@ -30,7 +30,7 @@ FINAL_RATE = 0.2
 MOST_ENTRIES = 16
 """Parameters of more values, such as maps of radiance, are not among single numbers."""
 DAMPING = 1.0
-"""How much of its own curvature each parameter is held by: alone, it goes half of the way."""
+"""How much of its own curvature each parameter is damped by: alone, it goes half of the way."""
 LARGEST_STEP = 4.0
 """No number moves by more than so many times its rate."""
 LEVEL_RATE = 0.05

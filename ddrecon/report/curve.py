@@ -15,6 +15,8 @@ WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 520, 280, 62, 12, 26, 40
 """The picture and the margins of its plot, in units of SVG."""
 LEGEND = 70
 """Room for a name in the legend."""
+ROW = 20
+"""Height of a row of bars."""
 MOST = 500
 """Points of a curve that are drawn."""
 
@@ -61,6 +63,28 @@ def draw_curve(
         parts.append(_text(end, 16, name, "end", color=color))
     label = f'role="img" aria-label="{escape(title)}"'
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(parts)}</svg>'
+
+
+def draw_bars(rows: Sequence[tuple[str, float, float]]) -> str:
+    """An SVG of the `rows` of a name, a value and its deviation: a bar of one and a line of two.
+
+    All have one axis, so that values can be compared.
+    """
+    ends = [value + way * deviation for _, value, deviation in rows for way in (-2, 2)]
+    low, high, at = _axis(ends, WIDTH / 2, WIDTH - RIGHT)
+    bottom, parts = ROW * len(rows), list[str]()
+    for index, (name, value, deviation) in enumerate(rows):
+        y = ROW * (index + 0.5)
+        parts.append(_text(WIDTH / 2 - 10, y + 4, name, "end"))
+        for times, width in ((2, 1.2), (1, 6)):
+            x1, x2 = at(value - times * deviation), at(value + times * deviation)
+            place = f'x1="{x1:.1f}" y1="{y}" x2="{x2:.1f}" y2="{y}"'
+            parts.append(f'<line {place} stroke="{COLORS[0]}" stroke-width="{width}"/>')
+        parts.append(f'<circle cx="{at(value):.1f}" cy="{y}" r="3.5" fill="{COLORS[1]}"/>')
+    for tick in ticks(low, high):
+        parts.append(_text(at(tick), bottom + 14, f"{tick:.6g}", "middle"))
+    label = f'role="img" aria-label="{escape(", ".join(name for name, _, _ in rows))}"'
+    return f'<svg viewBox="0 0 {WIDTH} {bottom + 20}" {label}>{"".join(parts)}</svg>'
 
 
 def _axis(

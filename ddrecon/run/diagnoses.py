@@ -1,4 +1,4 @@
-"""What seems to be wrong with a run, told by its pictures and its log.
+"""What seems to be wrong with a run, by its pictures and its log.
 
 Each function returns a sentence, with what to do, or None where there is nothing to say.
 """
@@ -53,14 +53,14 @@ def diagnose(
     least = 1.0
     if share is not None and abs(math.log(usual)) <= math.log(GAIN):
         least = max(EXPLAINED, share)
-    told = {
+    found = {
         "overfit": overfit,
         "exposure": find_exposure(trained, images, usual, least),
         "cameras": find_shift(trained, images, least),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
     }
-    return [{"kind": kind, "text": text} for kind, text in told.items() if text is not None]
+    return [{"kind": kind, "text": text} for kind, text in found.items() if text is not None]
 
 
 def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float]]) -> str | None:

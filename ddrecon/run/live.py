@@ -124,7 +124,7 @@ def serve_page(page: Callable[[], str], port: int | None) -> ThreadingHTTPServer
             self.wfile.write(content)
 
         def log_message(self, *_: object) -> None:
-            """Requests are not told."""
+            """Requests are not logged."""
 
     if port is None:
         with suppress(OSError):

@@ -67,7 +67,7 @@ def find_results(run: Reconstruction, registers: bool = False) -> Findings:
 def _given_fields(scene: Scene) -> dict[str, Tensor]:
     """The fields of `scene` that are optimized but start from something else: the truth, perhaps.
 
-    What is the same in every cell is not told.
+    What is the same in every cell is left out.
     """
     given = {}
     for name, start in scene.starts.items():

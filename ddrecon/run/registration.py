@@ -2,7 +2,7 @@
 
 A held-out camera may err as all do, and then says more of itself than of the volume. So its pose
 and exposure are fitted to the finished volume, by Gauss and Newton with the slopes of where it was
-given: shifts are small, and slopes dear. The volume stays as it is.
+given, by differences: shifts are small. The volume stays as it is.
 """
 
 from __future__ import annotations
@@ -13,12 +13,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, project
 from ddrecon.grid import Grid
 from ddrecon.losses import Target
-from ddrecon.reconstruct.curvature import change_of
 from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.renderer import LightField, view_picture
 from ddrecon.scene import Scene, View
@@ -29,6 +27,8 @@ STEPS = 8
 """At most; they end when one makes nothing better."""
 LEAST = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
+SMALL = 0.1
+"""The part of a rate over which slopes are differences."""
 FARTHEST = 40.0
 """No step is farther than so many rates, of a quarter of a pixel."""
 
@@ -41,38 +41,39 @@ def register(
     And by how many pixels it moved, the mean of the box's corners. `sizes` are as for
     `fit_held_out`.
     """
-    name, ways = f"views.{view.name}.camera", torch.eye(6).to(view.camera.pose)
-    unit = pose_rate(scene, name, ways[0])
-    change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
-    columns: list[Tensor] = []
-    for _ in range(STEPS):
+    name = f"views.{view.name}.camera"
+    unit = pose_rate(scene, name, view.camera.pose)
+
+    def see_by(change: Tensor) -> tuple[View, Tensor]:
         world = with_values(scene, {name: change})
         moved = world.view(view.name)
-        picture = view_picture(light_field, world, moved)
+        return moved, view_picture(light_field, world, moved)
+
+    change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
+    moved, picture = see_by(change)
+    ways = SMALL * unit
+    changes = torch.stack([(see_by(way)[1] - picture) / SMALL for way in ways.diag()])
+    for _ in range(STEPS):
         fitted, response = fit_held_out(picture, view, target, sizes)
         psnr = float(target.psnr_of(fitted))
         if best and psnr <= best["psnr"]:
             break
         shift = shift_between(view.camera, moved.camera, scene.volume.grid)
         best = {"psnr": psnr, "ssim": float(target.ssim_of(fitted)), "shift": shift}
-        if not columns:
-            for way in ways:
-                with forward_ad.dual_level():
-                    moving = {name: forward_ad.make_dual(change, way * unit)}
-                    columns.append(change_of(light_field, with_values(scene, moving), view.name))
         # Errors are those that PSNR counts, of values as they are compared.
         given = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
         slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / given
         error = target.compared - target.on.values(fitted)
         if target.seen is not None:
             slope, error = slope * target.seen, error * target.seen
-        jacobian = (torch.stack(columns) * slope).flatten(1).double().cpu()
+        jacobian = (changes * slope).flatten(1).double().cpu()
         residual = error.flatten().double().cpu()
         matrix = jacobian @ jacobian.T
         matrix = matrix + LEAST * matrix.diagonal().max() * torch.eye(6).double()
         step = torch.linalg.lstsq(matrix, jacobian @ residual).solution
         step = step / (step.abs().max() / FARTHEST).clamp(min=1)
         change = change + step.to(unit) * unit
+        moved, picture = see_by(change)
     return best
 
 

@@ -75,7 +75,7 @@ def render_to_folder(
         {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
         for r in memory.records
     ]
-    report = {
+    report: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
         "solves": solves,
         "physics": needed_terms(scene),
@@ -83,6 +83,8 @@ def render_to_folder(
         "preview": PREVIEW,
         "psnr": quality,
     }
+    if rounds := [r for r in memory.records if r.kind == "rounds"]:
+        report["rounds"] = {"count": rounds[-1].iterations, "residual": rounds[-1].residual}
     if fluence_files:
         report["fluence"] = fluence_files
     if parameter is not None:
@@ -147,6 +149,9 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
     if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
         lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
+    if "rounds" in report:
+        count, residual = report["rounds"]["count"], report["rounds"]["residual"]
+        lines.append(f"transport rounds: {count}, residual {residual:.2g}")
     if "fluence" in report:
         lines.append(f"fluence: {', '.join(report['fluence'])}")
     if "ring" in report:

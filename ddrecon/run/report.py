@@ -187,8 +187,8 @@ def _view_table(findings: Findings) -> str:
         height, width = view.camera.size
         split = "test" if view.is_test else "train"
         quality = findings.quality.get(view.name)
-        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
-        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
+        shown = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *shown))
     return table(["view", "split", "pixels", "weight", "PSNR [dB]", "SSIM"], rows)
 
 

@@ -1,4 +1,4 @@
-"""How sure a run is: samples are drawn, one after the other, and nothing is lost on the way."""
+"""How sure a run is: experiments are made, one after the other, and nothing is lost on the way."""
 
 from __future__ import annotations
 
@@ -17,37 +17,35 @@ from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoint
-from ddrecon.run.run_folder import CHECKPOINTS, remove_samples
-from ddrecon.uncertainty.folder import write_found, write_sample
-from ddrecon.uncertainty.next_view import candidates_of
-from ddrecon.uncertainty.posterior import Sample
-from ddrecon.uncertainty.samples import PictureErrors, Uncertainty
+from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, remove_samples
+from ddrecon.scene import Scene
+from ddrecon.uncertainty.deviations import Deviations
+from ddrecon.uncertainty.experiments import Uncertainty
+from ddrecon.uncertainty.folder import write_found
+from ddrecon.uncertainty.next_view import candidates_of, rank_views
 
 
 @dataclass(frozen=True)
 class Request:
-    """What samples depend on: `noise` of all pictures, if their scene is not to say, and so on."""
+    """What is asked for: so many `experiments`, and `samples` of what they leave open.
+
+    `noise` is that of all pictures, if their scene is not to say; `next_view` what to rank.
+    """
 
     seed: int
+    experiments: int
+    samples: int
     noise: Noise | None = None
-    tolerance: float | None = None
     next_view: str | None = None
+    has_samples: bool = False
 
 
 def drive_uncertainty(
-    run: Reconstruction,
-    path: Path,
-    samples: int,
-    request: Request,
-    *,
-    has_samples: bool,
-    resume: bool,
-    is_quiet: bool,
+    run: Reconstruction, path: Path, request: Request, *, resume: bool, is_quiet: bool
 ) -> dict[str, Any]:
-    """What `uncertainty.json` says of `run`, after `samples` in all, its folder being `path`.
+    """What `uncertainty.json` says of `run`, its folder being `path`.
 
-    Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
-    as volumes. An interrupt takes effect after a sample.
+    An interrupt takes effect after an iteration of an experiment; `resume` goes on from there.
     """
     described, checkpoints = _describe(run, request), path / CHECKPOINTS
     state, began = None, perf_counter()
@@ -59,52 +57,67 @@ def drive_uncertainty(
         remove_samples(path)
     for folder in (path / "volumes", checkpoints):
         folder.mkdir(exist_ok=True)
-    found = _begin(run, from_first(state), request)
+    found, candidates = _begin(run, from_first(state), request)
 
-    def keep(sample: Sample) -> None:
-        if has_samples:
-            write_sample(found, sample.change, path)
-        state = found.state() | {"seconds": perf_counter() - began}
-        save_checkpoint(checkpoints, state, described)
+    def keep() -> None:
+        save_checkpoint(checkpoints, found.state() | {"seconds": perf_counter() - began}, described)
 
     try:
-        _draw(found, samples, keep, is_quiet)
+        _experiment(found, request.experiments, keep, is_quiet)
+        deviations = Deviations(found)
+        views = rank_views(deviations, candidates, request.samples)
     except RanksError as error:
-        raise error.with_advice(f"{found.count} samples are kept: go on with --resume") from error
+        raise error.with_advice("what was done is kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
-    return write_found(found, path, perf_counter() - began)
+    kept = request.samples if request.has_samples else 0
+    return write_found(deviations, views, kept, path, perf_counter() - began)
 
 
-def follow_uncertainty(run: Reconstruction, samples: int, request: Request) -> None:
+def follow_uncertainty(run: Reconstruction, request: Request) -> None:
     """Does this rank's part of what `drive_uncertainty` does on the first, which alone writes."""
-    _draw(_begin(run, from_first(None), request), samples, lambda _: None, is_quiet=True)
+    found, candidates = _begin(run, from_first(None), request)
+    _experiment(found, request.experiments, lambda: None, is_quiet=True)
+    rank_views(Deviations(found), candidates, request.samples)
 
 
-def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) -> Uncertainty:
-    errors = None if state is None else PictureErrors(**state["errors"])
+def _begin(
+    run: Reconstruction, state: dict[str, Any] | None, request: Request
+) -> tuple[Uncertainty, list[Scene]]:
     # Before anything takes long: there may be nothing to rank.
-    shots = candidates_of(run.level.train, request.next_view) if request.next_view else []
-    found = Uncertainty(run, request.seed, request.noise, request.tolerance, errors, shots)
+    candidates = candidates_of(run.level.train, request.next_view) if request.next_view else []
+    found = Uncertainty(run, request.seed, request.noise)
     if state is not None:
         found.restore(state)
-    return found
+    return found, candidates
 
 
-def _draw(found: Uncertainty, samples: int, keep: Callable[[Sample], None], is_quiet: bool) -> None:
-    bar = tqdm(total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet))
+def _experiment(
+    found: Uncertainty, experiments: int, keep: Callable[[], None], is_quiet: bool
+) -> None:
+    """Makes what is lacking of `experiments`; `keep` is called now and then, and where it ends."""
+    total, due = experiments * found.run.iteration, perf_counter() + CHECKPOINT_SECONDS
+    bar = tqdm(total=total, initial=found.iteration, desc="uncertainty", **bar_settings(is_quiet))
+    keep()
     with defer_interrupt() as asked, bar:
-        while found.count < samples:
-            sample = found.step()
-            keep(sample)
-            bar.set_postfix_str(f"{sample.products} products", refresh=False)
+        while found.count < experiments:
+            try:
+                found.step()
+            except RanksError:
+                keep()
+                raise
             bar.update()
-            if is_any(bool(asked)):
-                raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
+            is_asked = is_any(bool(asked))
+            if is_asked or found.trial is None or perf_counter() > due:
+                keep()
+                due = perf_counter() + CHECKPOINT_SECONDS
+            if is_asked:
+                made = f"after {found.iteration} of {total} iterations"
+                raise KeyboardInterrupt(f"{made}; go on with --resume")
 
 
 def _describe(run: Reconstruction, request: Request) -> dict[str, Any]:
-    """What samples depend on, in plain values, so that only those of the same run are added up."""
+    """What experiments depend on, in plain values, so that only those of the same run go on."""
     sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
     noise = None if request.noise is None else vars(request.noise)
-    return {"iteration": run.iteration, "values": sums} | vars(request) | {"noise": noise}
+    return {"iteration": run.iteration, "values": sums, "seed": request.seed, "noise": noise}

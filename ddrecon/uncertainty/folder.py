@@ -1,8 +1,8 @@
-"""The folder of samples of a run: deviations of all that was optimized, and the page about them."""
+"""The folder of how sure a run is: deviations of all that was optimized, and their page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,66 +10,72 @@ from torch import Tensor
 
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import png_of
-from ddrecon.report.page import paragraph, picture, section, table, write_page
-from ddrecon.report.pictures import slices
+from ddrecon.report.curve import draw_bars
+from ddrecon.report.page import items, paragraph, picture, section, table, write_page
+from ddrecon.report.pictures import see_through, slices
 from ddrecon.report.volumes import find_white_value
 from ddrecon.run.run_folder import write_values
-from ddrecon.uncertainty.next_view import rank_views
-from ddrecon.uncertainty.samples import Uncertainty
+from ddrecon.uncertainty.deviations import SHORT, Deviations, Field
 from ddrecon.variables.kinds import kind_of
 
 RECORD = "uncertainty.json"
 """What tells a folder of this kind."""
+ASSUMED = (
+    "Deviations are those of experiments: what was found was photographed, by more transport rounds"
+    " than the run had, with the errors that its pictures had, and reconstructed by the same"
+    f" settings. They are taken {SHORT} times, which is what experiments lacked where the truth was"
+    " known. What no experiment changes (cameras, lights and optics that were given) is taken for"
+    " true."
+)
+CAVEAT = (
+    "Not calibrated (--calibrate 0): deviations know noise alone, and are several times too small."
+)
 
 
-def write_sample(found: Uncertainty, change: Tensor, path: Path) -> None:
-    """Writes the fields of the last sample, `change` from the optimum, to the folder `path`."""
-    folder = path / "samples" / f"{found.count - 1:04d}"
-    folder.mkdir(parents=True, exist_ok=True)
-    parts = found.curvature.split(change)
-    for name in _written(found):
-        _write(found, folder / name, name, found.curvature.values[name] + parts[name])
+def write_found(
+    deviations: Deviations,
+    views: Sequence[Mapping[str, Any]],
+    samples: int,
+    path: Path,
+    seconds: float,
+) -> dict[str, Any]:
+    """What `uncertainty.json` says; writes it, volumes, so many `samples` and report to `path`.
 
-
-def write_found(found: Uncertainty, path: Path, seconds: float) -> dict[str, Any]:
-    """What `uncertainty.json` says; writes it, volumes and report to the folder `path`."""
-    stated = {"std": found.deviations, "mean": found.means, "told": found.told}
-    fields = dict[str, Any]()
-    for name in _written(found):
+    `views` are those that may come next.
+    """
+    found, fields = deviations.found, deviations.fields
+    for name, field in fields.items():
+        stated = {"std": field.deviation, "mean": field.value, "told": field.told}
         for kind, values in stated.items():
-            _write(found, path / "volumes" / f"{name}_{kind}", name, values[name])
-        value, deviation = found.curvature.values[name], stated["std"][name]
-        fields[name] = {
-            "root_mean_square": float(value.square().mean().sqrt()),
-            "deviation": float(deviation.square().mean().sqrt()),
-            "told": float(stated["told"][name].mean()),
-        }
-    known = "the scene" if found.errors.is_known else "residuals"
+            _write(field, path / "volumes" / f"{name}_{kind}", name, values)
+    for number in range(samples):
+        folder = path / "samples" / f"{number:04d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        changes = found.curvature.split(deviations.draw(number))
+        for name, field in fields.items():
+            p, sample = field.parameter, field.value + changes[name].cpu()
+            _write(field, folder / name, name, sample.clamp(p.low, p.high))
     record = {
-        "samples": found.count,
+        "experiments": found.count,
         "seconds": seconds,
-        "products": found.products,
-        "residual": found.residual,
-        "noise": vars(found.errors) | {"from": known},
-        "fields": fields,
-        "numbers": found.described_numbers(),
-        "correlations": found.correlations().tolist() if found.tabled else [],
-        "next_views": rank_views(found),
+        "iterations": found.iteration,
+        "noise": {
+            "deviation": found.deviation,
+            "from": "the scene" if found.is_noise_known else "residuals",
+        },
+        "assumed": ASSUMED if found.count else CAVEAT,
+        "fields": {name: field.describe() for name, field in fields.items()},
+        "numbers": deviations.numbers(),
+        "next_views": list(views),
     }
     write_json(path / RECORD, record)
-    write_uncertainty_report(path / "report.html", stated, record)
+    write_uncertainty_report(path / "report.html", fields, record)
     return record
 
 
-def _written(found: Uncertainty) -> list[str]:
-    """The names of fields and maps: of all that is no table of numbers."""
-    tabled = {parameter.name for parameter in found.tabled}
-    return [name for name in found.curvature.values if name not in tabled]
-
-
-def _write(found: Uncertainty, stem: Path, name: str, value: Tensor) -> None:
-    grid = found.curvature.scene.volume.grid
-    write_values(stem, stem.name, value, grid, is_map=not kind_of(name).is_cellwise)
+def _write(field: Field, stem: Path, name: str, value: Tensor) -> None:
+    is_map = not kind_of(name).is_cellwise
+    write_values(stem, stem.name, value, field.parameter.grid, is_map=is_map)
 
 
 def volumes_in(folder: Path) -> list[Path]:
@@ -83,83 +89,110 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
     """The `record` of a folder `path` as lines."""
     noise = record["noise"]
     return [
-        f"{record['samples']} samples in {record['seconds']:.1f} s, {record['products']} products;"
+        f"experiments: {record['experiments']}, in {record['seconds']:.1f} s;"
         f" pictures err by {noise['deviation']:.3g} (from {noise['from']})",
         *(
-            f"{name}: deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g}"
-            f" (root mean squares), {100 * field['told']:.0f} % told by pictures"
+            line
             for name, field in record["fields"].items()
+            for line in (f"{name}: {_about(field)}", *(f"  {each}" for each in _classes(field)))
         ),
+        *(f"{name}: {_number(number)}" for name, number in record["numbers"].items()),
         *(
-            f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
-            for name, number in record["numbers"].items()
-        ),
-        *(
-            f"{'  then ' if place else 'next view: '}{view['name']}, whose picture takes at least "
-            f"{100 * view['gain']:.1f} % of the variance (+- {100 * view['error']:.1f})"
+            f"{'  then ' if place else 'next view: '}{view['name']} {_promise(view, place)}"
             for place, view in enumerate(record["next_views"])
         ),
+        record["assumed"],
         f"deviations and report written to {path}",
     ]
 
 
+def _about(field: Mapping[str, Any]) -> str:
+    return (
+        f"deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g} (root mean squares"
+        f" over the smoke); pictures explain {100 * field['told']:.0f} % of the variance"
+    )
+
+
+def _classes(field: Mapping[str, Any]) -> list[str]:
+    """A line for each class of the cells of a `field`: how many, and how often experiments held."""
+    lines = []
+    for name, of in field["classes"].items():
+        what = ", where pictures tell nothing" if name == "untold" else ""
+        line = f"{name}{what}: {100 * of['share']:.0f} % of the smoke"
+        if "within_1" in of:
+            line += (
+                f"; in experiments {100 * of['within_1']:.0f} % lay within one deviation,"
+                f" {100 * of['within_2']:.0f} % within two"
+            )
+        lines.append(line)
+    return lines
+
+
+def _number(number: Mapping[str, float | None]) -> str:
+    deviation = number["deviation"]
+    known = "unknown without experiments" if deviation is None else f"{deviation:.2g}"
+    return f"{number['value']:.5g} +- {known}"
+
+
+def _promise(view: Mapping[str, Any], place: int) -> str:
+    """What the picture at this `place` in the ranking may tell."""
+    tied = ", not to be told from the first" if place and view["is_tied"] else ""
+    gain, error = 100 * view["gain"], 100 * view["error"]
+    return f"takes at least {gain:.1f} % of the variance (+- {error:.1f}){tied}"
+
+
 def write_uncertainty_report(
-    path: Path, stated: Mapping[str, Mapping[str, Tensor]], record: Mapping[str, Any]
+    path: Path, fields: Mapping[str, Field], record: Mapping[str, Any]
 ) -> None:
-    """Writes the page about the fields `stated` by kind and name, and what `record` has of them."""
+    """Writes the page about the `fields` by name, and what `record` has of them."""
     sections = [
-        section(name.capitalize(), *_field(name, stated, numbers))
-        for name, numbers in record["fields"].items()
+        section(name.capitalize(), *_field(name, field, record["fields"][name]))
+        for name, field in fields.items()
     ]
     if record["numbers"]:
-        rows = [
-            (name, f"{number['value']:.5g} ± {number['deviation']:.2g}")
-            for name, number in record["numbers"].items()
-        ]
-        sections.append(section("Numbers", table(["number", "value ± deviation"], rows)))
+        rows = [(name, _number(number)) for name, number in record["numbers"].items()]
+        sections.append(section("Numbers", *_bars(record["numbers"]), table(["", ""], rows)))
     if record["next_views"]:
-        rows = [
-            (view["name"], f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %")
-            for view in record["next_views"]
-        ]
-        head = ["picture", "of the variance of all cells, at least"]
-        sections.append(section("Next picture", table(head, rows)))
-    error = 100 / max(2 * (record["samples"] - 1), 1) ** 0.5
-    how = (
-        f"A deviation from {record['samples']} samples is itself off by about {error:.0f} %."
-        " Told is the part of a cell's variance that pictures took away from what smoothing"
-        " alone leaves open, in the mean of the cells around.",
-        "All this is about the optimum that was found, for pictures that err by noise alone:"
-        " what the model of light lacks is not in it.",
-    )
-    sections.append(section("How", *map(paragraph, how)))
+        rows = [(each["name"], _promise(each, at)) for at, each in enumerate(record["next_views"])]
+        sections.append(section("Next picture", table(["picture", ""], rows)))
+    sections.append(section("How", paragraph(record["assumed"])))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
     noise = record["noise"]
     lead = (
-        f"{record['samples']} samples in {record['seconds']:.1f} s. Pictures err by"
+        f"Experiments: {record['experiments']}, in {record['seconds']:.1f} s. Pictures err by"
         f" {noise['deviation']:.3g} of radiance, by {noise['from']}."
     )
     write_page(path, title, lead, sections, is_alive=False)
 
 
-def _field(
-    name: str, stated: Mapping[str, Mapping[str, Tensor]], numbers: Mapping[str, float]
-) -> list[str]:
-    mean, deviation, told = (stated[kind][name] for kind in ("mean", "std", "told"))
-    white, strongest = find_white_value(mean), find_white_value(deviation)
+def _field(name: str, field: Field, described: Mapping[str, Any]) -> list[str]:
+    value, deviation = field.value, field.deviation
+    strongest = find_white_value(deviation)
     pictures = [
-        (mean, white, f"{name}, mean of the samples: white is {white:.3g}"),
-        (deviation, strongest, f"standard deviation: white is {strongest:.3g}"),
-        (told, 1.0, "told by pictures: black is nothing, white is all"),
+        (slices(deviation, strongest), f"deviation: white is {strongest:.3g}"),
+        (slices(field.told, 1.0), "explained by pictures: black is nothing, white is all"),
     ]
-    shown = "".join(
-        picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
-    )
+    if field.parameter.is_field:
+        size, off = (
+            each.reshape(-1, *each.shape[-3:]).abs().mean(0) for each in (value, deviation)
+        )
+        seen = see_through(size, off / size.clamp(min=1e-3 * float(size.max())))
+        caption = "opaque by what was found; blue is sure, white off by half, red by all of it"
+        pictures.insert(0, (seen, caption))
+    shown = "".join(picture(png_of(pixels), caption) for pixels, caption in pictures)
     return [
-        paragraph(
-            f"Deviation {numbers['deviation']:.3g} of {numbers['root_mean_square']:.3g} (root mean"
-            f" squares over all cells); {100 * numbers['told']:.0f} % told on average."
-            " Slices across z, x and y from left to right."
-        ),
+        paragraph(f"{_about(described).capitalize()}. Seen along z, x and y from left to right."),
+        items(_classes(described)),
         f'<div class="views">{shown}</div>',
     ]
+
+
+def _bars(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
+    """Pictures of the `numbers` with their deviations, a picture for all of one kind."""
+    kinds = dict[str, list[tuple[str, float, float]]]()
+    for name, number in numbers.items():
+        value, deviation = number["value"], number["deviation"]
+        if value is not None and deviation is not None:
+            kind = name.split(".", 2)[-1] if name.startswith(("views.", "lights.")) else name
+            kinds.setdefault(kind, []).append((name, value, deviation))
+    return [draw_bars(rows) for rows in kinds.values()]

@@ -1,4 +1,4 @@
-"""Which picture to take next: how much of the posterior's variance a picture would take away.
+"""Which picture to take next: how much of the variance that is left a picture would take away.
 
 Few samples differ in every picture, so that it seems to tell them all apart. What is used here is a
 bound made of means over pairs and triples of different samples, which have no such bias.
@@ -6,6 +6,7 @@ bound made of means over pairs and triples of different samples, which have no s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +17,12 @@ from ddrecon.errors import UsageError
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.scene import Scene, View
 from ddrecon.turntable import place_turntable
-from ddrecon.uncertainty.samples import Uncertainty
+from ddrecon.uncertainty.deviations import Deviations
 
 CANDIDATES = 12
 """Pictures that are ranked."""
-FEWEST = 5
-"""Samples that there must be: four are independent of their mean, and without one of them three."""
+FEWEST = 4
+"""Samples that there must be: without one of them there are triples yet."""
 
 
 def candidates_of(scene: Scene, kind: str) -> list[Scene]:
@@ -49,27 +50,44 @@ def candidates_of(scene: Scene, kind: str) -> list[Scene]:
     return found
 
 
-def rank_views(found: Uncertainty) -> list[dict[str, Any]]:
-    """What `uncertainty.json` says of the views of the candidates that samples changed, best first.
+def rank_views(
+    deviations: Deviations, candidates: Sequence[Scene], samples: int
+) -> list[dict[str, Any]]:
+    """What `uncertainty.json` says of the views of the `candidates`, best first, by `samples`.
 
-    A picture takes at least the part `gain` of the variance; `error` is of that.
+    A picture takes at least the part `gain` of the variance; `error` is of that. One `is_tied` that
+    these samples cannot tell from the best.
     """
-    ranked, samples = list[dict[str, Any]](), map(found.curvature.split, found.changes)
+    found, ranked, left_out = deviations.found, list[dict[str, Any]](), dict[str, Tensor]()
+    if not candidates:
+        return ranked
+    changes = [deviations.draw(number) for number in range(samples)]
     # In steps of each: densities and cross sections have units of their own.
     rates = {p.name: torch.as_tensor(p.rate).cpu() for p in found.parameters}
-    names = [p.name for p in found.parameters if p.is_field] or list(rates)
-    steps = [torch.cat([(s[n] / rates[n]).flatten() for n in names]) for s in samples]
-    for scene in found.candidates:
-        alike = find_products(torch.stack(steps))
-        lights = scene.lights if len(found.candidates) > 1 else ()
+    names = list(deviations.fields) or list(rates)
+    parts = [found.curvature.split(change) for change in changes]
+    alike = find_products(
+        [torch.cat([(p[n].cpu() / rates[n]).flatten() for n in names]) for p in parts]
+    )
+    for scene in candidates:
+        pictures = [found.curvature.tangents(change, scene) for change in changes]
+        lights = scene.lights if len(candidates) > 1 else ()
         ways = [light.direction.tolist() for light in lights if isinstance(light, DirectionalLight)]
         for view in scene.views:
-            shown = torch.stack([pictures[view.name].flatten() for pictures in found.pictures])
-            pair = alike, find_products(shown / found.errors.deviation)
-            told = {"name": view.name, "gain": find_gain(*pair), "error": find_error(*pair)}
+            shown = find_products(
+                [p[view.name].cpu().flatten() / found.deviation for p in pictures]
+            )
+            left_out[view.name] = gains_but_one(alike, shown)
+            gain, error = find_gain(alike, shown), find_error(left_out[view.name])
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
+            told = {"name": view.name, "gain": gain, "error": error}
             ranked.append(told | {"matrix": matrix, "light_directions": ways})
-    return sorted(ranked, key=lambda each: -each["gain"])
+    ranked.sort(key=lambda each: -each["gain"])
+    best = ranked[0]
+    for each in ranked:
+        between = find_error(left_out[best["name"]] - left_out[each["name"]])
+        each["is_tied"] = best["gain"] - each["gain"] <= between
+    return ranked
 
 
 def find_gain(alike: Tensor, shown: Tensor) -> float:
@@ -87,22 +105,18 @@ def find_gain(alike: Tensor, shown: Tensor) -> float:
     return min(once**2 / ((once + twice) * total), 1.0) if once > 0 and total > 0 else 0.0
 
 
-def find_error(alike: Tensor, shown: Tensor) -> float:
-    """The standard error of `find_gain`, by leaving out one sample after another (jackknife)."""
-    count = len(alike)
-    kept = [torch.arange(count) != left_out for left_out in range(count)]
-    gains = [find_gain(alike[some][:, some], shown[some][:, some]) for some in kept]
-    return float(torch.tensor(gains).std(correction=0)) * (count - 1) ** 0.5
+def gains_but_one(alike: Tensor, shown: Tensor) -> Tensor:
+    """`find_gain` without one sample after another."""
+    kept = [torch.arange(len(alike)) != left_out for left_out in range(len(alike))]
+    return torch.tensor([find_gain(alike[some][:, some], shown[some][:, some]) for some in kept])
 
 
-def find_products(samples: Tensor) -> Tensor:
-    """Inner products [m, m] of what `samples` [m + 1, n] are apart from their mean.
+def find_error(left_out: Tensor) -> float:
+    """The standard error of what is `left_out` [m] without one sample after another (jackknife)."""
+    return float(left_out.std(correction=0)) * (len(left_out) - 1) ** 0.5
 
-    They are turned so that m of them are independent, and the mean is the other (Helmert).
-    """
-    count, wide = len(samples), samples.double()
-    turn = torch.ones(count - 1, count, dtype=torch.float64).tril()
-    rows = torch.arange(1, count)
-    turn[rows - 1, rows] = -rows.double()
-    turn = turn / (rows * (rows + 1.0))[:, None].sqrt()
-    return turn @ (wide @ wide.T) @ turn.T
+
+def find_products(samples: Sequence[Tensor]) -> Tensor:
+    """Inner products [m, m] of m independent `samples` [n], whose mean is 0."""
+    wide = torch.stack(list(samples)).double()
+    return wide @ wide.T

@@ -90,15 +90,17 @@ def offset_rate(scene: Scene, name: str, start: Tensor) -> float:
 def unit_of(scene: Scene, name: str) -> float:
     """The density, or cross section, of an optical depth of 1 across the box's shortest side.
 
-    `name` is the variable's: a density counts by the mean extinction of its own medium, a cross
-    section by the largest density of its own, or by `SOUGHT_DEPTH` where that is empty. 1 where
-    neither is known, and for other variables. An emission counts by the pictures' brightness.
+    `name` is the variable's: a density counts by the mean extinction of its own medium, where there
+    is any, a cross section by the largest density of its own, or by `SOUGHT_DEPTH` where that is
+    empty. 1 where neither is known, and for other variables. An emission counts by the pictures'
+    brightness.
     """
     volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
     if volume.media is not None and name.startswith("media."):
         volume = volume.media[name.split(".")[1]]
     if kind == "density" or kind.startswith("sigma_"):
-        depth = side * float(volume.sigma_a.mean() + volume.sigma_s.mean())
+        extinction = volume.sigma_a + volume.sigma_s
+        depth = side * float(extinction.sum() / extinction.count_nonzero().clamp(min=1))
         unit = 1 / depth if depth > 0 else 1.0
         largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
         return unit if kind == "density" else 1 / (side * largest)

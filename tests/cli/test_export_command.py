@@ -113,17 +113,19 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
     )
 
 
-@pytest.mark.parametrize("colors", [(), (3,)])
-def test_z_points_up_where_y_did(succeed: Run, colors: tuple[int, ...]) -> None:
-    """Each cell keeps its place in space: (x, y, z) becomes (x, -z, y)."""
+@pytest.mark.parametrize(("name", "colors"), [("g", ()), ("albedo", (3,)), ("velocity", (3,))])
+def test_z_points_up_where_y_did(succeed: Run, name: str, colors: tuple[int, ...]) -> None:
+    """Each cell keeps its place in space: (x, y, z) becomes (x, -z, y). So do arrows."""
     values = np.random.default_rng(2).random((2, 3, 4, *colors)).astype(np.float32)
     box = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 5.0]])
-    write_field(Path("start.npz"), "albedo", values, box)
+    write_field(Path("start.npz"), name, values, box)
     succeed("export", "start.npz", "-o", "turned.npz", "--up", "z")
-    turned = read_field(Path("turned.npz"), "albedo")
+    turned = read_field(Path("turned.npz"), name)
     assert turned.bounds is not None and turned.bounds.tolist() == [[-1, -5, -2], [1, 3, 2.5]]
-    for (z, y, x), value in np.ndenumerate(values[..., 0] if colors else values):
+    for z, y, x in np.ndindex(2, 3, 4):
         center = box[0] + (np.array([x, y, z]) + 0.5) * (box[1] - box[0]) / [4, 3, 2]
         place = np.array([center[0], -center[2], center[1]]) - turned.bounds[0]
         i, j, k = (place / (turned.bounds[1] - turned.bounds[0]) * [4, 2, 3]).astype(int)
-        assert (turned.values[k, j, i, 0] if colors else turned.values[k, j, i]) == value
+        was = values[z, y, x]
+        now = [was[0], -was[2], was[1]] if name == "velocity" else was
+        assert np.array_equal(turned.values[k, j, i], now)

@@ -8,7 +8,6 @@ from click.testing import Result
 from far_device import FAR
 
 from ddrecon.cli.session import Session
-from ddrecon.uncertainty import posterior
 
 Run = Callable[..., Result]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("shapes_by_python")]
@@ -16,11 +15,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("shapes_by_python")]
 
 def test_commands_end_well_there(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Session, "start", lambda _: FAR)
-    for name in ("MOST", "ROUNDS", "INNER"):
-        monkeypatch.setattr(posterior, name, 1)
     succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "2")
     succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "3", "--resume")
-    succeed("uncertainty", "run", "-o", "sure", "--samples", "2")
+    succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1")
     succeed("render", "run", "-o", "seen")
     succeed("gradcheck", "scene.yaml", "--samples", "2")
     assert Path("run/report.html").is_file() and Path("seen/front.npy").is_file()

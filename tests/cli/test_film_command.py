@@ -110,7 +110,11 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
         for name in field_names(exported):
             values = read_field(run / "volumes" / f"{name}.npz", name).values
             np.testing.assert_array_equal(read_field(exported, name).values, values)
-    # Each is a run as any other.
+    # Each is a run as any other, and some are rendered together.
+    succeed("render", "out", "-o", "seen", "--frames", "1:2", "--view", "side")
+    succeed("render", "out/frames/0002", "-o", "one", "--view", "side")
+    assert sorted(path.name for path in Path("seen").iterdir()) == ["0001", "0002"]
+    np.testing.assert_array_equal(np.load("seen/0002/side.npy"), np.load("one/side.npy"))
     load_run(Path("out/frames/0002"), lambda dtype: load_scene("out/frames/0002/scene.yaml"))
     # Its calibration goes to another film.
     succeed(*optimize("-o", "other", "--shared", "out/shared.json", "--frames", "2:"))
@@ -131,6 +135,36 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
     )
     start, first = volumes("out/frames/0001"), volumes("out/frames/0000")
     assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
+
+
+def test_frames_end_by_themselves_as_runs_do(
+    film: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ddrecon.reconstruct.tuning.WINDOW", 3)
+    sizes = "-D", "optimize.iterations=auto", "-D", "frames.calibrate=0"
+    succeed(*optimize("-o", "out", "--frames", "0:1", *sizes))
+    for number in range(2):
+        summary = json.loads(Path(f"out/frames/000{number}/summary.json").read_text())
+        assert summary["ended"]["kind"] == "rest" and 12 <= summary["iterations"] < 300
+
+
+def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
+    """It begins from nothing, and its first frame moves as the second does."""
+    for name in VIEWS:
+        for number in (8, 9):
+            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_{number - 6:02d}.npy"))
+    sizes = "-D", "frames.calibrate=0", "-D", "frames.first=0", "-D", "frames.last=9"
+    for name in VIEWS:
+        for number in range(4, 8):
+            np.save(f"{name}_{number:02d}.npy", np.load(f"{name}_00.npy"))
+    succeed(*optimize("-o", "alone", "--frames", "8:9", *sizes))
+    for part in ("0:1", "8:9"):
+        succeed(*optimize("-o", "out", "--resume", "--frames", part, *sizes))
+    out, alone = volumes("out"), volumes("alone")
+    assert alone.items() <= out.items()
+    assert not [file for file in out if file.startswith("frames/0008/start")]
+    arrows = [out[f"frames/000{number}/volumes/velocity.npz"] for number in (8, 9)]
+    assert arrows[0] == arrows[1]
 
 
 @pytest.fixture
@@ -308,8 +342,11 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     Path("strange.json").write_text(json.dumps(shared))
     strange = run(*optimize("-o", "new", "--shared", "strange.json"))
     assert strange.exit_code == 2 and "views.top.exposure: the scene has none" in strange.stderr
-    single = run("optimize", "scene.yaml", "-o", "single", "--frames", "0:1")
-    assert single.exit_code == 2 and "--frames is for films" in single.stderr
+    for command, line in (("optimize", "is for films"), ("render", "is for the folders of films")):
+        single = run(command, "scene.yaml", "-o", "single", "--frames", "0:1")
+        assert single.exit_code == 2 and f"--frames {line}" in single.stderr
+    beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
+    assert beyond.exit_code == 2 and "no such frame is done" in beyond.stderr
 
 
 def test_frames_are_spread_over_all() -> None:

@@ -80,7 +80,7 @@ CELLS = "--share", "cells"
 
 def sure(ranks: int, output: str, *options: str) -> Job:
     command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
-    roughly = ["--noise", "0.05", "--tolerance", "0.9", "--keep-samples"]
+    roughly = ["--noise", "0.05", "--samples", "2", "--keep-samples"]
     return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
 
@@ -95,9 +95,9 @@ JOBS = {
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
-    "sure": sure(1, "sure", "--samples", "3"),
-    "sure begun": sure(1, "doubts", "--samples", "2"),
-    "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
+    "sure": sure(1, "sure", "--calibrate", "2"),
+    "sure begun": sure(1, "doubts", "--calibrate", "1"),
+    "sure of three": sure(3, "doubts", "--calibrate", "2", "--resume"),
     "whole": job(1, "whole", *TALL, *ROUNDS),
     "warm": job(1, "warm", *WARM),
     "warm cells": job(2, "warm cells", *WARM, *CELLS),

@@ -8,11 +8,10 @@ from media import make_camera, make_scene, random_values
 
 from ddrecon.losses import Target
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.numbers import number_curvature, single_numbers
+from ddrecon.reconstruct.numbers import _sum_between, find_curvatures, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
-from ddrecon.uncertainty.posterior import Posterior, solve_numbers_within
 from ddrecon.variables.values import value_of
 
 NAMES = (
@@ -42,7 +41,7 @@ def curvature() -> Curvature:
     # Twists are about cameras as they were told: the derivative is where it has moved to.
     parameters[3].value = 0.02 * random_values(6, seed=3)
     targets = {view.name: Target.of(view.image, None) for view in scene.views}
-    return Curvature(scene, parameters, targets, 0.3)
+    return Curvature(scene, parameters, targets)
 
 
 def test_it_is_the_part_of_the_matrix_between_numbers(curvature: Curvature) -> None:
@@ -55,40 +54,11 @@ def test_it_is_the_part_of_the_matrix_between_numbers(curvature: Curvature) -> N
         for way in p.value.detach()[None] if p.is_field else entries:
             parts.append(curvature.join({p.name: way}))
     basis = torch.stack(parts, 1)
-    found = number_curvature(curvature, curvature.parameters)
+    views = [view.name for view in curvature.scene.views]
+    by_view = find_curvatures(curvature, curvature.parameters, views, curvature.weights)
+    found = _sum_between(curvature.parameters, by_view, curvature.parameters)
     size = found.diagonal().sqrt()
     for ways in random_values(3, len(found)) - 0.5:
         wanted = basis.T @ curvature.data_product(basis @ (ways / size))
         # Solves for tangents and adjoints end at their tolerance.
         torch.testing.assert_close(found @ (ways / size) / size, wanted / size, rtol=0, atol=1e-5)
-
-
-def test_numbers_are_solved_for_within_what_is_sought() -> None:
-    """As by the matrix in a basis of what is free and shown, with units that differ widely."""
-    units = torch.logspace(-3, 3, 7, dtype=torch.float64)
-    root, gauge = random_values(7, 7, seed=1), random_values(7, 2, seed=2)
-    matrix = (root @ root.T + torch.eye(7)) * units * units[:, None]
-    gauge = torch.linalg.qr(gauge / units[:, None])[0]
-    right, is_fixed = units * random_values(7, seed=3), torch.arange(7) == 4
-    found = solve_numbers_within(matrix, right, is_fixed, gauge)
-    free = ~is_fixed
-    basis = torch.linalg.svd((gauge[free] / units[free, None]).T)[2][2:].T / units[free, None]
-    within = torch.linalg.solve(basis.T @ matrix[free][:, free] @ basis, basis.T @ right[free])
-    assert float(found[4]) == 0
-    torch.testing.assert_close(
-        (units * found)[free], units[free] * (basis @ within), rtol=1e-4, atol=1e-5
-    )
-
-
-def test_alone_they_are_found_in_one_product(curvature: Curvature) -> None:
-    """The preconditioner is the inverse where all else is fixed."""
-    posterior = Posterior(curvature, torch.zeros(curvature.size), 1e-4, seed=0)
-    is_fixed = ~posterior.is_number
-    wanted = random_values(curvature.size, seed=5) - 0.5
-    wanted = wanted.masked_fill(is_fixed, 0)
-    found = posterior._precondition(posterior.product(wanted), is_fixed)
-    wanted, found = wanted[posterior.is_number], found[posterior.is_number]
-    size = posterior.between.diagonal().sqrt()
-    torch.testing.assert_close(
-        size * found, size * wanted, rtol=1e-3, atol=1e-3 * float((size * wanted).norm())
-    )

@@ -16,7 +16,8 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.samples import Uncertainty
+from ddrecon.uncertainty.deviations import Deviations
+from ddrecon.uncertainty.experiments import Uncertainty
 
 pytestmark = pytest.mark.slow
 EYES = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
@@ -131,7 +132,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
 
 
 def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
-    """What a run finds, and how far a sample of its posterior is from it, in units of `scene_of`.
+    """What a run finds, and how far a sample about it is from it, in units of `scene_of`.
 
     And how many iterations it took.
     """
@@ -139,9 +140,10 @@ def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Ten
     run = Reconstruction(in_units(scene_of(kind), density, length))
     while not run.is_done:
         run.step()
-    uncertainty = Uncertainty(run, seed=0, tolerance=0.5)
-    change = uncertainty.step().change
-    samples = uncertainty.curvature.split(change)
+    uncertainty = Uncertainty(run, seed=0)
+    while uncertainty.count < 1:
+        uncertainty.step()
+    samples = uncertainty.curvature.split(Deviations(uncertainty).draw(0))
     both = {"run": {p.name: p.value.detach() for p in run.parameters}, "sample": samples}
     return {"iterations": torch.tensor(float(run.iteration))} | {
         f"{name} of the {what}": value / factor_of(name, density, length)

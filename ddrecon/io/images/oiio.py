@@ -161,7 +161,7 @@ def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
 
 
 def read_pixels(path: Path, file: Any, dtype: str) -> np.ndarray:
-    """All pixels [h, w, channels]; raises FormatError where some are damaged or lacking."""
+    """All pixels [h, w, channels]; raises FormatError where some are damaged or missing."""
     pixels = file.read_image(dtype)
     if file.has_error or pixels is None:
         raise FormatError(path, f"is damaged: {_line(file.geterror())}")

@@ -18,7 +18,9 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
-SIGNED = ("g", "velocity")
+VECTORS = ("velocity",)
+"""What fields are called whose three numbers are along x, y and z, not colors."""
+SIGNED = ("g", *VECTORS)
 """What fields are called that may be negative."""
 
 

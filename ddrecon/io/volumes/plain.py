@@ -74,8 +74,8 @@ def read_vol(path: Path, name: str) -> Field:
         known = f"only version {VERSION} with float32 values (type {FLOAT32}) can be read"
         raise FormatError(path, f"is of version {version} and type {kind}; {known}")
     if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
-        told = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
-        raise FormatError(path, f"is damaged: its header says {told}")
+        said = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
+        raise FormatError(path, f"is damaged: its header says {said}")
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
     values = values[..., 0] if colors == 1 else values
     return check_field(path, name, values, np.array(corners).reshape(2, 3))

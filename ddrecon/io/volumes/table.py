@@ -11,7 +11,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.volumes.field import BOX, Field, Fields
+from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
 from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol, write_vti
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
@@ -126,4 +126,10 @@ def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
     """`fields` and their box turned so that z points up where y did: (x, y, z) is (x, -z, y)."""
     (x, y, z), (far_x, far_y, far_z) = bounds.tolist()
     box = np.array([[x, -far_z, y], [far_x, -z, far_y]])
-    return {name: values.swapaxes(0, 1)[:, ::-1] for name, values in fields.items()}, box
+    turned = {name: values.swapaxes(0, 1)[:, ::-1] for name, values in fields.items()}
+    along = {
+        name: turned[name][..., [0, 2, 1]] * np.array([1, -1, 1])
+        for name in VECTORS
+        if name in turned
+    }
+    return turned | along, box

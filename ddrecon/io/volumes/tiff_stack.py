@@ -52,8 +52,8 @@ def read_stack(path: Path, name: str) -> Field:
             pages.append(read_pixels(path, file, "unknown"))
             check_size(4 * pages[0].size * len(pages), path, "the stack")
         # That no page follows is an error to it too: in OpenImageIO 3.0 the file's name alone.
-        if (told := file.geterror()) and "could not seek" not in told and told != f"Err: {path}":
-            raise FormatError(path, f"is damaged: {told}")
+        if (said := file.geterror()) and "could not seek" not in said and said != f"Err: {path}":
+            raise FormatError(path, f"is damaged: {said}")
         per_unit = [spec.get_float_attribute(f"{axis}Resolution", 1.0) for axis in "XY"]
     if len(pages) != int(facts.get("images", len(pages))):
         raise FormatError(path, f"is damaged: {len(pages)} of {facts['images']} pages are there")

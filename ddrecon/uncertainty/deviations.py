@@ -1,0 +1,195 @@
+"""What experiments say of each cell and number: deviations, and how often they held (E11).
+
+A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
+a factor for its class, times `SHORT`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.numerics.around import mean_around
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.uncertainty.experiments import Uncertainty, is_tabled
+from ddrecon.variables.kinds import split_name
+from ddrecon.variables.values import component_names
+
+WITHIN = 0.68
+"""The part of cells that is to be within one deviation."""
+SHORT = 1.5
+"""How many times as large errors are as in experiments, whose volumes lack what no reconstruction
+shows: as measured where the truth was known (docs/uncertainty.md)."""
+EMPTY = 0.02
+"""Cells of less than this part of the largest are empty."""
+WIDTH = 3
+"""Cells a side over which errors are averaged,"""
+WIDE = 9
+"""and over which samples hang together."""
+
+
+class Field:
+    """What is known of the field, or map, of `parameter`, by the experiments of `found`.
+
+    `power` is the mean square of its cells that are not empty: what a cell varies by if no picture
+    tells of it. `classes` are cells by class, [..., z, y, x].
+    """
+
+    def __init__(self, found: Uncertainty, parameter: Parameter):
+        self.parameter, name = parameter, parameter.name
+        self.value = found.values[name].cpu().double()
+        self.errors = [each[name].cpu().double() for each in found.errors]
+        self.squares = [mean_around(error.square(), WIDTH) for error in self.errors]
+        is_empty = self.value.abs() <= EMPTY * self.value.abs().max()
+        self.is_smoke = ~is_empty
+        inside = self.value[self.is_smoke]
+        self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
+        # What pictures leave of that, by noise alone.
+        told = self.power * mean_around(found.information[name].cpu().double(), WIDTH)
+        self.left, is_untold = self.power / (1 + told), told < 1
+        is_edge = mean_around(is_empty.double(), WIDTH) > 0
+        self.classes = {
+            "edge": is_edge & ~is_untold,
+            "inside": ~is_edge & ~is_untold,
+            "untold": is_untold,
+        }
+
+    def spread(self, but: int | None = None) -> Tensor:
+        """The root mean square error around each cell, of all experiments `but` one."""
+        chosen = [each for at, each in enumerate(self.squares) if at != but] or self.squares
+        tiny = torch.finfo(torch.float32).eps * self.power**0.5
+        return torch.stack(chosen).mean(0).sqrt().clamp(min=tiny)
+
+    @cached_property
+    def factors(self) -> dict[str, float]:
+        """Of each class how large, in spreads, two thirds of the experiments' errors are."""
+        sizes = torch.stack(self.errors).abs() / self.spread()
+        return {n: _find_within(sizes[:, own & self.is_smoke]) for n, own in self.classes.items()}
+
+    @cached_property
+    def deviation(self) -> Tensor:
+        """The deviation of each cell; without experiments, what noise alone leaves."""
+        return self.deviation_but(None) if self.errors else self.left.sqrt()
+
+    def deviation_but(self, but: int | None) -> Tensor:
+        """It by all experiments `but` one. Where pictures tell nothing, it is what they leave."""
+        spread, deviation = self.spread(but), self.left.sqrt()
+        for name, own in self.classes.items():
+            by_errors = SHORT * self.factors[name] * spread
+            if name == "untold":
+                by_errors = torch.maximum(by_errors, deviation)
+            deviation = torch.where(own, by_errors, deviation)
+        return deviation
+
+    @property
+    def told(self) -> Tensor:
+        """The share of each cell's variance that the pictures explain: 0 none, 1 all."""
+        return (1 - self.deviation.square() / self.power).clamp(0, 1)
+
+    def describe(self) -> dict[str, Any]:
+        """Root mean squares over the smoke, the share that is told, and classes with coverage."""
+        smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
+        deviation = float(self.deviation[smoke].square().mean())
+        return {
+            "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
+            "deviation": deviation**0.5,
+            "told": min(max(1 - deviation / self.power, 0.0), 1.0),
+            "classes": {
+                name: {"share": float(own[smoke].double().mean())}
+                | self._coverage(name, own & smoke)
+                for name, own in self.classes.items()
+                if bool((own & smoke).any())
+            },
+        }
+
+    def _coverage(self, name: str, where: Tensor) -> dict[str, float]:
+        """How often errors of experiments were within deviations that the others say of them."""
+        if not self.errors:
+            return {}
+        sizes = torch.stack(
+            [(e.abs() / self.deviation_but(at))[where] for at, e in enumerate(self.errors)]
+        )
+        within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
+        return {"factor": SHORT * self.factors[name]} | within
+
+    def draw(self, generator: torch.Generator) -> Tensor:
+        """A change as likely as any: the experiments' errors, each times a smooth random field."""
+        if not self.errors:
+            return self.deviation * _draw_smooth(self.value, generator)
+        summed = sum(_draw_smooth(self.value, generator) * error for error in self.errors)
+        return self.deviation * summed / (self.spread() * len(self.errors) ** 0.5)
+
+
+class Deviations:
+    """The deviations of all that `found` is about, by its experiments so far."""
+
+    def __init__(self, found: Uncertainty):
+        self.found = found
+        self.fields = {p.name: Field(found, p) for p in found.parameters if not is_tabled(p)}
+        self.tabled = [p for p in found.parameters if is_tabled(p)]
+
+    def numbers(self) -> dict[str, dict[str, float | None]]:
+        """The value and the deviation of each number, and of the mass of each density, by name.
+
+        A deviation is None where there were no experiments.
+        """
+        numbers, errors = dict[str, dict[str, float | None]](), self.found.errors
+        for name, field in self.fields.items():
+            if split_name(name)[1] == "density":
+                cell = math.prod(field.parameter.grid.spacing)
+                sums = torch.tensor([float(error.sum()) for error in field.errors])
+                value = cell * float(field.value.sum())
+                numbers[f"mass of {name}"] = _with_deviation(value, cell * sums)
+        for p in self.tabled:
+            # Of one kind, all views' numbers err alike, and so do all entries of any other.
+            alike = [q for q in self.tabled if q.view is not None and q.key == p.key]
+            found = [torch.stack([e[q.name].flatten() for q in alike or [p]]) for e in errors]
+            for at, name in enumerate(_entry_names(p)):
+                own = [e[:, at] if alike else e.square().mean(1).sqrt() for e in found]
+                value = float(p.value.detach().flatten()[at])
+                numbers[name] = _with_deviation(value, torch.cat(own) if own else torch.empty(0))
+        return numbers
+
+    def draw(self, number: int) -> Tensor:
+        """The sample of this `number`: a change of all values, in one vector of the curvature."""
+        generator = torch.Generator().manual_seed((self.found.seed % 2**31) * 1_000_003 + number)
+        parts = {name: field.draw(generator) for name, field in self.fields.items()}
+        values, numbers = self.found.values, self.numbers()
+        for p in self.tabled:
+            sizes = torch.tensor([numbers[n]["deviation"] or 0.0 for n in _entry_names(p)]).double()
+            random = torch.randn(len(sizes), generator=generator, dtype=torch.float64)
+            parts[p.name] = (sizes * random).view(p.value.shape)
+        return self.found.curvature.join({n: part.to(values[n]) for n, part in parts.items()})
+
+
+def _with_deviation(value: float, errors: Tensor) -> dict[str, float | None]:
+    """A number with its deviation, by the `errors` of experiments: wider where there are few."""
+    count = len(errors)
+    size = float(errors.double().square().mean().sqrt()) if count else None
+    return {"value": value, "deviation": size and SHORT * (1 + 2 / count) * size}
+
+
+def _entry_names(parameter: Parameter) -> Sequence[str]:
+    """The names of the entries of a `parameter` that is tabled."""
+    name, value = parameter.name, parameter.value
+    if value.numel() == 1:
+        return [name]
+    parts = component_names(name, value) if value.ndim else ()
+    return [f"{name}.{part}" for part in parts or range(value.numel())]
+
+
+def _find_within(sizes: Tensor) -> float:
+    """What `WITHIN` of the `sizes` are at most; 1 where there are none."""
+    count = sizes.numel()
+    return float(sizes.flatten().kthvalue(math.ceil(WITHIN * count)).values) if count else 1.0
+
+
+def _draw_smooth(like: Tensor, generator: torch.Generator) -> Tensor:
+    """A random field like `like`, of mean square 1, smooth over `WIDE` cells."""
+    wave = mean_around(torch.randn(like.shape, generator=generator, dtype=like.dtype), WIDE)
+    return wave / wave.square().mean().sqrt()
