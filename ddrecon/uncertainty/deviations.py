@@ -49,7 +49,7 @@ class Field:
         self.is_smoke = ~is_empty
         inside = self.value[self.is_smoke]
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
-        # What pictures leave of that by noise alone, of cells that change together with those around.
+        # What pictures leave of that by noise alone, of cells that change with those around.
         around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
         told = self.power * around
         self.left, is_untold = self.power / (1 + told), told < 1
