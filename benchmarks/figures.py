@@ -49,7 +49,7 @@ COMMANDS = {
     "speed": "ddrecon bench --quick",
     "hard": "ddrecon bench --hard",
     "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
-    "uncertainty": "python benchmarks/uncertainty.py real --samples 16",
+    "uncertainty": "python benchmarks/uncertainty.py real --references FOLDER",
     "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
 }

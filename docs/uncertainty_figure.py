@@ -14,9 +14,9 @@ from ddrecon.io.volumes.table import read_field
 
 ROOT = Path(__file__).parents[1]
 KINDS = {
-    "mean": "mean of the samples",
-    "std": "standard deviation",
-    "told": "told by pictures\n(white: all)",
+    "mean": "what was found",
+    "std": "deviation",
+    "told": "explained by pictures\n(white: all)",
 }
 
 

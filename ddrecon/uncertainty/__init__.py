@@ -1,1 +1,1 @@
-"""How sure a reconstruction is: samples of its posterior, and what they say together."""
+"""How sure a reconstruction is: experiments with what it found, and what follows of them."""

@@ -1,4 +1,4 @@
-"""What experiments say of each cell and number: deviations, and how often they held (E11).
+"""What experiments say of each cell and number: deviations, and how often they held (E11.4).
 
 A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
 a factor for its class, times `SHORT`.
@@ -22,7 +22,7 @@ from ddrecon.variables.values import component_names
 
 WITHIN = 0.68
 """The part of cells that is to be within one deviation."""
-SHORT = 1.5
+SHORT = 1.45
 """How many times as large errors are as in experiments, whose volumes lack what no reconstruction
 shows: as measured where the truth was known (docs/uncertainty.md)."""
 EMPTY = 0.02
@@ -49,8 +49,9 @@ class Field:
         self.is_smoke = ~is_empty
         inside = self.value[self.is_smoke]
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
-        # What pictures leave of that, by noise alone.
-        told = self.power * mean_around(found.information[name].cpu().double(), WIDTH)
+        # What pictures leave of that by noise alone, of cells that change with those around.
+        around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
+        told = self.power * around
         self.left, is_untold = self.power / (1 + told), told < 1
         is_edge = mean_around(is_empty.double(), WIDTH) > 0
         self.classes = {

@@ -1,4 +1,4 @@
-"""Experiments: volumes that are known, reconstructed as the run was, and how far off that is (E11).
+"""Experiments: known volumes, reconstructed as the run was, and how far off that is (E11.4).
 
 What a run found is itself a volume whose pictures can be made. It is not quite like what is true: a
 reconstruction of it lacks what this lacks of it. So the next experiment's volume gets that back.

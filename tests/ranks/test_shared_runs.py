@@ -80,7 +80,7 @@ CELLS = "--share", "cells"
 
 def sure(ranks: int, output: str, *options: str) -> Job:
     command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
-    roughly = ["--noise", "0.05", "--samples", "2", "--keep-samples"]
+    roughly = ["--noise", "0.05", "--samples", "3", "--keep-samples"]
     return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
 

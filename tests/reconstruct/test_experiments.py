@@ -102,7 +102,7 @@ def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack(
 
 
 def test_without_experiments_it_is_what_noise_leaves_of_what_a_cell_may_be() -> None:
-    """1 / (1 / power + information), by Gauss; and numbers are not told of."""
+    """1 / (1 / power + information of the 27 around), by Gauss; and numbers are not told of."""
     value = 2 * torch.ones(SHAPE).double()
     found = found_of(
         {"density": value, "g": torch.tensor(0.3, dtype=torch.float64)}, information=0.75
