@@ -102,7 +102,7 @@ def by_path_replay(scene: Scene, iterations: int, headroom: float = 1.0) -> Foun
         )
         penalty = power * parameter.penalty()
         smooth = torch.autograd.grad(penalty, parameter.value)[0] if parameter.tv else 0
-        rate = rate_at(iteration, iterations)
+        rate = rate_at(iteration, iterations, 0, 0.2)
         parameter.step(replay.by_density(gradient, density) + smooth, rate, power)
         _note(found, time.process_time() - start, loss + float(penalty), parameter.value.detach())
     return found

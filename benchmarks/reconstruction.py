@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import tempfile
@@ -60,11 +61,12 @@ def read_density(path: Path) -> np.ndarray:
 
 
 def coarsened(density: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Means of `density` over cells of a grid of `shape`, which divides its own."""
-    parts = [
-        n for pair in ((n, m // n) for n, m in zip(shape, density.shape, strict=True)) for n in pair
-    ]
-    return density.reshape(parts).mean((1, 3, 5))
+    """Means of `density` over the cells of a grid of `shape`."""
+    for axis, (count, own) in enumerate(zip(shape, density.shape, strict=True)):
+        parts = np.repeat(density, math.lcm(count, own) // own, axis)
+        parts = parts.reshape(*parts.shape[:axis], count, -1, *parts.shape[axis + 1 :])
+        density = parts.mean(axis + 1)
+    return density
 
 
 def density_errors(run: Path, truth: Path) -> tuple[float, float, float]:

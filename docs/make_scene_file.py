@@ -478,6 +478,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Fractions of the run at which cells and pixels become half as large: coarse to "
                 "fine."
             ),
+            "begin_at": (
+                "The fraction of the run that counts as made: what is left begins at its "
+                "resolution and learning rates, as a frame of a film that begins with another does."
+            ),
+            "final_rate": (
+                "The part of their value to which learning rates fall over a run. 0.05 takes fewer "
+                "iterations at full resolution where pictures agree well with each other."
+            ),
         },
     ),
     (

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,9 @@ from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, volume_file, write_
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
+
+REPORT_SHARE = 0.05
+"""While frames are made, their page takes no more than this part of the time."""
 
 
 def optimize_sequence(
@@ -69,10 +73,15 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
 
     All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
     """
-    before = film.done()
-    for number in drive_frames(film, numbers):
-        if number not in before:
-            write_film_report(film)
+    before, due = film.done(), 0.0
+    try:
+        for number in drive_frames(film, numbers):
+            if number not in before and monotonic() >= due:
+                start = monotonic()
+                write_film_report(film)
+                due = monotonic() + (monotonic() - start) / REPORT_SHARE
+    finally:
+        record = write_film_report(film)
     if exported is not None:
         (film.path / SEQUENCE).mkdir(exist_ok=True)
         for number in film.done():
@@ -80,7 +89,7 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
             fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
             path = film.path / SEQUENCE / f"film_{number:04d}.{exported}"
             write_fields(path, fields, np.array(film.grid.bounds_xyz))
-    return write_film_report(film)
+    return record
 
 
 def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:

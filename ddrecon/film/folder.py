@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,11 +26,12 @@ from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
 from ddrecon.scene_file.schema import FramesSection
-from ddrecon.settings import AUTO
 from ddrecon.variables.kinds import kind_of
 
 SHARE = 6
-"""A frame that begins with another makes so many times fewer iterations."""
+"""A frame that begins with another makes so many times fewer iterations: the last of its run."""
+FINAL_RATE = 0.05
+"""To what part of their value its learning rates fall; with larger ones films flicker more."""
 FARTHEST = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
@@ -112,9 +112,7 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            optimize["refine_at"] = []
-            if (planned := optimize["iterations"]) != AUTO:
-                optimize["iterations"] = math.ceil(planned / SHARE)
+            optimize |= {"begin_at": 1 - 1 / SHARE, "final_rate": FINAL_RATE}
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:

@@ -71,7 +71,7 @@ class Reconstruction:
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self.before_step: dict[str, Any] | None = None
-        self._enter_stage(0)
+        self._enter_stage(self.schedule.stage(0))
 
     @property
     def iteration(self) -> int:

@@ -36,13 +36,14 @@ class Schedule:
     def __init__(self, settings: OptimizeSettings, count: int):
         self.is_auto = settings.iterations == AUTO
         self.planned = tuning.PLANNED if self.is_auto else int(settings.iterations)
-        self.most = tuning.MOST if self.is_auto else self.planned
-        self.refine_at = settings.refine_at
+        begun = round(settings.begin_at * self.planned)
+        self.most = tuning.MOST if self.is_auto else max(self.planned - begun, 1)
+        self.refine_at, self.final_rate = settings.refine_at, settings.final_rate
         # As nearly whole passes as can be, so that a window hardly tells one view from another.
         drawn = min(settings.views_per_iteration or count, count)
         windows = range(tuning.WINDOW, tuning.WINDOW + count // drawn + 1)
         self.window = min(windows, key=lambda window: window * drawn % count)
-        self.progress = Progress()
+        self.progress = Progress(begun)
 
     def is_over(self, iteration: int) -> bool:
         """Whether a run ends that has made `iteration` iterations."""
@@ -61,7 +62,8 @@ class Schedule:
 
         It is for parameters that begin to move after the part `release` of the run.
         """
-        return rate_at(self.place(iteration), self.planned, round(release * self.planned))
+        begin = round(release * self.planned)
+        return rate_at(self.place(iteration), self.planned, begin, self.final_rate)
 
     def note(self, iteration: int, loss: float) -> None:
         """Takes in the `loss` of `iteration`, counted from 0; may end its part."""
@@ -93,15 +95,15 @@ class Schedule:
         return {"kind": kind, "text": f"ended: {text}"}
 
 
-def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
+def rate_at(iteration: int, iterations: int, begin: int, final: float) -> float:
     """The part of their value that learning rates have in an iteration, in (0, 1].
 
-    It is for parameters that move from iteration `begin` on, and 0 before. After the last of
-    `iterations` it falls no more.
+    It is for parameters that move from iteration `begin` on, and 0 before, and falls exponentially
+    to `final`. After the last of `iterations` it falls no more.
     """
     if iteration < begin:
         return 0.0
-    fall: float = tuning.FINAL_RATE ** min(1.0, (iteration - begin) / (iterations - begin))
+    fall: float = final ** min(1.0, (iteration - begin) / (iterations - begin))
     return fall
 
 

@@ -22,8 +22,6 @@ is where steps neither swell nor fade, in a field that smoothing alone moves."""
 WARM_UP = 5
 """Iterations at a resolution over which rates rise to their value: Adam's first steps are all of
 full size, and would throw away what a coarser grid has found. With 10 the plume is less close."""
-FINAL_RATE = 0.2
-"""Rates fall exponentially over a run, to this part of their value."""
 
 # How numbers move: damped Gauss-Newton steps (E10.2). Chosen on the capture at half size, and seen
 # on Fig. 10 and 14.

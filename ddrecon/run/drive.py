@@ -155,7 +155,7 @@ def advance(
     `folder` before it is passed on. So do a divergence and the end of another rank; any other
     failure leaves the checkpoints written so far.
     """
-    total = None if run.schedule.is_auto else run.schedule.planned
+    total = None if run.schedule.is_auto else run.schedule.most
     bar = tqdm(total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet))
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:

@@ -15,7 +15,7 @@ from ddrecon.variables.kinds import kind_of
 
 
 def test_rates_fall_and_never_exceed_their_value() -> None:
-    rates = [rate_at(iteration, 100, 10) for iteration in range(100)]
+    rates = [rate_at(iteration, 100, 10, 0.2) for iteration in range(100)]
     assert not any(rates[:10]) and all(0 < rate <= 1 for rate in rates[10:])
     assert rates[10:] == sorted(rates[10:], reverse=True)
 

@@ -9,16 +9,18 @@ import torch
 
 from ddrecon.reconstruct.levels import stage_of
 from ddrecon.reconstruct.schedule import Progress, Schedule, rate_at
-from ddrecon.reconstruct.tuning import FALL, FINAL_RATE, MOST, PLANNED, WINDOW
+from ddrecon.reconstruct.tuning import FALL, MOST, PLANNED, WINDOW
 from ddrecon.settings import AUTO, OptimizeSettings, ParameterSettings
 
 LossOf = Callable[[int], float]
 
 
-def schedule_of(count: int = 1, iterations: int | str = AUTO, drawn: int = 0) -> Schedule:
-    parameters = {"density": ParameterSettings()}
+def schedule_of(
+    count: int = 1, iterations: int | str = AUTO, drawn: int = 0, begin_at: float = 0.0
+) -> Schedule:
+    parameters, refine_at = {"density": ParameterSettings()}, (0.4, 0.8)
     settings = OptimizeSettings(
-        parameters, iterations, refine_at=(0.4, 0.8), views_per_iteration=drawn
+        parameters, iterations, None, None, drawn, refine_at=refine_at, begin_at=begin_at
     )
     return Schedule(settings, count)
 
@@ -38,8 +40,15 @@ def test_a_number_of_iterations_is_made_whatever_the_loss() -> None:
     stages = drive(schedule, lambda _: 1.0)
     assert stages == [stage_of(i, 50, (0.4, 0.8)) for i in range(50)]
     rates = [schedule.rate(i, 0.2) for i in range(50)]
-    assert rates == [rate_at(i, 50, 10) for i in range(50)]
+    assert rates == [rate_at(i, 50, 10, 0.2) for i in range(50)]
     assert schedule.ending(50)["kind"] == "iterations"
+
+
+def test_a_run_begun_later_is_the_rest_of_a_whole_one() -> None:
+    whole, rest = schedule_of(iterations=60), schedule_of(iterations=60, begin_at=0.7)
+    stages = drive(rest, lambda _: 1.0)
+    assert stages == drive(whole, lambda _: 1.0)[42:]
+    assert [rest.rate(i, 0.2) for i in range(18)] == [whole.rate(i, 0.2) for i in range(42, 60)]
 
 
 def test_a_loss_that_falls_goes_on_as_planned_and_then_to_the_most() -> None:
@@ -48,7 +57,7 @@ def test_a_loss_that_falls_goes_on_as_planned_and_then_to_the_most() -> None:
     stages = drive(schedule, lambda made: (1 - 1.01 * FALL) ** (made / WINDOW))
     assert len(stages) == MOST and schedule.ending(MOST)["kind"] == "bound"
     assert stages == [stage_of(i, PLANNED, (0.4, 0.8)) for i in range(MOST)]
-    assert schedule.rate(MOST - 1, 0.0) == pytest.approx(FINAL_RATE)
+    assert schedule.rate(MOST - 1, 0.0) == pytest.approx(schedule.final_rate)
 
 
 def test_a_loss_at_rest_ends_a_part_after_two_windows() -> None:
