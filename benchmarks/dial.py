@@ -5,7 +5,8 @@
 Errors of reflectance `R` and transmittance `T` of layers without end, and relative RMS errors of
 radiance above, `up`, and below, `down`, in percent (`tests/exact/published.py`); `once`, of that
 part of `up` that is scattered once. `half-space` is one cell across, far wider than deep. A step
-cloud repeats without end. All others have cubes. `box`: by how much, in percent, the image of a plain box changes from 8 to 16 rounds.
+cloud repeats without end. All others have cubes. `box`: by how much, in percent, the image of a
+plain box changes from 8 to 16 rounds.
 
 NAME is part of a row's name, `-D` overrides keys of all scenes, `seconds` are those of the default.
 Slabs need PythonicDISORT.
