@@ -52,10 +52,13 @@ COMMANDS = {
     "uncertainty": "python benchmarks/uncertainty.py real --references FOLDER",
     "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
+    "pyshdom": "python benchmarks/pyshdom.py FOLDER/pyshdom",
 }
 """By the name of a figure, what prints it."""
 KEPT_BY_THEMSELVES = ("fig10", "paper")
 """Scripts that keep their tables: the paper's, of one experiment or of all."""
+COPIED = ("pyshdom",)
+"""Figures of a copy in FOLDER that its license keeps out of here: measured where there is one."""
 SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
     ("the same, worst", "eleven", "worst", "default"),
@@ -96,7 +99,7 @@ def describe_machine() -> str:
 def measure(name: str, references: Path) -> None:
     """Runs the command of a figure, and keeps the table that it prints."""
     command = COMMANDS[name]
-    words = [str(references) if word == "FOLDER" else word for word in command.split()]
+    words = [word.replace("FOLDER", str(references)) for word in command.split()]
     words[:1] = [sys.executable] if words[0] == "python" else words[:1]
     run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     lines = [line for line in run.stdout.splitlines() if line.startswith("|")]
@@ -182,9 +185,12 @@ def main() -> None:
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
-    for name in [] if given.write else given.names or COMMANDS:
+    references = given.references.resolve()
+    absent = [name for name in COPIED if not (references / name).exists()]
+    chosen = given.names or [name for name in COMMANDS if name not in absent]
+    for name in [] if given.write else chosen:
         print(name, flush=True)
-        measure(name, given.references.resolve())
+        measure(name, references)
     write_pages()
 
 

@@ -41,8 +41,16 @@ PLUME = {
     "loss: photon": ("-D", "optimize.loss=photon"),
     "engine torch": ("--engine", "torch"),
 }
-GALLERY = {"plume": "plume", "cumulus_field": "cumulus_field", "smoke_sky": "", "photograph": ""}
-"""Configs, and the folder of data that holds the true density, if any does."""
+GALLERY = {
+    "plume": "plume/density",
+    "cumulus_field": "cumulus_field/density",
+    "smoke_sky": "",
+    "satellite": "cumulus_field/density",
+    "fire": "fire/fire",
+    "phantom": "",
+    "photograph": "",
+}
+"""Configs, and the file of data that holds the true density, if any does."""
 
 
 def optimize(
@@ -94,9 +102,7 @@ def print_runs(runs: dict[str, tuple[str, str, Sequence[str]]], folder: Path) ->
         place = folder / name.replace(" ", "_").replace(":", "")
         summary, seconds = optimize(config, place, options)
         psnr = summary.get("test_psnr")
-        errors = (
-            density_errors(place, ROOT / "data" / truth / "density.npz") if truth else ("",) * 3
-        )
+        errors = density_errors(place, ROOT / "data" / f"{truth}.npz") if truth else ("",) * 3
         print_row(name, f"{psnr:.1f} dB" if psnr else "", *errors, f"{seconds:.0f}")
 
 
@@ -235,7 +241,7 @@ def main() -> None:
         print_film(folder)
     elif given.what == "plume":
         optimize("plume", folder / "first", ("--iterations", "6"))
-        runs = {name: ("plume", "plume", options) for name, options in PLUME.items()}
+        runs = {name: ("plume", "plume/density", options) for name, options in PLUME.items()}
         print_runs(runs, folder)
     else:
         print_runs({name: (name, truth, ()) for name, truth in GALLERY.items()}, folder)

@@ -13,17 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from make_shapes import Array, centers, smooth_step, swirl, write
+from noisy import write_pictures
 
-import ddrecon
 from ddrecon.medium.black_body import black_body_radiance
 
 FOLDER = Path(__file__).parent / "fire"
 BOX = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
 CELLS = (32, 48, 32)
-NOISE = 0.03
-"""Of a pixel as bright as the picture is on average; that of others is as photons have it."""
-
-
 SEED = 7
 
 
@@ -47,16 +43,7 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     density, emission = fire(centers(BOX, CELLS))
     write(FOLDER / "fire.npz", BOX, density=density, emission=emission)
-    exact = ["diffusion.transport_rounds=4", "diffusion.degree=5", "render.samples_per_pixel=4"]
-    exact += [f"views.{number}.image=null" for number in range(10)]
-    scene = ddrecon.load_scene(FOLDER.parents[1] / "configs" / "fire.yaml", overrides=exact)
-    chance = np.random.default_rng(SEED)
-    with torch.no_grad():
-        images = ddrecon.render(scene)
-    for view, image in zip(scene.views, images, strict=True):
-        bright = image.permute(1, 2, 0).numpy()
-        noise = NOISE * np.sqrt(bright * bright.mean()) * chance.normal(size=bright.shape)
-        np.save(FOLDER / f"{view.name}.npy", (bright + noise).clip(0).astype(np.float16))
+    write_pictures("fire", noise=0.03)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Makes data/phantom: the absorption of a phantom of tissue, 20 mm wide, with an absorber inside.
+"""Makes data/phantom: the absorption of a phantom of tissue, 20 mm wide, and eight pictures of it.
 
 python data/make_phantom.py
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from noisy import write_pictures
 
 from ddrecon.io.volumes.table import write_field
 
@@ -31,6 +32,9 @@ def main() -> None:
     folder = Path(__file__).parent / "phantom"
     folder.mkdir(exist_ok=True)
     write_field(folder / "sigma_a.npz", "sigma_a", TISSUE + (ABSORBER - TISSUE) * part, bounds)
+    write_pictures(
+        "phantom", noise=0.005, truth=["volume.sigma_a={file: ../data/phantom/sigma_a.npz}"]
+    )
 
 
 if __name__ == "__main__":

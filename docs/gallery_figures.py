@@ -1,12 +1,12 @@
 """Makes a picture of docs/gallery.md from the folder of a run, and that of its `ddrecon render
---ring`.
+--ring` or `--fluence`.
 
     ddrecon optimize configs/NAME.yaml -o runs/NAME
     ddrecon render runs/NAME -o runs/NAME_around --ring 8 --light '{...}'
     python docs/gallery_figures.py runs/NAME runs/NAME_around VIEW docs/pictures/gallery/NAME.png
 
 Above: the target of VIEW, our render, their difference four times enlarged, and the slices of the
-density. Below: the volume from around.
+fields that were found. Below: the volume from around, or slices of the logarithm of its fluence.
 """
 
 from __future__ import annotations
@@ -16,12 +16,19 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+import torch
+import yaml
 from numpy.typing import NDArray
+
+from ddrecon.report.pictures import slices
 
 Picture = NDArray[np.uint8]
 HEIGHT = 192
 """Pixels of a row."""
 GAP = 6
+FIELDS = ("density", "emission", "sigma_a")
+FLUENCE, DECADES = "volumes/fluence.npz", 1
+"""Where it lies, and how far below its largest value it is black."""
 
 
 def scaled(picture: Picture) -> Picture:
@@ -58,13 +65,18 @@ def column(rows: list[Picture]) -> Picture:
 
 def main(run: Path, around: Path, view: str, output: Path) -> None:
     """Writes the picture."""
-    above = [
-        iio.imread(run / "previews" / f"{name}.png")[..., :3] for name in (view, "density.slices")
-    ]
-    turned = iio.imread(around / "ring.png", index=..., plugin="pillow")[..., :3]
-    whole = column(
-        [row([scaled(picture) for picture in above]), row([scaled(frame) for frame in turned[:5]])]
-    )
+    sought = yaml.safe_load((run / "scene.yaml").read_text())["optimize"]["parameters"]
+    names = [view, *(f"{name}.slices" for name in FIELDS if name in sought)]
+    above = [iio.imread(run / "previews" / f"{name}.png")[..., :3] for name in names]
+    if (around / FLUENCE).exists():
+        fluence = np.load(around / FLUENCE)["fluence"]
+        part = np.log10(np.maximum(fluence / fluence.max(), 10.0**-DECADES)) / DECADES + 1
+        field = torch.from_numpy(part if part.ndim == 3 else np.moveaxis(part, -1, 0))
+        below = [(255 * slices(field, white=1.0)).astype(np.uint8)]
+    else:
+        turned = iio.imread(around / "ring.png", index=..., plugin="pillow")[..., :3]
+        below = [*turned[:5]]
+    whole = column([row([scaled(picture) for picture in part]) for part in (above, below)])
     output.parent.mkdir(parents=True, exist_ok=True)
     iio.imwrite(output, whole, optimize=True)
 
