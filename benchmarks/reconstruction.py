@@ -178,9 +178,10 @@ def run_film(folder: Path, *options: str) -> tuple[dict[str, Any], float, float]
 def calibration_errors(values: dict[str, Any], number: int) -> dict[str, float]:
     """How far `values`, by variable, are from the truth, by the smoke of the frame `number`."""
     turns, shifts = [], []
-    for frame in json.loads((FILM / "truth.json").read_text())["frames"]:
-        name = frame["file_path"].partition("_{")[0]
-        if (found := values.get(f"views.{name}.camera")) is not None:
+    truth = json.loads((FILM / "truth.json").read_text())
+    for frame in truth["frames"]:
+        if frame["file_path"] in truth["train_filenames"]:
+            found = values[f"views.{frame['file_path'].partition('_{')[0]}.camera"]
             poses = [np.array(each)[:3] for each in (found["matrix"], frame["transform_matrix"])]
             turns.append(rotation_between(*poses))
             shifts.append(pixels_off(*poses, frame["fl_x"], FILM / f"density_{number:04d}.npz"))
