@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.pictures.noise import Noise
+from ddrecon.pictures.noise import LEAST, Noise
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
@@ -53,20 +53,22 @@ class Uncertainty:
         self.residuals = {v.name: target_of(v) - images[v.name] for v in level.train.views}
         said = {v.name: noise or given_noise(v, settings) for v in level.train.views}
         self.is_noise_known = None not in said.values()
-        seen = {v.name: 1.0 if v.mask is None else v.mask for v in level.train.views}
-        counted = {name: residual * seen[name] for name, residual in self.residuals.items()}
-        squares = {
-            name: counted[name].square().mean()
-            if (known := said[name]) is None
-            else known.deviation(images[name]).square().mean()
-            for name in images
-        }
-        self.deviation = float(torch.stack(list(squares.values())).mean().sqrt())
-        for name, each in counted.items():
-            if said[name] is not None:
+        # Nothing is known better than a part of all pictures.
+        powers = [target_of(view).square().mean() for view in level.train.views]
+        least = float(torch.stack(powers).mean()) * LEAST**2 + torch.finfo(torch.float32).tiny
+        squares = dict[str, Tensor]()
+        for view in level.train.views:
+            name, known = view.name, said[view.name]
+            seen = torch.ones(view.camera.size) if view.mask is None else view.mask
+            left = (self.residuals[name] * seen.to(images[name])).square().mean()
+            square = left if known is None else known.deviation(images[name]).square().mean()
+            squares[name] = square.clamp(min=least)
+            if known is not None:
                 # Pictures err as they are known to; the fit has taken up a part of that.
-                self.residuals[name] *= (squares[name] / each.square().mean()).sqrt().clamp(min=1)
-            self.curvature.weights[name] = (seen[name] / squares[name]).expand_as(each)
+                self.residuals[name] *= (square / left.clamp(min=least)).sqrt().clamp(min=1)
+            weight = seen.to(images[name]) / squares[name]
+            self.curvature.weights[name] = weight.expand_as(images[name])
+        self.deviation = float(torch.stack(list(squares.values())).mean().sqrt())
         self.information = self._find_information(torch.Generator().manual_seed(seed % 2**31))
         self.count, self.errors = 0, list[dict[str, Tensor]]()
         self.truth = dict(self.values)

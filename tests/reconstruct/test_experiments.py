@@ -105,7 +105,7 @@ def test_without_experiments_it_is_what_noise_leaves_of_what_a_cell_may_be() -> 
     """1 / (1 / power + information of the 27 around), by Gauss; and numbers are not told of."""
     value = 2 * torch.ones(SHAPE).double()
     found = found_of(
-        {"density": value, "g": torch.tensor(0.3, dtype=torch.float64)}, information=0.75
+        {"density": value, "g": torch.tensor(0.3, dtype=torch.float64)}, information=0.75 / 27
     )
     (field,) = Deviations(found).fields.values()
     torch.testing.assert_close(field.deviation.square(), value**0)
