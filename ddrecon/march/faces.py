@@ -43,10 +43,12 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     for name, field in emission.fields.items():
         is_mass = name.startswith("mass ")
         lines = [(is_mass or name == "diffuse") and is_line for is_line in ends]
-        layers = _OnFaces.apply([False] * 6, field)
+        outermost = _Outermost.apply(field)
+        pairs = list(zip(FACES, outermost[::2], outermost[1::2], strict=True))
+        layers = [_go_on(*pair, [False] * 6) for pair in pairs]
         matter = matter or layers
         if any(lines):
-            both = zip(layers, _OnFaces.apply(lines, field), strict=True)
+            both = zip(layers, (_go_on(*pair, lines) for pair in pairs), strict=True)
             if is_mass:
                 lit = shine_through(emission.beams[int(name.split()[1])], grid)
                 shades = _shades(grid, 1 - lit * lit.new_tensor(lines))
@@ -79,32 +81,28 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     return (part * part * (3 - 2 * part)).flatten()
 
 
-class _OnFaces(torch.autograd.Function):
-    """What `_go_on` has at each of `FACES` of `field`; linear.
-
-    One function, as forward mode would take long for so many small operations.
-    """
+class _Outermost(torch.autograd.Function):
+    """The layers of `field` at each of `FACES`, and those before them; linear."""
 
     @staticmethod
-    def forward(lines: list[bool], field: Tensor) -> tuple[Tensor, ...]:
-        return tuple(_go_on(face, *_layers(field, face), lines) for face in FACES)
+    def forward(field: Tensor) -> tuple[Tensor, ...]:
+        return tuple(layer.clone() for face in FACES for layer in _layers(field, face))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.lines, ctx.shape = inputs[0], inputs[1].shape
+        ctx.shape = inputs[0].shape
 
     @staticmethod
-    def backward(ctx: Any, *bars: Tensor) -> tuple[None, Tensor]:
-        has_graph = torch.is_grad_enabled()
-        with torch.enable_grad():
-            anywhere = bars[0].new_zeros(ctx.shape, requires_grad=True)
-            made = _OnFaces.forward(ctx.lines, anywhere)
-            (field_bar,) = torch.autograd.grad(made, anywhere, bars, create_graph=has_graph)
-        return None, field_bar
+    def backward(ctx: Any, *bars: Tensor) -> Tensor:
+        field_bar = bars[0].new_zeros(ctx.shape)
+        layers = (layer for face in FACES for layer in _layers(field_bar, face))
+        for layer, bar in zip(layers, bars, strict=True):
+            layer += bar
+        return field_bar
 
     @staticmethod
-    def jvp(ctx: Any, _: None, change: Tensor) -> tuple[Tensor, ...]:
-        return _OnFaces.forward(ctx.lines, change)
+    def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, ...]:
+        return _Outermost.forward(change)
 
 
 def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
