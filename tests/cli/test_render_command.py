@@ -101,6 +101,17 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
     assert read_field(Path("out/volumes/fluence.npz"), "fluence").values.shape == (4, 5, 6)
 
 
+def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run) -> None:
+    succeed(*RENDER, "--fluence", "-D", "diffusion.transport_rounds=null")
+    found = read_field(Path("out/volumes/fluence.npz"), "fluence").values
+    one, two = (
+        ddrecon.fluence(ddrecon.load_scene("scene.yaml", overrides=[key])).permute(1, 2, 3, 0)
+        for key in ("diffusion.transport_rounds=1", "diffusion.transport_rounds=2")
+    )
+    np.testing.assert_allclose(found, two.numpy(), rtol=1e-4)
+    assert not np.allclose(found, one.numpy(), rtol=1e-3)
+
+
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
     assert set(record["enters"]) == {"lights.0", "lights.1"}
