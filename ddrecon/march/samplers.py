@@ -172,7 +172,9 @@ def greatest_depth(volume: Volume) -> float:
         sigma.detach() if sigma.ndim == 4 else along_colors(sigma).detach()
         for sigma in (volume.sigma_a, volume.sigma_s)
     )
-    most = (absorbing + scattering).amax(0)
+    most, density = (absorbing + scattering).amax(0), volume.density.detach()
+    if not any(density.stride()):
+        density = density[:1, :1, :1]  # the same in all cells, which may be too many to be made
     sides = list(zip(volume.grid.spacing, volume.grid.shape, strict=True))
     widths = [width for width, cells in sides if cells > 1] or list(volume.grid.spacing)
-    return float((volume.density.detach() * most).amax()) * sum(widths) / len(widths)
+    return float((density * most).amax()) * sum(widths) / len(widths)
