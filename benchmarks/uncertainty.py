@@ -121,7 +121,7 @@ def with_traced(scene: Scene, truth: Path, folder: Path) -> Scene:
     """`scene` with pictures of the scene file `truth`, which `folder` keeps."""
     if not (folder / "reference.json").is_file():
         command = ["ddrecon", "reference", truth, "-o", folder, "--overwrite", "--views", "-q"]
-        subprocess.run([*map(str, command), "--spp", str(PATHS)], check=True)
+        subprocess.run([*map(str, command), "--spp", str(PATHS)], check=True, capture_output=True)
     images = {v.name: np.load(folder / f"{v.name}.npy").transpose(2, 0, 1) for v in scene.views}
     return replace(
         scene, views=[replace(v, image=torch.tensor(images[v.name])) for v in scene.views]

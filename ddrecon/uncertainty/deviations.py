@@ -22,7 +22,7 @@ from ddrecon.variables.values import component_names
 
 WITHIN = 0.68
 """The part of cells that is to be within one deviation."""
-SHORT = 1.45
+SHORT = 1.55
 """How many times as large errors are as in experiments, whose volumes lack what no reconstruction
 shows: as measured where the truth was known (docs/uncertainty.md)."""
 EMPTY = 0.02
