@@ -429,8 +429,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
                 "where there are none: without model `p1` or scheme `conservative`. With "
-                "degree 5 it is one more beyond 0.55, and where a face of the box is dense at "
-                "least one more in cells thicker than 1.5 optical depths, two from 4 on. Where "
+                "degree 5 it is one more, two in cells thicker than 4 optical depths. Where "
                 "none is, it is 1 in cells thicker than 3. Cells count as `refine` leaves them."
             ),
             "transport_tolerance": (

@@ -62,9 +62,9 @@ a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and
 """
 FEW_ANGLES = 0.1
 """A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
-THICK = 1.5, 4.0
-"""Where a cell has more optical depths than one of these, a round more: theta of E7.2 is less than
-1. Measured on half-spaces and slabs (docs/accuracy.md).
+THICK = 4.0
+"""With degree 5 there is a round more, and two where a cell has more optical depths: theta of E7.2
+is less than 1 then. Measured on half-spaces and slabs (docs/accuracy.md).
 """
 FINER, FINER_FLAT, MOST_CELLS = 1.5, 0.75, 2**20
 """Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
@@ -361,8 +361,7 @@ def choose_diffusion(
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     if is_flat or _turns_back(phase):
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
-        thick_rounds = sum(depth / times > bound for bound in THICK)
-        rounds, degree = rounds + max(left > MORE_ROUNDS[0], thick_rounds), 5
+        rounds, degree = rounds + 1 + (depth / times > THICK), 5
     elif depth / times > SOFT:
         rounds = 1
     if tree.volume.periodic:

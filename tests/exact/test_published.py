@@ -17,7 +17,7 @@ VAN_DE_HULST = {
 """`SLAB` in van de Hulst's Multiple Light Scattering, 1980."""
 
 # What is claimed of our defaults, in percent.
-HALF_SPACE = {"R": 0.2, "up": 1.2}
+HALF_SPACE = {"R": 0.3, "up": 1.5}
 VAN_DE_HULST_SLAB = {"R": 1.2, "up": 4.5, "T": 0.5, "down": 1.2}
 SLABS = {
     ("Rayleigh", 1.0): {"R": 0.6, "up": 1.8, "T": 0.4, "down": 1.5},
@@ -30,8 +30,8 @@ SLABS = {
 """By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
 CLOUDS = {
     StepCloud("overhead", 0.999999, 1.0): 4.0,
-    StepCloud("slanted", 0.999999, 0.5): 7.5,
-    StepCloud("absorbing", 0.99, 0.5): 7.5,
+    StepCloud("slanted", 0.999999, 0.5): 5.0,
+    StepCloud("absorbing", 0.99, 0.5): 5.0,
 }
 
 

@@ -61,7 +61,7 @@ def test_constants(write: Write):
     "g, depth, is_flat, expected",
     [
         (0.3, 0.5, False, (1, 1, 1)),
-        (0.3, 0.5, True, (1, 5, 1)),
+        (0.3, 0.5, True, (2, 5, 1)),
         (0.8, 0.5, False, (3, 3, 1)),
         (0.8, 4, False, (3, 3, 3)),
         (0.8, 50, False, (1, 3, 9)),
