@@ -35,6 +35,7 @@ from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, count_threads, make_room
 from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.ranks import cells_are_shared
 from ddrecon.renderer import require_refracting
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
@@ -352,7 +353,8 @@ def choose_diffusion(
         depth, is_flat = 0.0, False
     times = 1 if settings.refine is None else settings.refine
     thin = FINER_FLAT if is_flat else FINER
-    while settings.refine is None and times < 9 and depth / times > thin:
+    may_refine = settings.refine is None and not cells_are_shared()
+    while may_refine and times < 9 and depth / times > thin:
         if grid.refine(3 * times).cells > MOST_CELLS:
             break
         times *= 3
