@@ -18,6 +18,9 @@ from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.slicing import NEARLY, across
 from ddrecon.slabs.slab import Slab, whole_of
 
+BEND = 0.05
+"""The part of a cell becomes all of it smoothly, over so much of it: even media are just there."""
+
 
 def light_at_sides(
     extinction: Coefficient, grid: Grid, directions: Tensor, entered: Tensor, steps: Tensor
@@ -52,8 +55,10 @@ def light_at_sides(
             # 2 M, twice the depth of the center; then t 2 M / d, 1 at most
             twice = (2 * mass + depth).clamp(min=0)
             entering = twice * (1 - shares[0] * shares[1] * shares[2])
-            is_part = entering < depth
-            part = torch.where(is_part, entering / torch.where(is_part, depth, 1.0), 1.0)
+            is_part = entering < (1 + BEND) * depth
+            ratio = torch.where(is_part, entering / torch.where(is_part, depth, 1.0), 1 + BEND)
+            bent = 1 - (1 + BEND - ratio) ** 2 / (4 * BEND)
+            part = torch.where(ratio < 1 - BEND, ratio, bent)
             more = part * (decay_mean(twice) - torch.exp(-mass) * decay_mean(depth))
             for before in shares[:axis]:
                 more = more * (before == 1)
