@@ -14,7 +14,6 @@ from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import is_fused_whole, sum_masses
-from ddrecon.light.sides import light_at_sides
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
@@ -140,21 +139,15 @@ def attenuate_few(
     extinction, is_fused = cells.extinction, is_fused_whole(cells.grid, directions)
     field, scale = extinction.field, extinction.scale
 
-    def find() -> Tensor:
+    def receive() -> Tensor:
         entered, steps = sum_masses(field, cells.grid, directions, extinction.mass_bound)
         if is_fused:
             from ddrecon.light.fused.receive import receive
 
             colors = max(weights.shape[2], len(scale))
             given = entered, steps, weights.expand(-1, -1, colors)
-            received = receive(field, scale.flatten().expand(colors), *given)
-        else:
-            tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
-            received = torch.einsum("lmc,lczyx->mczyx", weights, tau)
-        sides = light_at_sides(extinction, cells.grid, directions, entered, steps)
-        for lit, axis, layer, more in sides:
-            gained = torch.einsum("lmc,lczyx->mczyx", weights[lit], more)
-            received.index_add_(2 + axis, torch.tensor([layer], device=gained.device), gained)
-        return received
+            return receive(field, scale.flatten().expand(colors), *given)
+        tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
+        return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 
-    return find() if is_fused and is_kept else recompute(find)
+    return receive() if is_fused and is_kept else recompute(receive)

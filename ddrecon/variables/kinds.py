@@ -99,8 +99,9 @@ def unit_of(scene: Scene, name: str) -> float:
     if volume.media is not None and name.startswith("media."):
         volume = volume.media[name.split(".")[1]]
     if kind == "density" or kind.startswith("sigma_"):
-        extinction = volume.sigma_a + volume.sigma_s
-        depth = side * float(extinction.sum() / extinction.count_nonzero().clamp(min=1))
+        parts = volume.sigma_a, volume.sigma_s  # of the cells that have any
+        share = max(float(part.count_nonzero()) / part.numel() for part in parts) or 1.0
+        depth = side * float(sum(part.mean() for part in parts)) / share
         unit = 1 / depth if depth > 0 else 1.0
         largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
         return unit if kind == "density" else 1 / (side * largest)

@@ -19,6 +19,7 @@ views:
   - {name: view, camera: {type: perspective, origin: [4, 0, 0], target: [0, 0, 0], up: [0, 1, 0],
      fov: 30, resolution: [2, 2]}}
 """
+AS_GIVEN = "diffusion.refine=1"
 MEAN_SIDE = (0.1 + 0.2 + 0.4) / 3
 
 
@@ -27,7 +28,7 @@ def test_two_where_a_cell_is_thick(tmp_path: Path, depth: float) -> None:
     """The densest color decides, across a cell's mean side; `check` says so."""
     path = tmp_path / "scene.yaml"
     path.write_text(SCENE)
-    scene = load_scene(path, overrides=[f"volume.density={depth / (4 * MEAN_SIDE)}"])
+    scene = load_scene(path, overrides=[f"volume.density={depth / (4 * MEAN_SIDE)}", AS_GIVEN])
     steps = 1 if depth < 0.75 else 2
     assert scene.render.steps == steps
     samples = "1 sample" if steps == 1 else "2 samples"
