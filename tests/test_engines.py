@@ -63,7 +63,7 @@ def outcome(scene: Scene, names: Sequence[str], engine: str, first: int = 0) -> 
 def assert_engines_agree(scene: Scene, names: Sequence[str]) -> None:
     """To `CLOSE`; where numbers of 32 bits do not tell so much, to what they do tell.
 
-    That is how far the known result is from the same scene's in 64 bits, at worst for three sums of
+    That is how far either engine's result is from its own in 64 bits, at worst for three sums of
     pixels: of one alone, errors may cancel by chance.
     """
     known, found = (outcome(scene, names, engine) for engine in ENGINES)
@@ -77,9 +77,11 @@ def assert_engines_agree(scene: Scene, names: Sequence[str]) -> None:
 
 
 def rounding(scene: Scene, names: Sequence[str], first: int) -> list[float]:
-    """How far the torch engine's `outcome` of `scene` is from that in 64 bits."""
-    pair = (outcome(each, names, "torch", first) for each in (scene, in_double(scene)))
-    return [float((exact - one).norm()) for one, exact in zip(*pair, strict=True)]
+    """How far the `outcome` of `scene` is from that in 64 bits, by the worse of both engines."""
+    scenes = scene, in_double(scene)
+    pairs = ([outcome(each, names, engine, first) for each in scenes] for engine in ENGINES)
+    found = ([float((a - b).norm()) for a, b in zip(*pair, strict=True)] for pair in pairs)
+    return [max(both) for both in zip(*found, strict=True)]
 
 
 def in_double(record: Any) -> Any:
