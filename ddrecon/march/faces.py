@@ -7,13 +7,14 @@ optical depth at most; but it is zero on faces through which the light shines.
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -39,29 +40,33 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     outermost centers' these are the mean. Where a slab is cut, and along an axis of a single cell,
     light stays as it is as well.
     """
-    grid, extinction = emission.grid, emission.extinction
-    is_line = [[_is_line(grid, *face) for face in FACES[2 * k : 2 * k + 2]] for k in range(3)]
-    extended, matter = {}, list[Tensor]()
-    for name, field in emission.fields.items():
-        is_mass = name.startswith("mass ")
-        has_lines = (is_mass or name == "diffuse") and any(map(any, is_line))
-        outermost = _Outermost.apply(field)
-        layers = [pad(pair[:, 0], (1, 1, 1, 1), mode="replicate") for pair in outermost]
-        matter = matter or layers
-        if has_lines:
-            both = list(zip(layers, _go_on(outermost, field.new_tensor(is_line)), strict=True))
-            if is_mass:
-                lit = shine_through(emission.beams[int(name.split()[1])], grid).view(3, 2)
-                shades = _shades(grid, 1 - lit * lit.new_tensor(is_line))
-                limited = (_limit(*one, extinction.mass_bound) for one in both)
-                layers = [shade * one for shade, one in zip(shades, limited, strict=True)]
-            else:
-                scale = extinction.scale[: len(field), 0]
-                shares = (thinness(grid, scale * one[:, : len(field)], OPAQUE) for one in matter)
-                layers = [torch.lerp(*one, share) for one, share in zip(both, shares, strict=True)]
-        lines = [has_lines and is_line[k][side] for k, side in FACES]
-        extended[name] = _WithLayers.apply(axis, lines, field, *layers)
-    return extended
+    grid, extinction, named = emission.grid, emission.extinction, emission.fields
+    sizes = [len(field) for field in named.values()]
+    cells = torch.cat(list(named.values()))
+    is_line = [_is_line(grid, *face) for face in FACES]
+    is_light = [one for name, k in zip(named, sizes, strict=True) for one in [_is_light(name)] * k]
+    # One row a face, one number a channel.
+    lines = _lines(tuple(is_line), tuple(is_light), cells.dtype, cells.device)
+    last, goal = (one.split(sizes) for one in _Outside.apply(cells, lines))
+    outside = list[Tensor]()
+    for name, layer, line in zip(named, last, goal, strict=True):
+        if not any(is_line) or not _is_light(name):
+            outside.append(layer)
+        elif name == "diffuse":
+            scale = extinction.scale[: len(layer)].view(-1, 1)
+            share = thinness(grid, scale * last[0][: len(layer)], OPAQUE)
+            outside.append(torch.lerp(layer, line, share))
+        else:
+            lit = shine_through(emission.beams[int(name.split()[1])], grid)
+            shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
+            outside.append(shade * _limit(layer, line, extinction.mass_bound))
+    longer = _WithOutside.apply(axis, lines, cells, torch.cat(outside))
+    return dict(zip(named, longer.split(sizes), strict=True))
+
+
+def _is_light(name: str) -> bool:
+    """Whether the field of that `name` goes on, linearly, up to faces."""
+    return name == "diffuse" or name.startswith("mass ")
 
 
 def _is_line(grid: Grid, axis: int, side: int) -> bool:
@@ -83,31 +88,6 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     return (part * part * (3 - 2 * part)).flatten()
 
 
-class _Outermost(torch.autograd.Function):
-    """Of each axis the layers of `field` at both faces, and those before: [2, 2, ...]; linear."""
-
-    @staticmethod
-    def forward(field: Tensor) -> tuple[Tensor, ...]:
-        pairs = (_layers(field, (k, 0)) + _layers(field, (k, 1)) for k in range(3))
-        return tuple(torch.stack(pair).unflatten(0, (2, 2)) for pair in pairs)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.shape = inputs[0].shape
-
-    @staticmethod
-    def backward(ctx: Any, *bars: Tensor) -> Tensor:
-        field_bar = bars[0].new_zeros(ctx.shape)
-        for k, side in FACES:
-            for layer, bar in zip(_layers(field_bar, (k, side)), bars[k][side], strict=True):
-                layer += bar
-        return field_bar
-
-    @staticmethod
-    def jvp(ctx: Any, change: Tensor) -> tuple[Tensor, ...]:
-        return _Outermost.forward(change)
-
-
 def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     """`goal`, less than `layer` by 1 over `bound` at most."""
     fall = (goal - layer).clamp(max=0)
@@ -115,94 +95,127 @@ def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     return goal + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1)
 
 
-def _go_on(outermost: Sequence[Tensor], is_line: Tensor) -> list[Tensor]:
-    """Of each axis what is on both faces, [2, channels, 2 axes, a row more on each side].
+@functools.cache
+def _lines(
+    is_line: Sequence[bool], is_light: Sequence[bool], dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """1 for each face and channel of light that goes on there, else 0: [6, C, 1, 1]."""
+    lines = torch.outer(torch.tensor(is_line), torch.tensor(is_light))
+    return lines.to(device, dtype)[..., None, None]
 
-    It is on the line through the two layers at a face where that `is_line` [3, 2], and so on along
-    the face; else it stays as it is. `outermost` is of `_Outermost`.
+
+@functools.cache
+def _places(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Where cells outside of those of `shape` stand in a field with a layer more, and where the
+    outermost cells stand that are next to them: [2, M].
     """
-    layers = []
-    for axis, pair in enumerate(outermost):
-        last, before = pair.unbind(1)
-        layer = last + is_line[axis].view(2, 1, 1, 1) / 2 * (last - before)
-        for dim, other in enumerate((one for one in range(3) if one != axis), 2):
-            count, shape = layer.shape[dim], [1, 1, 1, 1]
-            shape[dim] = 2
-            ends = layer.narrow(dim, 0, 1), layer.narrow(dim, count - 1, 1)
-            if count > 1:
-                last = torch.cat(ends, dim)
-                before = torch.cat([layer.narrow(dim, k, 1) for k in (1, count - 2)], dim)
-                ends = (last + is_line[other].view(shape) / 2 * (last - before)).split(1, dim)
-            layer = torch.cat([ends[0], layer, ends[1]], dim)
-        layers.append(layer)
-    return layers
+    longer = [count + 2 for count in shape]
+    numbers = torch.arange(math.prod(longer), device=device).view(longer)
+    near = [torch.arange(n + 2, device=device).clamp(1, n) for n in shape]
+    nearest = numbers[near[0][:, None, None], near[1][:, None], near[2]]
+    return torch.stack([numbers, nearest])[:, numbers != nearest]
 
 
-def _shades(grid: Grid, shares: Tensor) -> list[Tensor]:
-    """Of each axis the product of the `shares` [3, 2] of faces, [2, 1, 2 axes, a layer more]."""
-    along = [
+def _shade(grid: Grid, shares: Tensor) -> Tensor:
+    """The product of the `shares` [6] of the faces beyond which cells outside lie, [M]."""
+    z, y, x = (
         torch.cat([low.view(1), shares.new_ones(count), high.view(1)])
-        for count, (low, high) in zip(grid.shape, shares, strict=True)
-    ]
-    pairs = ((1, 2), (0, 2), (0, 1))
-    rest = (torch.outer(along[one], along[other]) for one, other in pairs)
-    return [share.view(2, 1, 1, 1) * each for share, each in zip(shares, rest, strict=True)]
+        for count, (low, high) in zip(grid.shape, shares.view(3, 2), strict=True)
+    )
+    every = z[:, None, None] * y[:, None] * x
+    return every.flatten()[_places(tuple(grid.shape), shares.device)[0]]
 
 
-class _WithLayers(torch.autograd.Function):
-    """`field` with `layers` on its faces, beyond them but across `axis` where they are `lines`.
+class _Outside(torch.autograd.Function):
+    """Of `cells` [C, z, y, x] what is next to cells outside, and what these have on `lines`.
 
-    Layers are [2, ...], of both faces of each axis.
-
-    Linear; edges have what the last of their faces says, which all say alike.
+    [C, M] each. Linear: a line goes through the two outermost centers, and ends on the face.
     """
 
     @staticmethod
-    def forward(axis: int | None, lines: list[bool], field: Tensor, *layers: Tensor) -> Tensor:
-        longer = field.new_empty(len(field), *(count + 2 for count in field.shape[1:]))
-        longer[:, 1:-1, 1:-1, 1:-1] = field
-        for k, side in FACES:
-            _layers(longer, (k, side))[0].copy_(layers[k][side])
-        for face, is_line in zip(FACES, lines, strict=True):
-            if is_line and face[0] != axis:
-                outer, last = _layers(longer, face)
-                outer.mul_(2).sub_(last)
+    def forward(cells: Tensor, lines: Tensor) -> tuple[Tensor, Tensor]:
+        longer = _longer(cells)
+        for face, line in zip(FACES, lines / 2, strict=True):
+            outer, last, before = _layers(longer, face)
+            torch.lerp(last, before, -line, out=outer)
+        outside, nearest = _places(tuple(cells.shape[1:]), cells.device)
+        flat = longer.flatten(1)
+        return flat[:, nearest], flat[:, outside]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.shape, ctx.lines = inputs[0].shape, inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor, None]:
+        total = bars[0].new_zeros(ctx.shape)
+        outside = _places(tuple(ctx.shape[1:]), total.device)[0]
+        for bar, lines in zip(bars, (0 * ctx.lines, ctx.lines / 2), strict=True):
+            longer = _longer(torch.zeros_like(total))
+            longer.view(len(bar), -1)[:, outside] = bar
+            for face, line in reversed(list(zip(FACES, lines, strict=True))):
+                outer, last, before = _layers(longer, face)
+                last.addcmul_(outer, 1 + line)
+                before.addcmul_(outer, line, value=-1)
+            total += longer[:, 1:-1, 1:-1, 1:-1]
+        return total, None
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor, _: None) -> tuple[Tensor, Tensor]:
+        return _Outside.forward(change, ctx.lines)
+
+
+class _WithOutside(torch.autograd.Function):
+    """`cells` with those `outside` [C, M]: beyond faces where they are on `lines`, not on these.
+
+    But those across `axis` are on faces. Linear.
+    """
+
+    @staticmethod
+    def forward(axis: int | None, lines: Tensor, cells: Tensor, outside: Tensor) -> Tensor:
+        longer = _longer(cells)
+        longer.view(len(cells), -1)[:, _places(tuple(cells.shape[1:]), cells.device)[0]] = outside
+        for face, line in zip(FACES, lines, strict=True):
+            if face[0] != axis:
+                outer, last, _ = _layers(longer, face)
+                outer.lerp_(last, -line)
         return longer
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.axis, ctx.lines, *given = inputs
-        ctx.shapes = [one.shape for one in given]
+        ctx.axis, ctx.lines, ctx.shape = *inputs[:2], inputs[2].shape
 
     @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> Any:
-        bar = bar.clone()
-        for face, is_line in reversed(list(zip(FACES, ctx.lines, strict=True))):
-            if is_line and face[0] != ctx.axis:
-                outer, last = _layers(bar, face)
-                last -= outer
-                outer *= 2
-        bars = []
-        for face in reversed(FACES):
-            outer = _layers(bar, face)[0]
-            bars.append(outer.clone())
-            outer.zero_()
-        bars.reverse()
-        pairs = (torch.stack(bars[k : k + 2]) for k in (0, 2, 4))
-        return None, None, bar[:, 1:-1, 1:-1, 1:-1], *pairs
+    def backward(ctx: Any, bar: Tensor) -> tuple[Any, ...]:
+        longer = bar.clone()
+        for face, line in reversed(list(zip(FACES, ctx.lines, strict=True))):
+            if face[0] != ctx.axis:
+                outer, last, _ = _layers(longer, face)
+                last.addcmul_(outer, line, value=-1)
+                outer.mul_(1 + line)
+        outside = _places(tuple(ctx.shape[1:]), bar.device)[0]
+        return None, None, longer[:, 1:-1, 1:-1, 1:-1], longer.flatten(1)[:, outside]
 
     @staticmethod
-    def jvp(ctx: Any, _axis: None, _lines: None, *changes: Tensor | None) -> Tensor:
-        like = next(change for change in changes if change is not None)
-        known = (
-            like.new_zeros(shape) if change is None else change
-            for change, shape in zip(changes, ctx.shapes, strict=True)
-        )
-        return _WithLayers.forward(ctx.axis, ctx.lines, *known)
+    def jvp(
+        ctx: Any, _axis: None, _lines: None, cells: Tensor | None, outside: Tensor | None
+    ) -> Tensor:
+        like = next(one for one in (cells, outside) if one is not None)
+        count = _places(tuple(ctx.shape[1:]), like.device).shape[1]
+        cells = like.new_zeros(ctx.shape) if cells is None else cells
+        outside = like.new_zeros(len(cells), count) if outside is None else outside
+        return _WithOutside.forward(ctx.axis, ctx.lines, cells, outside)
 
 
-def _layers(field: Tensor, face: tuple[int, int]) -> list[Tensor]:
-    """The layer at a face and the one next to it, as views; of one layer that, twice."""
+def _longer(cells: Tensor) -> Tensor:
+    """`cells` [C, z, y, x] with a layer more on each side, which are zero."""
+    longer = cells.new_zeros(len(cells), *(count + 2 for count in cells.shape[1:]))
+    longer[:, 1:-1, 1:-1, 1:-1] = cells
+    return longer
+
+
+def _layers(longer: Tensor, face: tuple[int, int]) -> list[Tensor]:
+    """The layer on a face and the two before it, as views; of one layer of cells that, twice."""
     axis, side = face
-    places = [k if field.shape[1 + axis] > 1 else 0 for k in range(2)]
-    return [field.select(1 + axis, -1 - k if side else k) for k in places]
+    places = 0, 1, 2 if longer.shape[1 + axis] > 3 else 1
+    return [longer.select(1 + axis, -1 - k if side else k) for k in places]
