@@ -98,16 +98,16 @@ class Pane:
         before = (eye[self.axis] - self.place).abs()
         behind = away[self.axis].abs() - before
         square = sum(one**2 for axis, one in enumerate(away) if axis != self.axis)
-        bent, squared = (self.index**2 - 1) * square, self.index**2
+        excess, squared = (self.index**2 - 1) * square, self.index**2
         # By Newton's method, of t over the distance: from 0 up, and it never comes beyond.
         tangent = torch.zeros_like(square + behind)
         for step in range(NEWTON_STEPS):
             # The last step's derivative is that of the implicit function.
             with torch.set_grad_enabled(torch.is_grad_enabled() and step == NEWTON_STEPS - 1):
-                root = (squared + bent * tangent**2).sqrt()
+                root = (squared + excess * tangent**2).sqrt()
                 slope = (before + behind * squared / root**3).detach()
                 tangent = tangent - ((before + behind / root) * tangent - 1) / slope
-        inside = tangent / (squared + bent * tangent**2).sqrt()
+        inside = tangent / (squared + excess * tangent**2).sqrt()
         side = away[self.axis].sign()
         return [-side if axis == self.axis else -inside * one for axis, one in enumerate(away)]
 

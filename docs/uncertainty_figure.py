@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 KINDS = {
     "mean": "what was found",
     "std": "deviation",
-    "told": "explained by pictures\n(white: all)",
+    "explained": "explained by pictures\n(white: all)",
 }
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     figure, axes = plt.subplots(1, len(KINDS), figsize=(8.5, 2.8))
     for axis, (kind, title) in zip(axes, KINDS.items(), strict=True):
         values = read_field(folder / "volumes" / f"density_{kind}.npz", f"density_{kind}").values
-        white = 1 if kind == "told" else values.max()
+        white = 1 if kind == "explained" else values.max()
         shown = axis.imshow(values[len(values) // 2, ::-1], cmap="gray", vmin=0, vmax=white)
         axis.set_title(title, fontsize=10)
         axis.set_axis_off()

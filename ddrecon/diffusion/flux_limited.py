@@ -231,8 +231,8 @@ def iterate_picard(
     u = torch.zeros_like(like) if guess is None or guess.shape != like.shape else guess
     iteration, change = 0, float("inf")
     while change > tolerance and iteration < MAX_ITERATIONS:
-        operator, lacking = defect(u)
-        step = DAMPING * solve.solver(operator, lacking, None, INNER_TOLERANCE).value
+        operator, residual = defect(u)
+        step = DAMPING * solve.solver(operator, residual, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
         size, length = (torch.linalg.vector_norm(each, dim=(1, 2, 3)) for each in (u, step))
         change = float((length / size.clamp(min=torch.finfo(u.dtype).tiny)).max())

@@ -148,9 +148,9 @@ class TextKernel:
     def write(self, record: Any, name: str, value: Any) -> None:
         """Writes a number into `record`, or the address of an array; 0 of one that is None."""
         if isinstance(value, Tensor):
-            wanted = self.arrays.get(name)
-            if value.dtype is not wanted or not value.is_contiguous():
-                raise ValueError(f"{name} is declared as {wanted}, and is to be contiguous")
+            expected = self.arrays.get(name)
+            if value.dtype is not expected or not value.is_contiguous():
+                raise ValueError(f"{name} is declared as {expected}, and is to be contiguous")
             setattr(record, name, value.data_ptr())
         elif name in self.lists:
             for entry, each in zip(self.lists[name], value, strict=True):

@@ -59,7 +59,7 @@ template <class N> struct Taps {
             return inner;
         }
     }
-    template <class M> INLINE auto bent(const M* value, int stride = 1) const {
+    template <class M> INLINE auto curved(const M* value, int stride = 1) const {
         return bend[0] * value[0] + bend[1] * value[stride] + bend[2] * value[2 * stride] +
                bend[3] * value[3 * stride];
     }

@@ -138,7 +138,7 @@ class Moments:
         return radiance
 
     def positive_along(self, direction: Vector, more: Tensor | None = None) -> Tensor:
-        """Radiance r = `along` + `more`, bent to zero below m = MARGIN (|L0| + |r - L0|).
+        """Radiance r = `along` + `more`, floored below m = MARGIN (|L0| + |r - L0|).
 
         It is r where r >= m, m (1 + r/m)^2 / 4 from there down to -m, and 0 below. E2.3 is negative
         where light is more directed than two terms in angle can say; where g is not 0 so may L0 be,
@@ -152,8 +152,8 @@ class Moments:
             radiance = radiance + more
         margin = MARGIN * (self.mean.abs() + (radiance - self.mean).abs())
         divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
-        bent = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4
-        return torch.where(radiance >= margin, radiance, bent)
+        floored = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4
+        return torch.where(radiance >= margin, radiance, floored)
 
 
 def _by_harmonic(factors: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from ddrecon.numerics.remember import remember
 class Received:
     """What each cell receives of beams, light that is not yet scattered, averaged over the cell.
 
-    `source`: Q0, Q1 and what follows, to the degree that was wanted. `mean` [C, z, y, x]: that of
+    `source`: Q0, Q1 and what follows, to the degree asked for. `mean` [C, z, y, x]: that of
     the light itself over directions, what peaks have turned among it. `turned`: light that backward
     peaks have turned back and forth (E8.11).
     """

@@ -91,13 +91,13 @@ def _sum_mass(
     on_slices, bends = rays.look(field)
     # Trapezoids over half steps are more than those over whole ones by
     # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    bent = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
+    curved = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
     passed = on_slices.cumsum(0) - on_slices
     if before is not None:
-        passed, bent = passed + before[0], bent + before[1]
+        passed, curved = passed + before[0], curved + before[1]
     third_order = ThirdOrder(0, 1, bound)
-    mass = passed * step + third_order.bounded(bent * (0.5 * step))
+    mass = passed * step + third_order.bounded(curved * (0.5 * step))
     entered = rays.to_cells(mass, third_order)
     return add_halo(grid.own(entered), grid) if isinstance(grid, Slab) else entered, step
 

@@ -82,6 +82,6 @@ def quadrature_reflectances(index: float, count: int) -> Tensor:
     place = (part.cumsum() - part)[:, None] + part[:, None] * (nodes + 1) / 2
     passed = 1 - reflectance(torch.from_numpy(place), index).numpy()
     mean = (passed * place) @ own / (place @ own)
-    wanted = transmitted_moments(index)[0] * (part * levels).sum()
-    reflected = 1 - np.minimum(wanted / (part * levels * mean).sum() * mean, 1)
+    entering = transmitted_moments(index)[0] * (part * levels).sum()
+    reflected = 1 - np.minimum(entering / (part * levels * mean).sum() * mean, 1)
     return torch.from_numpy(reflected[np.searchsorted(levels, cosines)])

@@ -149,7 +149,7 @@ class HenyeyGreenstein(PhaseFunction):
 class Rayleigh(PhaseFunction):
     """p(w) = 3/4 (1 + w^2), of particles much smaller than the wavelength; it has no peak.
 
-    `like`: any tensor of the precision that is wanted.
+    `like`: any tensor of the precision asked for.
     """
 
     NAME = "rayleigh"

@@ -43,7 +43,7 @@ def render_to_folder(
     parameter: str | None = None,
     kinds: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`.
+    """The report of rendering `views` of `scene`, with their components if asked for, to `folder`.
 
     With a `parameter`, which `require_variation` must allow, also the images' derivatives by it.
     The fluence is written in files of these `kinds`. The first rank alone writes.

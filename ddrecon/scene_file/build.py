@@ -82,7 +82,7 @@ side of a plane, which takes more directions. So do thick cells, and a backward 
 that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
 """
 START_OF_EMISSION = 0.1
-"""Emission that is sought from nothing shows so many times the pictures' brightness."""
+"""Emission optimized from nothing shows so many times the pictures' brightness."""
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
 

@@ -51,13 +51,13 @@ class Field:
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
         # What pictures leave of that by noise alone, of cells that change with those around.
         around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
-        told = self.power * around
-        self.left, is_untold = self.power / (1 + told), told < 1
+        explained = self.power * around
+        self.left, is_unseen = self.power / (1 + explained), explained < 1
         is_edge = mean_around(is_empty.double(), WIDTH) > 0
         self.classes = {
-            "edge": is_edge & ~is_untold,
-            "inside": ~is_edge & ~is_untold,
-            "untold": is_untold,
+            "edge": is_edge & ~is_unseen,
+            "inside": ~is_edge & ~is_unseen,
+            "unseen": is_unseen,
         }
 
     def spread(self, but: int | None = None) -> Tensor:
@@ -82,24 +82,24 @@ class Field:
         spread, deviation = self.spread(but), self.left.sqrt()
         for name, own in self.classes.items():
             by_errors = SHORT * self.factors[name] * spread
-            if name == "untold":
+            if name == "unseen":
                 by_errors = torch.maximum(by_errors, deviation)
             deviation = torch.where(own, by_errors, deviation)
         return deviation
 
     @property
-    def told(self) -> Tensor:
+    def explained(self) -> Tensor:
         """The share of each cell's variance that the pictures explain: 0 none, 1 all."""
         return (1 - self.deviation.square() / self.power).clamp(0, 1)
 
     def describe(self) -> dict[str, Any]:
-        """Root mean squares over the smoke, the share that is told, and classes with coverage."""
+        """Root mean squares over the smoke, what share pictures explain, and classes."""
         smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
         deviation = float(self.deviation[smoke].square().mean())
         return {
             "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
             "deviation": deviation**0.5,
-            "told": min(max(1 - deviation / self.power, 0.0), 1.0),
+            "explained": min(max(1 - deviation / self.power, 0.0), 1.0),
             "classes": {
                 name: {"share": float(own[smoke].double().mean())}
                 | self._coverage(name, own & smoke)

@@ -95,7 +95,7 @@ def _begin(
 def _experiment(
     found: Uncertainty, experiments: int, keep: Callable[[], None], is_quiet: bool
 ) -> None:
-    """Makes what is lacking of `experiments`; `keep` is called now and then, and where it ends."""
+    """Makes the missing `experiments`; `keep` is called now and then, and where it ends."""
     total, due = experiments * found.run.iteration, perf_counter() + CHECKPOINT_SECONDS
     bar = tqdm(total=total, initial=found.iteration, desc="uncertainty", **bar_settings(is_quiet))
     keep()

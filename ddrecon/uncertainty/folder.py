@@ -45,7 +45,7 @@ def write_found(
     """
     found, fields = deviations.found, deviations.fields
     for name, field in fields.items():
-        stated = {"std": field.deviation, "mean": field.value, "told": field.told}
+        stated = {"std": field.deviation, "mean": field.value, "explained": field.explained}
         for kind, values in stated.items():
             _write(field, path / "volumes" / f"{name}_{kind}", name, values)
     for number in range(samples):
@@ -109,7 +109,7 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
 def _about(field: Mapping[str, Any]) -> str:
     return (
         f"deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g} (root mean squares"
-        f" over the smoke); pictures explain {100 * field['told']:.0f} % of the variance"
+        f" over the smoke); pictures explain {100 * field['explained']:.0f} % of the variance"
     )
 
 
@@ -117,7 +117,7 @@ def _classes(field: Mapping[str, Any]) -> list[str]:
     """A line for each class of the cells of a `field`: how many, and how often experiments held."""
     lines = []
     for name, of in field["classes"].items():
-        what = ", where pictures tell nothing" if name == "untold" else ""
+        what = ", where pictures tell nothing" if name == "unseen" else ""
         line = f"{name}{what}: {100 * of['share']:.0f} % of the smoke"
         if "within_1" in of:
             line += (
@@ -136,7 +136,7 @@ def _number(number: Mapping[str, float | None]) -> str:
 
 def _promise(view: Mapping[str, Any], place: int) -> str:
     """What the picture at this `place` in the ranking may tell."""
-    tied = ", not to be told from the first" if place and view["is_tied"] else ""
+    tied = ", not to be distinguished from the first" if place and view["is_tied"] else ""
     gain, error = 100 * view["gain"], 100 * view["error"]
     return f"takes at least {gain:.1f} % of the variance (+- {error:.1f}){tied}"
 
@@ -170,7 +170,7 @@ def _field(name: str, field: Field, described: Mapping[str, Any]) -> list[str]:
     strongest = find_white_value(deviation)
     pictures = [
         (slices(deviation, strongest), f"deviation: white is {strongest:.3g}"),
-        (slices(field.told, 1.0), "explained by pictures: black is nothing, white is all"),
+        (slices(field.explained, 1.0), "explained by pictures: black is nothing, white is all"),
     ]
     if field.parameter.is_field:
         size, off = (

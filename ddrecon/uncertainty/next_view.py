@@ -80,8 +80,8 @@ def rank_views(
             left_out[view.name] = gains_but_one(alike, shown)
             gain, error = find_gain(alike, shown), find_error(left_out[view.name])
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
-            told = {"name": view.name, "gain": gain, "error": error}
-            ranked.append(told | {"matrix": matrix, "light_directions": ways})
+            row = {"name": view.name, "gain": gain, "error": error}
+            ranked.append(row | {"matrix": matrix, "light_directions": ways})
     ranked.sort(key=lambda each: -each["gain"])
     best = ranked[0]
     for each in ranked:

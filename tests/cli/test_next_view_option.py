@@ -28,7 +28,7 @@ def test_cameras_and_lights_are_ranked(
         gains = [view["gain"] for view in views]
         assert gains == sorted(gains, reverse=True) and 0 <= gains[-1] < gains[0] <= 1
         assert views[0]["is_tied"]
-        told = stdout.count("not to be told from the first")
+        told = stdout.count("not to be distinguished from the first")
         assert told == sum(view["is_tied"] for view in views[1:])
         assert f"next view: {views[0]['name']} takes" in stdout
         assert views[0]["name"] in Path(kind, "report.html").read_text()

@@ -44,7 +44,7 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
     # What is written is about what was found.
     value = read_field(Path("run/volumes/density.npz"), "density").values
     np.testing.assert_allclose(volume("sure", "density_mean"), value, atol=1e-6)
-    deviation, told = volume("sure", "density_std"), volume("sure", "density_told")
+    deviation, told = volume("sure", "density_std"), volume("sure", "density_explained")
     assert deviation.min() > 0 and 0 <= told.min() <= told.max() <= 1
     smoke = value > 0.02 * value.max()
     size = float(np.sqrt((deviation[smoke] ** 2).mean()))
@@ -57,7 +57,11 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
         assert record["assumed"] in text and "in experiments" in text and "explain" in text
     assert record["experiments"] == 2 and "lights.0.irradiance" in page
     succeed("export", "sure", "-o", "sure.npz")
-    assert set(field_names(Path("sure.npz"))) == {"density_std", "density_mean", "density_told"}
+    assert set(field_names(Path("sure.npz"))) == {
+        "density_std",
+        "density_mean",
+        "density_explained",
+    }
     remove_samples(Path("sure"))
     assert not any(Path("sure").iterdir())
 

@@ -88,7 +88,7 @@ def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack(
     size = torch.where(value > 0, 0.1, 0.01)
     found.errors = [{"density": size * torch.randn(SHAPE)} for _ in range(3)]
     field = Field(found, found.parameters[0])
-    assert not bool(field.classes["untold"].any())
+    assert not bool(field.classes["unseen"].any())
     for name in ("edge", "inside"):
         where = field.classes[name] & field.is_smoke
         errors = torch.stack([error[where] for error in field.errors])
@@ -109,7 +109,7 @@ def test_without_experiments_it_is_what_noise_leaves_of_what_a_cell_may_be() -> 
     )
     (field,) = Deviations(found).fields.values()
     torch.testing.assert_close(field.deviation.square(), value**0)
-    torch.testing.assert_close(field.told, 0.75 * value**0)
+    torch.testing.assert_close(field.explained, 0.75 * value**0)
     assert Deviations(found).numbers()["g"]["deviation"] is None
 
 
@@ -119,7 +119,7 @@ def test_where_pictures_tell_nothing_a_cell_may_be_anything() -> None:
     found = found_of({"density": value}, information=0.0)
     found.errors = [{"density": 1e-3 * random_values(*SHAPE)} for _ in range(2)]
     field = Field(found, found.parameters[0])
-    assert bool(field.classes["untold"].all()) and not bool(field.told.any())
+    assert bool(field.classes["unseen"].all()) and not bool(field.explained.any())
     power = float(value.square().mean())
     torch.testing.assert_close(field.deviation.square(), torch.full(SHAPE, power).double())
 

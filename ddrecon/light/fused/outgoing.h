@@ -38,7 +38,7 @@ INLINE void fill_harmonics(const N* v, const N& square, const N& cosine, const N
             v, square, v[2] * cosine - v[1] * sine, v[2] * sine + v[1] * cosine, y);
 }
 
-// `even` + `along`, bent to zero below a `margin` of their sizes; with its slopes by both.
+// `even` + `along`, floored below a `margin` of their sizes; with its slopes by both.
 template <class F> struct Bent {
     F value, by_even, by_along;
     INLINE Bent(F even, F along, F margin, F least) {
@@ -56,11 +56,11 @@ template <class F> struct Bent {
     static INLINE F size_of(F x) { return x < F(0) ? -x : x; }
     static INLINE F sign_of(F x) { return x < F(0) ? F(-1) : (x > F(0) ? F(1) : F(0)); }
 };
-template <class F> INLINE F bent(F even, F along, F margin, F least) {
+template <class F> INLINE F floored(F even, F along, F margin, F least) {
     return Bent<F>(even, along, margin, least).value;
 }
 template <class F>
-INLINE Dual<F> bent(const Dual<F>& even, const Dual<F>& along, F margin, F least) {
+INLINE Dual<F> floored(const Dual<F>& even, const Dual<F>& along, F margin, F least) {
     const Bent<F> found(even.value, along.value, margin, least);
     return even.chain(found.value, found.by_even, along, found.by_along);
 }
@@ -130,7 +130,7 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
             const N even = number[FACTOR] * in[0][i];
             Directed<N> found;
             direct(view, first, i, number + EYE, number + FACTOR, in, found);
-            out[i] = change_of(bent(even, found.along, view.margin, view.least));
+            out[i] = change_of(floored(even, found.along, view.margin, view.least));
         }
     }
 

@@ -146,11 +146,11 @@ template <class F, int BLOCK> struct Shear : Slices {
             for (int t = 0; t < size; ++t) {
                 const N value = c.a * here[t] + (F(1) - c.a) * here[t + 1];
                 const N between = c_half.a * midway[t] + (F(1) - c_half.a) * midway[t + 1];
-                const N bent = bend[t] - half * value;
-                const N x = F(0.5) * step * bent;
+                const N curved = bend[t] - half * value;
+                const N x = F(0.5) * step * curved;
                 mass[t] = step * sum[t] + bounded(x, bound);
                 correction[t] = x;
-                bend[t] = bent + more * (between - F(0.5) * value);
+                bend[t] = curved + more * (between - F(0.5) * value);
                 sum[t] += value;
             }
             if (is_kept && lo == 0 && c.n == 0) masses[at] = mass[0];
@@ -162,22 +162,22 @@ template <class F, int BLOCK> struct Shear : Slices {
     // Mass carried from rays to cells: rows of rays around cells are blended, linearly and as third
     // order has it; then four of their columns around a cell.
     template <class N> struct Blend {
-        N linear[BLOCK + 3], bent[BLOCK + 3];
+        N linear[BLOCK + 3], curved[BLOCK + 3];
         INLINE void rows(const Taps<F>& taps, const N* rays, int stride, int count) {
             INDEPENDENT
             for (int t = 0; t < count + 3; ++t) {
                 linear[t] = taps.linearly(rays + t, stride);
-                bent[t] = taps.bent(rays + t, stride);
+                curved[t] = taps.curved(rays + t, stride);
             }
         }
     };
     template <class T, class N>
-    static INLINE N correction_of(const Taps<T>& column, const N* linear, const N* bent) {
-        return column.linearly(bent) + column.bent(linear);
+    static INLINE N correction_of(const Taps<T>& column, const N* linear, const N* curved) {
+        return column.linearly(curved) + column.curved(linear);
     }
-    template <class T, class N>
-    static INLINE N mass_of(const Taps<T>& column, const N* linear, const N* bent, const N& bound) {
-        return column.linearly(linear) - bounded(correction_of(column, linear, bent), bound);
+    template <class T, class N> static INLINE N
+    mass_of(const Taps<T>& column, const N* linear, const N* curved, const N& bound) {
+        return column.linearly(linear) - bounded(correction_of(column, linear, curved), bound);
     }
     template <class N>
     INLINE void carry_to_cells(int item, N bound, const N* masses, N* entered) const {
@@ -189,7 +189,7 @@ template <class F, int BLOCK> struct Shear : Slices {
         N* __restrict out = entered + own.at;
         INDEPENDENT
         for (int t = 0; t < own.count; ++t)
-            out[t] = mass_of(column, blend.linear + t, blend.bent + t, bound);
+            out[t] = mass_of(column, blend.linear + t, blend.curved + t, bound);
     }
 
     // Adjoints gather everything. The correction's cotangent at each cell; and of the numbers, four
@@ -208,7 +208,7 @@ template <class F, int BLOCK> struct Shear : Slices {
         enum { ROW, COLUMN, LIMIT };
         F of[3][BLOCK];
         for (int t = 0; t < own.count; ++t) {
-            const F x = correction_of(column, blend.linear + t, blend.bent + t);
+            const F x = correction_of(column, blend.linear + t, blend.curved + t);
             const Bounded<F> part(x, bound);
             out[t] = bar[t] * part.by_x;
             of[LIMIT][t] = -bar[t] * part.by_bound;
@@ -217,19 +217,19 @@ template <class F, int BLOCK> struct Shear : Slices {
         // Slopes along the places of rows and columns.
         typedef Dual<F, 2> N;
         const Taps<Dual<F>> row_slope(r, rows, own.row == 0);
-        F linear[BLOCK + 3], bent[BLOCK + 3];
+        F linear[BLOCK + 3], curved[BLOCK + 3];
         for (int t = 0; t < own.count + 3; ++t) {
             linear[t] = row_slope.linearly(rays + t, window_row_stride).by[0];
-            bent[t] = row_slope.bent(rays + t, window_row_stride).by[0];
+            curved[t] = row_slope.curved(rays + t, window_row_stride).by[0];
         }
         auto change = [&](const Taps<N>& column, int t) HERE {
             N l[4], b[4];
             UNROLLED
             for (int u = 0; u < 4; ++u) {
                 l[u] = N(blend.linear[t + u]);
-                b[u] = N(blend.bent[t + u]);
+                b[u] = N(blend.curved[t + u]);
                 l[u].by[ROW] = linear[t + u];
-                b[u].by[ROW] = bent[t + u];
+                b[u].by[ROW] = curved[t + u];
             }
             const N mass = mass_of(column, l, b, N(bound));
             of[ROW][t] = bar[t] * mass.by[ROW];
@@ -250,7 +250,7 @@ template <class F, int BLOCK> struct Shear : Slices {
         int item, bool varies, const F* masses, const F* corrections, const F* entered_bar,
         const F* corrections_bar, F* slices_bar, F* midways_bar, double* sums) const {
         Rays own = rays_of(item);
-        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
+        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], curved[BLOCK + 6], bar[BLOCK + 3];
         F of_step[BLOCK], of_bound[BLOCK];
         clear(passed, BLOCK), clear(bends, BLOCK);
         double by_step = 0, by_bound = 0;
@@ -272,7 +272,7 @@ template <class F, int BLOCK> struct Shear : Slices {
             // Of rays, by gathering from cells: rows first, then columns.
             const Taps<F> row(r, rows), column(c, columns);
             const int size = to - from, left = from - c.n - 2;
-            clear(linear, size + 3), clear(bent, size + 3);
+            clear(linear, size + 3), clear(curved, size + 3);
             auto add_window_row = [&](int m) HERE {
                 for (int t = 0; t < 4; ++t) {
                     const int y = m - t;
@@ -281,7 +281,7 @@ template <class F, int BLOCK> struct Shear : Slices {
                     const F* part = corrections_bar + cell_row(own.channel, k, y);
                     add_row(linear, whole, left, size + 3, width, row.linear[t]);
                     add_row(linear, part, left, size + 3, width, -row.bend[t]);
-                    add_row(bent, part, left, size + 3, width, row.linear[t]);
+                    add_row(curved, part, left, size + 3, width, row.linear[t]);
                 }
             };
             if (k > 0) {
@@ -292,8 +292,8 @@ template <class F, int BLOCK> struct Shear : Slices {
             }
             for (int t = 0; t < size; ++t)
                 bar[t] = column.linear[1] * linear[t + 2] + column.linear[2] * linear[t + 1] -
-                         column.bend[0] * bent[t + 3] - column.bend[1] * bent[t + 2] -
-                         column.bend[2] * bent[t + 1] - column.bend[3] * bent[t];
+                         column.bend[0] * curved[t + 3] - column.bend[1] * curved[t + 2] -
+                         column.bend[2] * curved[t + 1] - column.bend[3] * curved[t];
             if (from < lo) bar[1] += bar[0];
             for (int j = hi; j < to; ++j) bar[hi - 1 - from] += bar[j - from];
 

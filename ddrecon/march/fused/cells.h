@@ -129,13 +129,13 @@ template <class F> struct Kink {
         const Place<F, V> at = Place<F, V>::at(seen, size);
         const V a = P::least(P::most(y, low), high) - P::real(at.cells[1]);
         const V live = P::pick((seen > low) & (seen < high), one, none);
-        const V bent = P::pick(Place<F, V>::is_curved(seen, size), one, none);
+        const V curved = P::pick(Place<F, V>::is_curved(seen, size), one, none);
         Place<F, N> q = {
             {at.cells[0], at.cells[1], at.cells[2], at.cells[3]},
             N(a),
-            N(bent * (F(0.5) * a * (F(1) - a)))};
+            N(curved * (F(0.5) * a * (F(1) - a)))};
         q.a.by[direction] = live;
-        q.excess.by[direction] = bent * (F(0.5) - a);
+        q.excess.by[direction] = curved * (F(0.5) - a);
         return q;
     }
 };
