@@ -258,7 +258,7 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
 CHECKPOINT_FILES = ("checkpoints/last.pt", "checkpoints/previous.pt")
 SAMPLE_FILES = (
     *("uncertainty.json", "report.html", *CHECKPOINT_FILES),
-    *(f"volumes/*_{kind}.*" for kind in ("std", "mean", "told")),
+    *(f"volumes/*_{kind}.*" for kind in ("std", "mean", "explained")),
     "samples/[0-9][0-9][0-9][0-9]/*",
 )
 """What files of `ddrecon uncertainty` are called."""
