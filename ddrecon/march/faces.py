@@ -7,7 +7,6 @@ optical depth at most; but it is zero on faces through which the light shines.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from itertools import product
@@ -21,6 +20,7 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import thinness
+from ddrecon.numerics.remember import remember
 from ddrecon.slabs.slab import Slab
 
 GRAZING = 0.1
@@ -44,7 +44,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     sizes = [len(field) for field in named.values()]
     cells = torch.cat(list(named.values()))
     is_line = [_is_line(grid, *face) for face in FACES]
-    is_light = [one for name, k in zip(named, sizes, strict=True) for one in [_is_light(name)] * k]
+    is_light = [_is_light(name) for name, field in named.items() for _ in field]
     # One row a face, one number a channel.
     lines = _lines(tuple(is_line), tuple(is_light), cells.dtype, cells.device)
     last, goal = (one.split(sizes) for one in _Outside.apply(cells, lines))
@@ -95,7 +95,7 @@ def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     return goal + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1)
 
 
-@functools.cache
+@remember
 def _lines(
     is_line: Sequence[bool], is_light: Sequence[bool], dtype: torch.dtype, device: torch.device
 ) -> Tensor:
@@ -104,7 +104,7 @@ def _lines(
     return lines.to(device, dtype)[..., None, None]
 
 
-@functools.cache
+@remember
 def _places(shape: tuple[int, ...], device: torch.device) -> Tensor:
     """Where cells outside of those of `shape` stand in a field with a layer more, and where the
     outermost cells stand that are next to them: [2, M].
