@@ -44,7 +44,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     sizes = [len(field) for field in named.values()]
     cells = torch.cat(list(named.values()))
     is_line = [_is_line(grid, *face) for face in FACES]
-    is_light = [_is_light(name) for name, field in named.items() for _ in field]
+    is_light = [_is_light(name) for name, field in named.items() for _ in range(len(field))]
     # One row a face, one number a channel.
     lines = _lines(tuple(is_line), tuple(is_light), cells.dtype, cells.device)
     last, goal = (one.split(sizes) for one in _Outside.apply(cells, lines))
