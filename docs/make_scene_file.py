@@ -430,7 +430,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
                 "where there are none: without model `p1` or scheme `conservative`. With "
                 "degree 5 it is one more, two in cells thicker than 4 optical depths. Where "
-                "none is, it is 1 in cells thicker than 3. Cells count as `refine` leaves them."
+                "none is, it is 1 in cells thicker than 3, and else at least 2 where the volume "
+                "emits light. Cells count as `refine` leaves them."
             ),
             "transport_tolerance": (
                 "Rounds end where one changes light by less of it, at most `transport_rounds` of "

@@ -366,6 +366,10 @@ def choose_diffusion(
         rounds, degree = rounds + 1 + (depth / times > THICK), 5
     elif depth / times > SOFT:
         rounds = 1
+    elif tree.glows:
+        # Around a small bright core diffusion is far too bright, and a single round too dark.
+        reasons.append("emission")
+        rounds = max(rounds, 2)
     if tree.volume.periodic:
         # With fewer directions too much light goes exactly along the axes that repeat.
         reasons.append("a volume that repeats")
