@@ -21,6 +21,7 @@ from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
+from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.tangents import varied
@@ -154,6 +155,12 @@ def render_tangent(
             key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
             for key, (primal, tangent) in pairs.items()
         }
+
+
+def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
+    """J^T W J times `vector` (E11.1)."""
+    changes = curvature.tangents(vector)
+    return curvature.adjoint({name: curvature.weights[name] * changes[name] for name in changes})
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
