@@ -43,6 +43,7 @@ VIEWS = f"views=[{', '.join(CAMERA.format(*place) for place in PLACES)}]"
 SMALL = ["volume.resolution=[5, 5, 5]", "volume.density=0.5", "diffusion.transport_rounds=0"]
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 SHAPE = (6, 7, 5)
+pytestmark = pytest.mark.usefixtures("few_directions")
 ALBEDO, HEIGHT = (0.6, 0.4, 0.2), -0.8
 VIEW = {"eye": (0.5, 1.5, 2.5), "size": (6, 7), "half_width": 0.5}
 """Most of its picture is ground."""

@@ -47,6 +47,7 @@ optimize:
   parameters: {density: {init: 0}, lights.0.irradiance: {}, "views.*.exposure": {}}
 """
 
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with film.yaml and the pictures of a ball that moves."""
@@ -70,10 +71,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             np.save(folder / f"{view.name}_{number:02d}.npy", picture.permute(1, 2, 0).numpy())
     return folder
 
+
 @pytest.fixture
 def film(made: Path, folder: Path) -> Path:
     """The current folder, with what is in the one that was made."""
     return Path(shutil.copytree(made, folder, dirs_exist_ok=True))
+
 
 @pytest.fixture(scope="module")
 def whole(made: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -83,7 +86,9 @@ def whole(made: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
         assert CliRunner().invoke(main, optimize("-o", "whole")).exit_code == 0
     return str(folder / "whole")
 
+
 FEW = "-D", "optimize.iterations=6"
+
 
 def volumes(folder: str) -> dict[str, bytes]:
     """The arrays of all volumes in the folder of a film, by file."""
@@ -94,8 +99,10 @@ def volumes(folder: str) -> dict[str, bytes]:
         for path in sorted(Path(folder).rglob("*.npz"))
     }
 
+
 def optimize(*arguments: str) -> tuple[str, ...]:
     return ("optimize", "film.yaml", *arguments, "-q", "--dtype", "float64")
+
 
 def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
     longer = "-D", "optimize.iterations=24"
@@ -136,6 +143,7 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
     assert not Path("other/calibration").exists()
     assert sorted(path.name for path in Path("other/frames").iterdir()) == ["0002", "0003"]
 
+
 def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed: Run) -> None:
     for name in VIEWS:
         np.save(f"{name}_01.npy", np.load(f"{name}_00.npy"))
@@ -150,6 +158,7 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
     start, first = volumes("out/frames/0001"), volumes("out/frames/0000")
     assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
 
+
 def test_frames_end_by_themselves_as_runs_do(
     film: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +169,7 @@ def test_frames_end_by_themselves_as_runs_do(
     for number in range(2):
         summary = json.loads(Path(f"out/frames/000{number}/summary.json").read_text())
         assert summary["ended"]["kind"] == "rest" and summary["iterations"] >= 6
+
 
 def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
     """It begins from nothing, and its first frame moves as the second does."""
@@ -178,6 +188,7 @@ def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) 
     assert not [file for file in out if file.startswith("frames/0008/start")]
     arrows = [out[f"frames/000{number}/volumes/velocity.npz"] for number in (8, 9)]
     assert arrows[0] == arrows[1]
+
 
 @pytest.fixture
 def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
@@ -198,6 +209,7 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     monkeypatch.setattr(Reconstruction, "step", counted)
     return arm
 
+
 @pytest.mark.slow
 def test_killed_anywhere_and_resumed_to_the_same_bits(
     whole: str, film: Path, succeed: Run, run: Run, killed_at: Callable[[int], None]
@@ -211,6 +223,7 @@ def test_killed_anywhere_and_resumed_to_the_same_bits(
     assert volumes("parts") == volumes(whole)
     shared = [json.loads(Path(f"{name}/shared.json").read_text()) for name in ("parts", whole)]
     assert shared[0] == shared[1]
+
 
 @pytest.mark.slow
 def test_a_calibration_that_diverges_goes_on_before_its_last_step(
@@ -232,6 +245,7 @@ def test_a_calibration_that_diverges_goes_on_before_its_last_step(
     succeed(*optimize("-o", "parts", "--resume"))
     assert volumes("parts") == volumes(whole)
 
+
 @pytest.mark.slow
 def test_parts_that_begin_together_calibrate_once(film: Path) -> None:
     """The second waits, and takes what the first has found."""
@@ -243,6 +257,7 @@ def test_parts_that_begin_together_calibrate_once(film: Path) -> None:
     assert [one.wait(timeout=100) for one in running] == [0, 0]
     found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 3)]
     assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
+
 
 def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:
     """Each camera by its own count; a scene says which frame is its, and is read again as such."""
@@ -269,6 +284,7 @@ def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> No
     (line,) = refuse(3, "check", "mp4.yaml")
     assert line.endswith("front.mp4: is damaged, or no film")
 
+
 @pytest.mark.slow
 def test_parts_joined_are_the_whole(whole: str, film: Path, succeed: Run) -> None:
     for part in ("0:1", "2:2", "3:"):
@@ -277,6 +293,7 @@ def test_parts_joined_are_the_whole(whole: str, film: Path, succeed: Run) -> Non
     frames = [json.loads(Path(f"{name}/film.json").read_text()) for name in ("parts", whole)]
     psnrs = [[row["psnr"] for row in record["frames"]] for record in frames]
     assert psnrs[0] == psnrs[1]
+
 
 @pytest.mark.slow
 def test_from_python(whole: str, film: Path) -> None:
@@ -291,6 +308,7 @@ def test_from_python(whole: str, film: Path) -> None:
     with pytest.raises(ddrecon.SceneError, match="frames: missing section"):
         next(ddrecon.optimize_sequence("scene.yaml"))
 
+
 def test_a_frame_that_fails_is_named_and_begun_from_both_sides(film: Path, run: Run) -> None:
     Path("front_01.npy").write_bytes(b"broken")
     first = run(*optimize("-o", "out", *FEW))
@@ -303,6 +321,7 @@ def test_a_frame_that_fails_is_named_and_begun_from_both_sides(film: Path, run: 
     assert len(json.loads(Path("out/film.json").read_text())["frames"]) == FRAMES - 1
     np.save("front_01.npy", np.load("front_00.npy"))
     assert run(*optimize("-o", "out", "--resume", *FEW)).exit_code == 0
+
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
@@ -329,6 +348,7 @@ def test_misuse_is_one_line(
     (told, *_) = refuse(code, *optimize("-o", "out", *arguments))
     assert line in told
 
+
 def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     succeed(*optimize("-o", "out", "--frames", "0:0", *FEW))
     again = run(*optimize("-o", "out"))
@@ -348,6 +368,7 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
         assert single.exit_code == 2 and f"--frames {line}" in single.stderr
     beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
     assert beyond.exit_code == 2 and "no such frame is done" in beyond.stderr
+
 
 def test_frames_are_spread_over_all() -> None:
     for count in range(2, 9):

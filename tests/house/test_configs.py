@@ -29,10 +29,7 @@ tests/validate.
 """
 
 
-KINDS = [
-    *sorted((ROOT / "configs" / "kinds").glob("*.yaml")),
-    ROOT / "configs" / "ground.yaml",
-]
+KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
 
 
 def small(config: Path) -> Scene:
