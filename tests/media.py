@@ -30,6 +30,10 @@ LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
 
 
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
         dtype
@@ -38,6 +42,11 @@ def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64
 
 def half_empty(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     return (2 * random_values(*shape, seed=seed, dtype=dtype) - 1).clamp(min=0)
+
+
+def assert_near(found: Tensor, known: Tensor, error: float) -> None:
+    """To `error` of the largest known."""
+    assert float((found - known).abs().max()) <= error * float(known.abs().max())
 
 
 def box_grid(shape: tuple[int, int, int]) -> Grid:

@@ -1,6 +1,6 @@
 """Both engines compute the same images and the same derivatives, whatever the scene.
 
-Of scenes of every kind in configs/ in 64 bits, with fewer cells and pixels, and of scenes drawn at random.
+Of each kind of scene in configs/ in 64 bits, with fewer cells and pixels, and of random ones.
 """
 
 from collections.abc import Sequence

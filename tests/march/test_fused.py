@@ -9,7 +9,7 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward
 from graphics_cards import assert_compiles
-from media import half_empty, make_camera, make_scene, random_values
+from media import assert_near, half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -125,10 +125,6 @@ def tangent(scene: Scene, names: list[str], engine: str) -> Tensor:
             change = random_values(*value.shape, seed=5).to(value)
             duals[name] = forward.make_dual(value, change)
         return forward.unpack_dual(images(scene, duals, engine)[0]).tangent
-
-
-def assert_near(found: Tensor, known: Tensor, error: float) -> None:
-    assert float((found - known).abs().max()) <= error * float(known.abs().max())
 
 
 EMISSIONS = [
