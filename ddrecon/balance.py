@@ -73,13 +73,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
         DIRECTIONS[settings.angles],
         lit,
     )
-    sources = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
-    crossings = {name: box.cross(parts) for name, parts in sources.items()}
-    if lit:
-        ambient = ambient_radiance([*chain(*sources.values())], medium.g).flatten()
-        crossings["ground"] = box.cross_upwards(ambient)
-    if medium.emission is not None:
-        crossings["emission"] = box.cross_out()
+    crossings = _cross_each(scene, box)
     enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
@@ -112,6 +106,19 @@ def find_balance(scene: Scene) -> dict[str, Any]:
 
     powers, fractions = in_units(torch.ones_like(entered)), in_units(entered)
     return {**powers, "fractions": fractions, "defect_percent": _plain(100 * (1 - left / entered))}
+
+
+def _cross_each(scene: Scene, box: _Box) -> dict[str, Tensor]:
+    """What crosses the `box` of each light of `scene`, of its ground and of its emission."""
+    medium = box.media[0]
+    sources = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
+    crossings = {name: box.cross(parts) for name, parts in sources.items()}
+    if box.lit:
+        ambient = ambient_radiance([*chain(*sources.values())], medium.g).flatten()
+        crossings["ground"] = box.cross_upwards(ambient)
+    if medium.emission is not None:
+        crossings["emission"] = box.cross_out()
+    return crossings
 
 
 def _plain(values: Tensor) -> float | list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
@@ -553,17 +553,24 @@ def _sections(is_expert: bool) -> list[str]:
     found = []
     for heading, record, what, texts in SECTIONS:
         declared, hints = {field.name: field for field in fields(record)}, type_hints(record)
-        rows = [
-            f"| `{name}` | {_takes(hints[name], declared[name])} | {_default(declared[name])} |"
-            f" {text} |"
+        rows = _joined(
+            (name, f"{_takes(hints[name], declared[name])} | {_default(declared[name])} | {text}")
             for name, text in texts.items()
             if bool(declared[name].metadata.get("expert")) == is_expert
-        ]
-        table = ["", "| key | takes | default | what |", "|---|---|---|---|", *rows]
+        )
+        table = ["", "| key | takes | default | what |", "|---|---|---|---|", *rows] if rows else []
         if rows or not is_expert:
             lead = [] if is_expert else ["", what]
             found.append("\n".join([f"## {heading}", *lead, *table]))
     return found
+
+
+def _joined(entries: Iterable[tuple[str, str]]) -> list[str]:
+    """A row for each text; names that have the same stand together."""
+    names: dict[str, list[str]] = {}
+    for name, text in entries:
+        names.setdefault(text, []).append(f"`{name}`")
+    return [f"| {', '.join(each)} | {text} |" for text, each in names.items()]
 
 
 def _takes(hint: Any, field: Field[Any]) -> str:
@@ -597,10 +604,11 @@ def _default(field: Field[Any]) -> str:
 
 def _parameters() -> str:
     """The table of what can be optimized."""
-    rows = []
+    entries = []
     for name, kind in KINDS.items():
         by_color, by_cell = ("yes" if holds else "" for holds in (kind.is_color, kind.is_cellwise))
-        rows.append(f"| `{name}` | {_limits(kind)} | {by_color} | {by_cell} |")
+        entries.append((name, f"{_limits(kind)} | {by_color} | {by_cell}"))
+    rows = _joined(entries)
     return "\n".join(
         [
             "## Names of parameters",

@@ -37,6 +37,13 @@ def same_seed() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture
+def few_directions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a ground's light, which goes along 72: what holds of any number is tried with few."""
+    monkeypatch.setattr("ddrecon.march.ground.DOWNWARDS", 6)
+    monkeypatch.setattr("ddrecon.light.ground.UPWARDS", 4)
+
+
 @pytest.fixture(scope="module")
 def shapes_by_python() -> Iterator[None]:
     """For devices of their own, of which C++ knows no shapes of sums with numbers."""

@@ -21,12 +21,17 @@ from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
+from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.tangents import varied
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
+
+
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -37,6 +42,11 @@ def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64
 
 def half_empty(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     return (2 * random_values(*shape, seed=seed, dtype=dtype) - 1).clamp(min=0)
+
+
+def assert_near(found: Tensor, known: Tensor, error: float) -> None:
+    """To `error` of the largest known."""
+    assert float((found - known).abs().max()) <= error * float(known.abs().max())
 
 
 def box_grid(shape: tuple[int, int, int]) -> Grid:
@@ -154,6 +164,12 @@ def render_tangent(
             key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
             for key, (primal, tangent) in pairs.items()
         }
+
+
+def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
+    """J^T W J times `vector` (E11.1)."""
+    changes = curvature.tangents(vector)
+    return curvature.adjoint({name: curvature.weights[name] * changes[name] for name in changes})
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Both engines compute the same images and the same derivatives, whatever the scene.
 
-Of every scene in configs/ in 64 bits, with fewer cells and pixels, and of scenes drawn at random.
+Of each kind of scene in configs/ in 64 bits, with fewer cells and pixels, and of random ones.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,17 @@ from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+ALIKE = ("film", "noisy", "plume", "satellite", "fig06_light", "fig07", "fig08", "fig09")
+ALIKE += ("fig12_single", "fig13")
+"""Configs whose lights, media and settings are of the kinds of others."""
+CONFIGS = sorted(one for one in (ROOT / "configs").rglob("*.yaml") if one.stem not in ALIKE)
 CLOSE = {torch.float32: 1e-5, torch.float64: 1e-11}
 SOLVED = {torch.float32: 1e-7, torch.float64: 1e-14}
 """Both solve as closely as numbers allow: what is compared is no solver's stopping."""
-MOST_CELLS = 12
+MOST_CELLS = 8
 
 
 def variables_of(scene: Scene) -> list[str]:
@@ -99,7 +102,7 @@ def in_double(record: Any) -> Any:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_engines_agree_on_every_config(config: Path) -> None:
+def test_engines_agree_on_every_kind_of_config(config: Path) -> None:
     scene = load_scene(config, dtype=torch.float64)
     factor = -(-max(scene.volume.grid.shape) // MOST_CELLS)
     scene = scene_at_level(replace(scene, views=scene.views[:2]), factor)
@@ -185,7 +188,7 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
     return replace(scene, render=render)
 
 
-@pytest.mark.parametrize(("dtype", "count"), [(torch.float32, 2), (torch.float64, 6)])
+@pytest.mark.parametrize(("dtype", "count"), [(torch.float32, 1), (torch.float64, 4)])
 def test_engines_agree_on_scenes_drawn_at_random(dtype: torch.dtype, count: int) -> None:
     @settings(max_examples=count, derandomize=True, database=None, phases=[Phase.generate])
     @given(scene=scenes(dtype), has_moved=some.booleans())

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from media import box_grid, make_scene, random_values
+from media import box_grid, make_scene, random_values, tensor
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -19,10 +19,6 @@ from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Light, PointLight
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def lit_by(light: Light, density: Tensor, **changes: Any) -> Scene:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from media import LOWER, UPPER, half_empty, make_camera, make_scene, random_values
+from media import LOWER, UPPER, half_empty, make_camera, make_scene, random_values, tensor
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -43,13 +43,10 @@ VIEWS = f"views=[{', '.join(CAMERA.format(*place) for place in PLACES)}]"
 SMALL = ["volume.resolution=[5, 5, 5]", "volume.density=0.5", "diffusion.transport_rounds=0"]
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 SHAPE = (6, 7, 5)
+pytestmark = pytest.mark.usefixtures("few_directions")
 ALBEDO, HEIGHT = (0.6, 0.4, 0.2), -0.8
 VIEW = {"eye": (0.5, 1.5, 2.5), "size": (6, 7), "half_width": 0.5}
 """Most of its picture is ground."""
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def on_ground(

@@ -7,7 +7,7 @@ scene file, are shown at once.
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -104,53 +104,50 @@ def render(
     session: Session,
     scene: Path,
     output: Path,
-    overwrite: bool,
-    names: tuple[str, ...],
-    components: bool,
-    parameter: str | None,
     lights: tuple[str, ...],
-    count: int | None,
-    has_fluence: bool,
-    exported: str | None,
     part: str | None,
+    **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    if exported and not has_fluence:
+    choice = _Choice(is_relit=bool(lights), **options)
+    if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
         session = session.with_override(f"lights=[{', '.join(lights)}]")
-    choice = overwrite, names, components, parameter, lights, count, has_fluence, exported
     if not (scene / "frames").is_dir():
         if part is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
-        report, lines = _render(session, scene, output, *choice)
-        session.show(report, lines)
+        session.show(*_render(session, scene, output, choice))
         return
     from ddrecon.film.folder import finished_frames
 
     frames = finished_frames(scene, part, session.build)
-    found = {run.name: _render(session, run, output / run.name, *choice) for run in frames}
+    found = {run.name: _render(session, run, output / run.name, choice) for run in frames}
     session.show(
         {name: report for name, (report, _) in found.items()},
         [*chain.from_iterable(lines for _, lines in found.values())],
     )
 
 
+@dataclass(frozen=True)
+class _Choice:
+    """What `render` makes of each scene, by the options of its command."""
+
+    is_relit: bool
+    overwrite: bool
+    names: tuple[str, ...]
+    components: bool
+    parameter: str | None
+    count: int | None
+    has_fluence: bool
+    exported: str | None
+
+
 def _render(
-    session: Session,
-    scene: Path,
-    output: Path,
-    overwrite: bool,
-    names: tuple[str, ...],
-    components: bool,
-    parameter: str | None,
-    lights: tuple[str, ...],
-    count: int | None,
-    has_fluence: bool,
-    exported: str | None,
+    session: Session, scene: Path, output: Path, choice: _Choice
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
-    kinds = [kind for kind in ("npz", exported) if kind and has_fluence]
+    kinds = [kind for kind in ("npz", choice.exported) if kind and choice.has_fluence]
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -165,23 +162,25 @@ def _render(
     )
 
     loaded = session.build(scene_file)
-    if has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+    if choice.has_fluence and scene_file.tree.diffusion.transport_rounds is None:
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
     require_sharing(loaded)
-    views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
-    if lights or count is not None:
-        loaded = remove_targets(loaded, views, count)
+    views = [loaded.view(name) for name in dict.fromkeys(choice.names)] or loaded.views
+    if choice.is_relit or choice.count is not None:
+        loaded = remove_targets(loaded, views, choice.count)
         views = list(loaded.views)
-    if parameter is not None:
-        require_variation(loaded, parameter)
-    with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
-        choice = components, session.progress, parameter, kinds
-        report = render_to_folder(loaded, views, output, *choice)
+    if choice.parameter is not None:
+        require_variation(loaded, choice.parameter)
+    with claim_folder(output, may_exist=choice.overwrite) if is_first() else nullcontext():
+        progress, parameter = session.progress, choice.parameter
+        report = render_to_folder(
+            loaded, views, output, choice.components, progress, parameter, kinds
+        )
         if not is_first():
             return {}, []
-        if count is not None:
+        if choice.count is not None:
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
     return report, render_lines(report, output)

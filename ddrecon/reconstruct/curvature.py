@@ -1,8 +1,8 @@
 """A run's second derivative by Gauss and Newton: products with J^T W J (E11.1).
 
 J is the derivative of all training pictures by all parameters, W how strongly each pixel counts.
-Nobody has the matrix: a product is one tangent and one adjoint, view by view, in one light field
-each, shared out over ranks. Its memory grows with the views by their pictures alone.
+Nobody has the matrix: a product with J or J^T is one tangent or adjoint, view by view, in one light
+field, shared out over ranks. Its memory grows with the views by their pictures alone.
 Parameters stand in one vector, entry by entry, in their own units and in their order.
 """
 
@@ -80,11 +80,6 @@ class Curvature:
         parts = vector.split([value.numel() for value in self.values.values()])
         named = zip(self.values.items(), parts, strict=True)
         return {name: part.view(value.shape) for (name, value), part in named}
-
-    def data_product(self, vector: Tensor) -> Tensor:
-        """J^T W J times `vector`."""
-        changes = self.tangents(vector)
-        return self.adjoint({name: self.weights[name] * changes[name] for name in changes})
 
     def tangents(self, vector: Tensor, scene: Scene | None = None) -> dict[str, Tensor]:
         """J times `vector`: how the picture [3, h, w] of each training view changes, by name.

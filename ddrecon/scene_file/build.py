@@ -116,27 +116,9 @@ def build_scene(
     """The scene of a file, of a film the first frame, as tensors; raises what `load_scene` does."""
     if scene_file.tree.frames is not None:
         scene_file = at_frame(scene_file, scene_file.tree.frames.first)
-    place, tree, problems = torch.device(device), scene_file.tree, Problems()
-    media, grid = dict[str, Volume](), None
-    with problems.collecting():
-        media = build_media(scene_file, dtype, place)
-        grid = next(iter(media.values())).grid
-    with problems.collecting():
-        views = build_views(scene_file, grid, dtype, place)
-    lights: list[Light] = []
-    for index, section in enumerate(tree.lights):
-        with problems.collecting():
-            lights.append(_build_light(scene_file, index, section, dtype, place))
-    ground = None
-    if media and tree.ground is not None:
-        with problems.collecting():
-            ground = _build_ground(scene_file, grid, views, dtype, place)
-    optimize = tree.optimize
-    for name, settings in optimize.parameters.items() if optimize else ():
-        if isinstance(settings.init, FieldFile):
-            with problems.collecting():
-                require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
-    problems.raise_any()
+    place, tree = torch.device(device), scene_file.tree
+    media, views, lights, ground = _build_parts(scene_file, dtype, place)
+    grid, optimize = next(iter(media.values())).grid, tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     depth = sum(map(greatest_depth, media.values()))
@@ -171,11 +153,39 @@ def build_scene(
             look_inside(view.camera, grid, volume.index, render)
     except UsageError as error:
         raise scene_file.refused("volume.index", str(error).partition(": ")[2]) from None
+    problems = Problems()
     for name, settings in optimize.parameters.items() if optimize else ():
         with problems.collecting():
             scene.starts[name] = _start(scene_file, scene, name, settings)
     problems.raise_any()
     return scene
+
+
+def _build_parts(
+    scene_file: SceneFile, dtype: torch.dtype, place: torch.device
+) -> tuple[dict[str, Volume], list[View], list[Light], Ground | None]:
+    """Media by name, views, lights and ground; whatever is wrong with any is raised together."""
+    tree, problems = scene_file.tree, Problems()
+    media, grid = dict[str, Volume](), None
+    with problems.collecting():
+        media = build_media(scene_file, dtype, place)
+        grid = next(iter(media.values())).grid
+    with problems.collecting():
+        views = build_views(scene_file, grid, dtype, place)
+    lights: list[Light] = []
+    for index, section in enumerate(tree.lights):
+        with problems.collecting():
+            lights.append(_build_light(scene_file, index, section, dtype, place))
+    ground = None
+    if media and tree.ground is not None:
+        with problems.collecting():
+            ground = _build_ground(scene_file, grid, views, dtype, place)
+    for name, settings in tree.optimize.parameters.items() if tree.optimize else ():
+        if isinstance(settings.init, FieldFile):
+            with problems.collecting():
+                require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
+    problems.raise_any()
+    return media, views, lights, ground
 
 
 def _build_light(

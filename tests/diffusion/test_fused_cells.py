@@ -111,7 +111,8 @@ def assert_equal(find: Callable[[str], Found], error: float) -> None:
 def test_systems_and_fluxes_are_those_of_torch(shape: Shape, colors: tuple[int, int]):
     for kind in itertools.product((False, True), repeat=2):
         assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float64), 1e-12)
-    assert_equal(lambda e: problem_of(e, shape, colors, (False, True), torch.float32), 1e-5)
+    if colors == COLORS[-1]:
+        assert_equal(lambda e: problem_of(e, shape, colors, (False, True), torch.float32), 1e-5)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

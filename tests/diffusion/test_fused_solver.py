@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from media import random_values
+from media import assert_near, random_values
 from test_multigrid import FORMS, patchy, patchy_box, uneven
 from torch import Tensor
 
@@ -34,10 +34,6 @@ def cycle(operator: Operator, source: Tensor) -> Tensor:
     run = fused.Run(operator, source / operator.once(Hierarchy.of).scale, None, -1.0)
     run.iterate(1)
     return run.vector("P").clone()
-
-
-def assert_near(found: Tensor, known: Tensor, error: float) -> None:
-    assert float((found - known).abs().max()) <= error * float(known.abs().max())
 
 
 @pytest.mark.parametrize("shape", SHAPES[1:], ids=str)

@@ -48,15 +48,19 @@ def fewer_cells(scene: str) -> list[str]:
     )
 
 
+ONE = ["-D", "volume.density=1"]
 FEW_PARAMETERS = "-D", "optimize={parameters: {density: {}, lights.0.direction: {}}}"
 
 
 def quick(command: str) -> list[str]:
     """The arguments of `command`, and those that make it quick."""
     _, name, *rest = shlex.split(command, comments=True)
+    ring, is_scene = ["--ring", "2"] if "--ring" in rest else [], rest[0].endswith(".yaml")
     added = {
         "optimize": lambda: ["--iterations", str(1 + ("--resume" in rest)), *fewer_cells(rest[0])],
-        "render": lambda: ["--ring", "2"] if "--ring" in rest else [],
+        "render": lambda: [*ring, *(fewer_cells(rest[0]) + ONE if is_scene else [])],
+        "check": lambda: fewer_cells(rest[0]),
+        "balance": lambda: fewer_cells(rest[0]),
         "reference": lambda: ["--spp", "4"],
         "gradcheck": lambda: ["--samples", "2", "-D", "ground=null", *FEW_PARAMETERS],
     }

@@ -28,11 +28,7 @@ CONFIGS = [
 tests/validate.
 """
 
-
-KINDS = [
-    *sorted((ROOT / "configs" / "kinds").glob("*.yaml")),
-    ROOT / "configs" / "ground.yaml",
-]
+KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
 
 
 def small(config: Path) -> Scene:
@@ -63,6 +59,7 @@ def test_every_phase_function_and_model_has_a_config() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from media import box_grid, make_camera, make_scene, random_values
+from media import box_grid, make_camera, make_scene, random_values, tensor
 from torch import Tensor
 
 from ddrecon.light.lights import BeamLight, DirectionalLight
@@ -15,10 +15,6 @@ from ddrecon.renderer import fluence, render
 from ddrecon.settings import RenderSettings
 
 AXES = (0.0, 0.0, -1.0), (0.3, -1.0, 0.2), (0.5, 0.4, 1.3)
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def length_in_box(direction: Tensor) -> float:

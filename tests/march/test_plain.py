@@ -17,6 +17,7 @@ from media import (
     march_rays,
     random_values,
     summed_series,
+    tensor,
 )
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
@@ -41,10 +42,6 @@ from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
 STEPS = (1, 8, 64)
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 LIGHTS: dict[str, list[Light]] = {

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, make_scene, random_values
+from media import box_grid, make_scene, random_values, tensor
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -16,10 +16,6 @@ from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 SHAPE = (4, 5, 6)
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def medium(seed: int, sigma_s: Tensor, g: float) -> Volume:

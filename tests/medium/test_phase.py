@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from media import box_grid, random_values, summed_series
+from media import box_grid, random_values, summed_series, tensor
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
@@ -18,10 +18,6 @@ from ddrecon.numerics.legendre import even_angles
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
-
-
-def tensor(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def scalar(value: float) -> Tensor:

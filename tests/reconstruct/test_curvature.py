@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import data_product, half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.losses import LOSSES, Target, compress, total_variation
@@ -67,7 +67,7 @@ def test_a_product_is_that_with_the_matrix_of_differences() -> None:
         way.copy_(curvature.join(part))
     changes = differences(scene, curvature, ways)
     weights = torch.cat([curvature.weights[v.name].expand(3, 4, 5).flatten() for v in scene.views])
-    found = torch.stack([curvature.data_product(way) for way in ways]) @ ways.T
+    found = torch.stack([data_product(curvature, way) for way in ways]) @ ways.T
     wanted = (changes * weights) @ changes.T
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
 
@@ -121,6 +121,6 @@ def test_products_are_those_of_a_symmetric_matrix() -> None:
     """Also with a transport round."""
     curvature = curvature_of(small_scene(torch.float64))
     one, other = random_values(2, curvature.size)
-    products = curvature.data_product(one), curvature.data_product(other)
+    products = data_product(curvature, one), data_product(curvature, other)
     assert float(other @ products[0]) == pytest.approx(float(one @ products[1]), rel=1e-9)
     assert float(one @ products[0]) > 0

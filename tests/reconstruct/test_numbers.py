@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import data_product, make_camera, make_scene, random_values
 
 from ddrecon.losses import Target
 from ddrecon.reconstruct.curvature import Curvature
@@ -59,6 +59,6 @@ def test_it_is_the_part_of_the_matrix_between_numbers(curvature: Curvature) -> N
     found = _sum_between(curvature.parameters, by_view, curvature.parameters)
     size = found.diagonal().sqrt()
     for ways in random_values(3, len(found)) - 0.5:
-        wanted = basis.T @ curvature.data_product(basis @ (ways / size))
+        wanted = basis.T @ data_product(curvature, basis @ (ways / size))
         # Solves for tangents and adjoints end at their tolerance.
         torch.testing.assert_close(found @ (ways / size) / size, wanted / size, rtol=0, atol=1e-5)

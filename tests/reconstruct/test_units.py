@@ -65,7 +65,7 @@ def scene_of(kind: str) -> Scene:
     ]
     settings = OptimizeSettings(
         SOUGHT[kind],
-        iterations=5,
+        iterations=3,
         noise=NoiseSettings(read=0.05),
         refine_at=(),
         views_per_iteration=0,

@@ -146,10 +146,7 @@ def test_values_by_height_are_linear_between_them_and_even_beyond(write: Write, 
     """A ramp that ends within the box, of one number and of colors."""
     gas = {"heights": [-0.25, 0.25], "values": [[1, 2, 3], 1]}
     density = {"heights": [-9, 9], "values": [0, 18]}
-    scene = load_scene(
-        write(volume((), density=density, sigma_a=gas, up=up)),
-        dtype=torch.float64,
-    )
+    scene = load_scene(write(volume((), density=density, sigma_a=gas, up=up)), dtype=torch.float64)
     medium, axis = scene.volume, "zyx".index(up)
     place = medium.grid.centers(medium.density)[axis]
     torch.testing.assert_close(medium.density, (place + 9).expand(4, 3, 2))

@@ -26,7 +26,7 @@ from tiny_scene import write_scene
 from ddrecon.cli.commands import main
 from ddrecon.run import run_folder
 
-SIGNALS = [*[signal.SIGKILL] * 4, signal.SIGTERM, signal.SIGINT]
+SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
 """What click says of an interrupt before the command has begun."""
 EXPECTED = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 130, signal.SIGINT: 130}

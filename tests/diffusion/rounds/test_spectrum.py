@@ -135,9 +135,7 @@ def test_a_round_shrinks_every_wave(degree: int, g: float):
         if degree == 7
         else [CUBES, (1.0, 1.0, 4.0), (1.0, 1.0, 20.0), (20.0, 1.0, 20.0), (0.2, 1.0, 5.0)]
     )
-    for spacing, depth, albedo in product(
-        shapes, (0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9, 0.9999)
-    ):
+    for spacing, depth, albedo in product(shapes, (0.01, 0.1, 1.0, 3.0, 6.7, 20.0), (0.5, 0.9999)):
         matrices, bound = rounds_of_waves(WAVES, np.array(spacing), g, degree, depth, albedo)
         eigenvalues = np.linalg.eigvals(matrices)
         left = float(np.abs(eigenvalues).max()), float(growth(eigenvalues, bound).max())
