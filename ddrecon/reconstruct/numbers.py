@@ -1,8 +1,9 @@
 """Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E10.2).
 
 They are few, and look alike: a camera's turn and its shift, a lamp and an exposure, and the level
-of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J, whose
-columns of J are tangents. It is found anew ever more rarely; derivatives are exact at every step.
+of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J. It sets how
+far they go, not where they come to rest: differences of pictures do, found anew ever more rarely.
+The derivative downhill is exact at every step.
 
 What is known of them without pictures are gauges, and how calibrations err. A gauge is a change of
 several parameters together that no picture shows, and that is not made: twice the exposure of all
@@ -13,22 +14,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.curvature import Curvature, change_of
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import has_slabs, own_views
-from ddrecon.renderer import LightField, solve_light
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
 from ddrecon.variables.values import with_values
@@ -175,7 +174,7 @@ class NumberSteps:
 
 
 def find_curvatures(
-    point: Point | Curvature,
+    point: Point,
     numbers: Sequence[Parameter],
     names: Sequence[str],
     weights: Mapping[str, Tensor],
@@ -183,40 +182,38 @@ def find_curvatures(
     """J^T W J at `point` of the views called `names`, between the `numbers` that each shows.
 
     Square matrices in float64, of all entries one after another. `weights` [3, h, w] are W of the
-    views that this rank renders. Columns of J are tangents; those of a number of one view are in
-    the light as it is.
+    views that this rank renders. Columns of J are differences of pictures; those of a number of one
+    view are in the light as it is.
     """
-    scene, values = point.scene, point.values
-    own = own_views(scene, names)
-    rendered = names if has_slabs(scene) else own
+    if not names:
+        return {}
+    own = own_views(point.scene, names)
+    rendered = names if has_slabs(point.scene) else own
     jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
-
-    def light_of(world: Scene) -> LightField:
-        return solve_light(world, SolveMemory(last=dict(point.solutions)))
-
-    def add_columns(p: Parameter, views: Sequence[str], light: LightField | None) -> None:
-        found: dict[str, list[Tensor]] = {name: [] for name in views}
-        for way in _ways(p, values[p.name]):
-            with forward_ad.dual_level():
-                moving = {p.name: forward_ad.make_dual(values[p.name], way)}
-                world = with_values(scene, {**values, **moving})
-                lit = light_of(world) if light is None else light
-                for name in views:
-                    found[name].append(change_of(lit, world, name))
-        for name, changes in found.items():
-            columns, count = torch.stack(changes), _count(p)
-            if len(columns) < count:  # all colors have changed at once
-                columns = columns * torch.eye(count).to(columns)[..., None, None]
-            jacobians[name].append(columns.flatten(1))
-
+    # Pictures differ by little: the light of each is solved closely, beginning where it is known.
+    diffusion, values = point.scene.diffusion, point.values
+    close = replace(diffusion, tolerance=min(diffusion.tolerance, tuning.CLOSE))
+    scene, memory = replace(point.scene, diffusion=close), SolveMemory(last=dict(point.solutions))
     with torch.no_grad():
-        is_lit = any(p.view in rendered for p in numbers if p.view is not None)
-        light = light_of(with_values(scene, values)) if is_lit else None
-        for p in numbers if rendered else ():
-            if p.view is None:
-                add_columns(p, rendered, None)
-            elif p.view in rendered:
-                add_columns(p, [p.view], light)
+        world = with_values(scene, values)
+        light = solve_light(world, memory)
+        pictures = {name: view_picture(light, world, world.view(name)) for name in rendered}
+        for p in numbers:
+            shown = [name for name in rendered if p.view in (None, name)]
+            changes: dict[str, list[Tensor]] = {name: [] for name in shown}
+            ways, lengths = _ways(point, p)
+            for way in ways if shown else ():
+                world, lit = with_values(scene, {**values, p.name: values[p.name] + way}), light
+                if p.view is None:
+                    lit = solve_light(world, SolveMemory(last=dict(memory.last)))
+                for name in shown:
+                    seen = view_picture(lit, world, world.view(name))
+                    changes[name].append(seen - pictures[name])
+            for name, found in changes.items():
+                columns = torch.stack(found)
+                if len(columns) < len(lengths):  # all colors have changed at once
+                    columns = columns * torch.eye(len(lengths)).to(columns)[..., None, None]
+                jacobians[name].append(columns.flatten(1) / lengths[:, None])
     matrices = []
     for name in names:
         size = sum(_count(p) for p in _shown_by(name, numbers))
@@ -274,13 +271,22 @@ def _gradient(p: Parameter, value: Tensor, gradient: Tensor) -> Tensor:
     return gradient.flatten().double().cpu()
 
 
-def _ways(p: Parameter, value: Tensor) -> Tensor:
-    """Changes [m, *shape] of `p` at its `value`: colors do not mix, so that all change at once."""
+def _ways(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
+    """Small changes [m, *shape] of `p` at `point`, and how far each of its entries goes [n].
+
+    They are parts of default rates, and go downwards at the upper bound. Colors do not mix, so that
+    all change at once.
+    """
+    value = point.values[p.name]
     if p.is_field:
-        return value[None]
+        lengths = value.new_full((_count(p),), -tuning.APART * tuning.LEVEL_RATE)
+        return (lengths[0] * value)[None], lengths
+    rate = torch.as_tensor(kind_of(p.name).rate(point.scene, p.name, value)).to(value)
+    lengths = tuning.APART * rate.expand(value.numel())
+    lengths = torch.where(value.flatten() + lengths > p.high, -lengths, lengths)
     if kind_of(p.name).is_color:
-        return torch.ones_like(value)[None]
-    return torch.eye(value.numel()).to(value).view(-1, *value.shape)
+        return lengths.view_as(value)[None], lengths
+    return lengths.diag().view(-1, *value.shape), lengths
 
 
 class Gauge:

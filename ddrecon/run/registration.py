@@ -17,6 +17,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, project
 from ddrecon.grid import Grid
 from ddrecon.losses import Target
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.renderer import LightField, view_picture
 from ddrecon.scene import Scene, View
@@ -27,8 +28,6 @@ STEPS = 8
 """At most; they end when one makes nothing better."""
 LEAST = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
-SMALL = 0.1
-"""The part of a rate over which slopes are differences."""
 FARTHEST = 40.0
 """No step is farther than so many rates, of a quarter of a pixel."""
 
@@ -51,8 +50,8 @@ def register(
 
     change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
     moved, picture = see_by(change)
-    ways = SMALL * unit
-    changes = torch.stack([(see_by(way)[1] - picture) / SMALL for way in ways.diag()])
+    ways = (tuning.APART * unit).diag()
+    changes = torch.stack([see_by(way)[1] - picture for way in ways]) / tuning.APART
     for _ in range(STEPS):
         fitted, response = fit_held_out(picture, view, target, sizes)
         psnr = float(target.psnr_of(fitted))
