@@ -66,7 +66,7 @@ from ddrecon.slabs.slab import Slab, own_slab, whole_of
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
 
-EXCHANGES = 2
+EXCHANGES = 4
 """How often it does where the volume repeats, and so little of it leaves sideways."""
 
 
