@@ -27,12 +27,12 @@ SHAPE, CELL = (6, 5, 7), 0.2
 STEEP, SLANTED, LOW = (-1.0, -3.0, 0.5), (-2.0, -2.5, -1.0), (-3.1, -1.0, 0.5)
 KINDS: dict[str, dict[str, Any]] = {
     "isotropic": {"travel": STEEP},
-    "fine angles": {"travel": SLANTED, "g": 0.6, "transport_rounds": 2, "degree": 5},
+    "fine angles": {"travel": SLANTED, "g": 0.6, "transport_rounds": 1, "degree": 5},
     "white sky": {"transport_rounds": 1, "ambient": (0.3,), "directional": None},
     "backward": {"travel": SLANTED, "g": -0.8, "transport_rounds": 1},
     "map": {"directional": None, "is_map": True, "model": "none"},
     "low sun": {"travel": LOW, "g": 0.4, "transport_rounds": 1},
-    "ground": {"travel": STEEP, "g": 0.4, "transport_rounds": 1, "has_ground": True},
+    "ground": {"travel": STEEP, "g": 0.4, "has_ground": True},
 }
 
 

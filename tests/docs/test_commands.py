@@ -17,7 +17,7 @@ from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -48,23 +48,22 @@ def fewer_cells(scene: str) -> list[str]:
     )
 
 
-ONE = ["-D", "volume.density=1"]
-FEW_PARAMETERS = "-D", "optimize={parameters: {density: {}, lights.0.direction: {}}}"
+ONE, NO_ROUNDS = ["-D", "volume.density=1"], ["-D", "diffusion.transport_rounds=0"]
+ONE_PARAMETER = ["--samples", "2", "-D", "optimize={parameters: {lights.0.direction: {}}}"]
 
 
 def quick(command: str) -> list[str]:
     """The arguments of `command`, and those that make it quick."""
     _, name, *rest = shlex.split(command, comments=True)
-    ring, is_scene = ["--ring", "2"] if "--ring" in rest else [], rest[0].endswith(".yaml")
     added = {
-        "optimize": lambda: ["--iterations", str(1 + ("--resume" in rest)), *fewer_cells(rest[0])],
-        "render": lambda: [*ring, *(fewer_cells(rest[0]) + ONE if is_scene else [])],
-        "check": lambda: fewer_cells(rest[0]),
-        "balance": lambda: fewer_cells(rest[0]),
-        "reference": lambda: ["--spp", "4"],
-        "gradcheck": lambda: ["--samples", "2", "-D", "ground=null", *FEW_PARAMETERS],
-    }
-    return [name, *rest, *(added[name]() if name in added else [])]
+        "optimize": ["--iterations", str(1 + ("--resume" in rest)), *NO_ROUNDS],
+        "render": ["--ring", "2"] if "--ring" in rest else [],
+        "reference": ["--spp", "4"],
+        "gradcheck": [*ONE_PARAMETER, *NO_ROUNDS, "-D", "ground=null"],
+    }.get(name, [])
+    if rest[0].startswith("configs"):
+        added += fewer_cells(rest[0]) + (ONE if name in ("render", "bench") else [])
+    return [name, *rest, *added]
 
 
 def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:

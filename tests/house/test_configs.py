@@ -18,6 +18,7 @@ from ddrecon.scene_file.schema import PhaseSection
 from ddrecon.settings import DiffusionSettings
 from ddrecon.variables.values import value_of, variable_names
 
+pytestmark = pytest.mark.usefixtures("few_directions")
 ROOT = Path(__file__).parents[2]
 CONFIGS = [
     config
@@ -59,7 +60,6 @@ def test_every_phase_function_and_model_has_a_config() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenImageIO") is None:

@@ -38,7 +38,6 @@ optimize:
     sigma_s: {field: true}
     g: {}
     lights.0.irradiance: {}
-    views.a.camera: {}
     views.c.camera: {}
     views.*.exposure: {}
     views.*.offset: {}
@@ -79,7 +78,7 @@ CELLS = "--share", "cells"
 
 
 def sure(ranks: int, output: str, *options: str) -> Job:
-    command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
+    command = ["uncertainty", "plain", "-o", output, "--engine", "torch"]
     roughly = ["--noise", "0.05", "--samples", "3", "--keep-samples"]
     return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
@@ -95,6 +94,7 @@ JOBS = {
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+    "plain": job(1, "plain", "-D", "diffusion.model=none"),
     "sure": sure(1, "sure", "--calibrate", "2"),
     "sure begun": sure(1, "doubts", "--calibrate", "1"),
     "sure of three": sure(3, "doubts", "--calibrate", "2", "--resume"),

@@ -157,5 +157,5 @@ def test_a_phase_function_that_scatters_backward() -> None:
     )
     scene = photographed(scene_of(volume, 3, 16))
     assert (
-        abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 140), "g")) + 0.802) < 0.02
+        abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 85), "g")) + 0.802) < 0.02
     )
