@@ -50,6 +50,7 @@ COMMANDS = {
     "hard": "ddrecon bench --hard",
     "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
     "uncertainty": "python benchmarks/uncertainty.py real --references FOLDER",
+    "next": "python benchmarks/uncertainty.py next",
     "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
     "pyshdom": "python benchmarks/pyshdom.py FOLDER/pyshdom",

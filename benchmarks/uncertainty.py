@@ -7,8 +7,8 @@
 held against its deviation. What FOLDER/uncertainty does not hold of pictures is traced by Mitsuba 3
 (extra `reference`) and kept there; without it there are those that we ship. FILE is a cloud of a
 large-eddy simulation, as AT3D has them (`ext_per_km` [x, y, z], `dx`, `dy`, `z` in km).
-`next`: a volume is reconstructed from four pictures, a fifth is proposed, and all that might be are
-really taken: where does the proposed one stand by the error that it leaves?
+`next`: four pictures are taken, a fifth is proposed, and all that might be are really taken: where
+does the proposed one stand by the error that it leaves?
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.turntable import place_turntable
 from ddrecon.uncertainty.deviations import EMPTY, Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
-from ddrecon.uncertainty.next_view import candidates_of, rank_views
+from ddrecon.uncertainty.next_view import CANDIDATES, rank_views
 
 ROOT = Path(__file__).parents[1]
 Known = tuple[Scene, Tensor]
@@ -174,14 +175,14 @@ def correlate_ranks(one: Tensor, other: Tensor) -> float:
     return float(torch.corrcoef(ranks)[0, 1])
 
 
-def try_next(name: str, path: Path, kept: int, samples: int) -> dict[str, Any]:
+def try_next(name: str, path: Path, kept: int) -> dict[str, Any]:
     """Where the view that is proposed stands among all, by the error of density that it leaves."""
     truth = read_density(path)
     scene = load_scene(ROOT / "configs" / "ball.yaml", overrides=["optimize.iterations=60"])
     volume, box = scene.volume, scene.volume.grid
     volume = replace(volume, density=resample(truth, box).to(volume.density))
     scene = replace(scene, views=[replace(v, mask=None) for v in scene.views[:kept]])
-    candidates = candidates_of(scene, "ring")[0].views
+    candidates = place_turntable(scene, scene.views[0], CANDIDATES)
     known = replace(scene, volume=volume, views=[*scene.views, *candidates])
     known = replace(known, diffusion=replace(known.diffusion, transport_rounds=4))
     with torch.no_grad():
@@ -190,23 +191,20 @@ def try_next(name: str, path: Path, kept: int, samples: int) -> dict[str, Any]:
     pictures += noise * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(0))
     views = [replace(v, image=p) for v, p in zip(known.views, pictures, strict=True)]
     scene = replace(scene, views=views[:kept])
-    deviations = experiment(finish(scene), 2)
-    ranked = rank_views(deviations, candidates_of(scene, "ring"), samples)
+    ranked = rank_views(scene, "ring")
     errors = {}
     for view in views[kept:]:
         found = finish(replace(scene, views=[*views[:kept], view])).current_scene().volume
         errors[view.name] = float((found.density - volume.density).square().mean().sqrt())
-    best = sorted(errors, key=lambda each: errors[each])
+    places = {each: at + 1 for at, each in enumerate(sorted(errors, key=lambda n: errors[n]))}
     tied = [each["name"] for each in ranked if each["is_tied"]]
     return {
         "volume": name,
-        "proposed": ranked[0]["name"],
-        "its place of 12": best.index(ranked[0]["name"]) + 1,
-        "tied with it": len(tied) - 1,
-        "places of these": ", ".join(str(best.index(each) + 1) for each in tied[1:]) or "-",
-        "error: proposed": f"{errors[ranked[0]['name']]:.4f}",
+        "its place of 12": places[tied[0]],
+        "places of those tied with it": ", ".join(str(places[each]) for each in tied[1:]) or "-",
+        "error of density with it": f"{errors[tied[0]]:.4f}",
         "mean of all": f"{sum(errors.values()) / len(errors):.4f}",
-        "best": f"{errors[best[0]]:.4f}",
+        "best": f"{min(errors.values()):.4f}",
     }
 
 
@@ -225,7 +223,6 @@ def main() -> None:
     parser.add_argument("--references", type=Path)
     parser.add_argument("--cloud", dest="clouds", type=Path, action="append", default=[])
     parser.add_argument("--calibrate", type=int, default=2)
-    parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--engine", default="auto")
     given = parser.parse_args()
     use_engine(given.engine)
@@ -236,7 +233,7 @@ def main() -> None:
 
     if given.kind == "next":
         chosen = {name: path for name, path in TRIED.items() if is_asked(name)}
-        print_rows(try_next(*each, kept=4, samples=given.samples) for each in chosen.items())
+        print_rows(try_next(*each, kept=4) for each in chosen.items())
         return
     cases = dict(known_cases(given.references, given.clouds))
     print_rows(

@@ -22,9 +22,11 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
 from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.tangents import varied
+from ddrecon.variables.values import with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -167,9 +169,17 @@ def render_tangent(
 
 
 def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
-    """J^T W J times `vector` (E11.1)."""
-    changes = curvature.tangents(vector)
-    return curvature.adjoint({name: curvature.weights[name] * changes[name] for name in changes})
+    """J^T W J times `vector` (E11.1): by a tangent and an adjoint."""
+    changes, weighted = curvature.split(vector), {}
+    with torch.no_grad(), forward_ad.dual_level():
+        pairs = {n: (value, changes[n]) for n, value in curvature.values.items()}
+        duals = {name: forward_ad.make_dual(*pair) for name, pair in pairs.items()}
+        world = with_values(curvature.scene, duals)
+        light_field = solve_light(world, curvature.new_memory())
+        for view in world.views:
+            change = forward_ad.unpack_dual(view_picture(light_field, world, view)).tangent
+            weighted[view.name] = curvature.weights[view.name] * change
+    return curvature.adjoint(weighted)
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:

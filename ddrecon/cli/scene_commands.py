@@ -289,7 +289,7 @@ def optimize(
     default=16,
     show_default=True,
     metavar="N",
-    help="Samples of what the experiments leave open, for --keep-samples and --next-view.",
+    help="Samples of what the experiments leave open, for --keep-samples.",
 )
 @click.option(
     "--noise",
@@ -303,8 +303,8 @@ def optimize(
 @click.option(
     "--next-view",
     type=click.Choice(["ring", "lights"]),
-    help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
-    "(ring), or in directional lights that are (lights).",
+    help="Which picture next? Rank twelve by how far off those taken they are, by the first camera: "
+    "turned around the volume (ring), or in directional lights that are (lights).",
 )
 @click.option("--tolerance", type=float, hidden=True)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
@@ -332,12 +332,9 @@ def uncertainty(
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
-    from ddrecon.uncertainty.next_view import FEWEST
 
     if tolerance is not None:
         warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
-    if next_view and samples < FEWEST:
-        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))

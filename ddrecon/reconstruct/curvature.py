@@ -1,8 +1,8 @@
-"""A run's second derivative by Gauss and Newton: products with J^T W J (E11.1).
+"""A run's second derivative by Gauss and Newton, J^T W J: what its factors are (E11.1).
 
 J is the derivative of all training pictures by all parameters, W how strongly each pixel counts.
-Nobody has the matrix: a product with J or J^T is one tangent or adjoint, view by view, in one light
-field, shared out over ranks. Its memory grows with the views by their pictures alone.
+Nobody has the matrix: a product with J^T is one adjoint, view by view, in one light field, shared
+out over ranks. Its memory grows with the views by their pictures alone.
 Parameters stand in one vector, entry by entry, in their own units and in their order.
 """
 
@@ -12,24 +12,15 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import share_pictures
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import with_values
-
-
-def change_of(light_field: LightField, world: Scene, name: str) -> Tensor:
-    """How the picture [3, h, w] of the view called `name` changes in `world`, of dual numbers."""
-    derivatives = world.optimize.derivatives if world.optimize else "all"
-    picture = view_picture(light_field, world, world.view(name), derivatives)
-    tangent = forward_ad.unpack_dual(picture).tangent
-    return torch.zeros_like(picture) if tangent is None else tangent.clone()
 
 
 class Curvature:
@@ -80,23 +71,6 @@ class Curvature:
         parts = vector.split([value.numel() for value in self.values.values()])
         named = zip(self.values.items(), parts, strict=True)
         return {name: part.view(value.shape) for (name, value), part in named}
-
-    def tangents(self, vector: Tensor, scene: Scene | None = None) -> dict[str, Tensor]:
-        """J times `vector`: how the picture [3, h, w] of each training view changes, by name.
-
-        Or those of the views of a `scene` of the same volume, whose own views and lights are known.
-        """
-        changes, scene = self.split(vector), scene or self.scene
-        known = [k for k in ("lights", "views") if getattr(scene, k) is not getattr(self.scene, k)]
-        with torch.no_grad(), forward_ad.dual_level():
-            duals = {
-                name: forward_ad.make_dual(value, changes[name])
-                for name, value in self.values.items()
-                if name.partition(".")[0] not in known
-            }
-            world = with_values(scene, duals)
-            light_field = solve_light(world, self.new_memory())
-            return share_pictures(scene, lambda view: change_of(light_field, world, view.name))
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

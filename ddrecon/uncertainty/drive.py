@@ -18,11 +18,10 @@ from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoint
 from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, remove_samples
-from ddrecon.scene import Scene
 from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 from ddrecon.uncertainty.folder import write_found
-from ddrecon.uncertainty.next_view import candidates_of, rank_views
+from ddrecon.uncertainty.next_view import rank_views
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,8 @@ def drive_uncertainty(
 
     An interrupt takes effect after an iteration of an experiment; `resume` goes on from there.
     """
+    # Before anything is removed: there may be nothing to rank.
+    views = rank_views(run.level.train, request.next_view) if request.next_view else []
     described, checkpoints = _describe(run, request), path / CHECKPOINTS
     state, began = None, perf_counter()
     if resume:
@@ -57,39 +58,32 @@ def drive_uncertainty(
         remove_samples(path)
     for folder in (path / "volumes", checkpoints):
         folder.mkdir(exist_ok=True)
-    found, candidates = _begin(run, from_first(state), request)
+    found = _begin(run, from_first(state), request)
 
     def keep() -> None:
         save_checkpoint(checkpoints, found.state() | {"seconds": perf_counter() - began}, described)
 
     try:
         _experiment(found, request.experiments, keep, is_quiet)
-        deviations = Deviations(found)
-        views = rank_views(deviations, candidates, request.samples)
     except RanksError as error:
         raise error.with_advice("what was done is kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
     kept = request.samples if request.has_samples else 0
-    return write_found(deviations, views, kept, path, perf_counter() - began)
+    return write_found(Deviations(found), views, kept, path, perf_counter() - began)
 
 
 def follow_uncertainty(run: Reconstruction, request: Request) -> None:
     """Does this rank's part of what `drive_uncertainty` does on the first, which alone writes."""
-    found, candidates = _begin(run, from_first(None), request)
+    found = _begin(run, from_first(None), request)
     _experiment(found, request.experiments, lambda: None, is_quiet=True)
-    rank_views(Deviations(found), candidates, request.samples)
 
 
-def _begin(
-    run: Reconstruction, state: dict[str, Any] | None, request: Request
-) -> tuple[Uncertainty, list[Scene]]:
-    # Before anything takes long: there may be nothing to rank.
-    candidates = candidates_of(run.level.train, request.next_view) if request.next_view else []
+def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) -> Uncertainty:
     found = Uncertainty(run, request.seed, request.noise)
     if state is not None:
         found.restore(state)
-    return found, candidates
+    return found
 
 
 def _experiment(

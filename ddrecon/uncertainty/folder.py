@@ -135,10 +135,10 @@ def _number(number: Mapping[str, float | None]) -> str:
 
 
 def _promise(view: Mapping[str, Any], place: int) -> str:
-    """What the picture at this `place` in the ranking may tell."""
+    """How far off the picture at this `place` in the ranking is."""
     tied = ", not to be distinguished from the first" if place and view["is_tied"] else ""
-    gain, error = 100 * view["gain"], 100 * view["error"]
-    return f"takes at least {gain:.1f} % of the variance (+- {error:.1f}){tied}"
+    nearest = "light" if view["light_directions"] else "picture"
+    return f"{view['angle']:.0f} degrees from the nearest {nearest}{tied}"
 
 
 def write_uncertainty_report(
