@@ -156,6 +156,4 @@ def test_a_phase_function_that_scatters_backward() -> None:
         phase=torch.tensor(-0.802),
     )
     scene = photographed(scene_of(volume, 3, 16))
-    assert (
-        abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 85), "g")) + 0.802) < 0.02
-    )
+    assert abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 85), "g")) + 0.802) < 0.02
