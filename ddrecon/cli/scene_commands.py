@@ -303,8 +303,8 @@ def optimize(
 @click.option(
     "--next-view",
     type=click.Choice(["ring", "lights"]),
-    help="Which picture next? Rank twelve by how far off those taken they are. By the first camera, "
-    "it is turned around the volume (ring), or directional lights are (lights).",
+    help="Which picture next? Rank twelve by how far off those taken they are. By the first "
+    "camera: it is turned around the volume (ring), or directional lights are (lights).",
 )
 @click.option("--tolerance", type=float, hidden=True)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")

@@ -212,9 +212,11 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         chosen = settings.parameters[name]
         rate, unit = chosen.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
         parameters.append(Parameter(name, chosen, rate, start, scene.volume.grid, unit))
-    # Lights wait for fields alone, and not for those whose level is moved with the lights (E10.2).
+    # Lights wait for fields, emission for others that are lit; none for those whose level is moved
+    # with the lights (E10.2).
     has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
-    if has_levels or not any(parameter.is_field for parameter in parameters):
-        for parameter in parameters:
+    for parameter in parameters:
+        others = [other for other in parameters if other.is_field and other is not parameter]
+        if has_levels or not others or (parameter.is_field and not scene.lights):
             parameter.release = 0.0
     return parameters

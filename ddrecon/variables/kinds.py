@@ -145,8 +145,9 @@ class Kind:
     vector points matters, and a step keeps its length. `tv` is the default weight of total
     variation, taken of what `losses.compress` makes of one that `is_compressed`;
     `difference_steps` are those of finite differences. `release` is the part of a run after which
-    the variable begins to move where fields are optimized, of which a lamp would learn wrong things
-    while they are empty. Its rate rises over a warm-up by the power `rise`.
+    the variable begins to move where other fields are optimized: a lamp would learn wrong things
+    while they are empty, and emission, where lights shine, stand for what is lit. Its rate rises
+    over a warm-up by the power `rise`.
     """
 
     rate: Rate
@@ -190,6 +191,8 @@ KINDS: Mapping[str, Kind] = {
         is_compressed=True,
         # A first step lights all cells, and they shine together: it must not outshine the pictures.
         rise=3.0,
+        # What is lit could as well glow: density comes first.
+        release=0.1,
     ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
