@@ -124,7 +124,11 @@ def write_scene(copy: Path, folder: Path) -> None:
         # 1 on level ground
         "lights": [{"type": "directional", "direction": SUN, "irradiance": -1 / SUN[2]}],
         "views": views,
-        "optimize": {"iterations": 150, "parameters": {"density": {"init": 0, "tv": 1e-2}}},
+        "optimize": {
+            "iterations": 150,
+            "refine_at": [0.15, 0.3],
+            "parameters": {"density": {"init": 0}},
+        },
     }
     (folder / "scene.yaml").write_text(json.dumps(scene))  # JSON is YAML
 
