@@ -40,33 +40,23 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     outermost centers' these are the mean. Where a slab is cut, and along an axis of a single cell,
     light stays as it is as well.
     """
-    grid, extinction, named = emission.grid, emission.extinction, emission.fields
-    sizes = [len(field) for field in named.values()]
-    cells = torch.cat(list(named.values()))
-    is_line = [_is_line(grid, *face) for face in FACES]
-    is_light = [_is_light(name) for name, field in named.items() for _ in range(len(field))]
-    # One row a face, one number a channel.
-    lines = _lines(tuple(is_line), tuple(is_light), cells.dtype, cells.device)
-    last, goal = (one.split(sizes) for one in _Outside.apply(cells, lines))
-    outside = list[Tensor]()
-    for name, layer, line in zip(named, last, goal, strict=True):
-        if not any(is_line) or not _is_light(name):
-            outside.append(layer)
-        elif name == "diffuse":
-            scale = extinction.scale[: len(layer)].view(-1, 1)
-            share = thinness(grid, scale * last[0][: len(layer)], OPAQUE)
-            outside.append(torch.lerp(layer, line, share))
-        else:
+    grid, extinction = emission.grid, emission.extinction
+    is_line = tuple(_is_line(grid, *face) for face in FACES)
+    extended, matter = dict[str, Tensor](), list[Tensor]()
+    for name, field in emission.fields.items():
+        lines = is_line if name == "diffuse" or name.startswith("mass ") else (False,) * len(FACES)
+        outside, line = _Outside.apply(field, lines)
+        matter = matter or [outside]
+        if any(lines) and name == "diffuse":
+            scale = extinction.scale[: len(field)].view(-1, 1)
+            share = thinness(grid, scale * matter[0][: len(field)], OPAQUE)
+            outside = torch.lerp(outside, line, share)
+        elif any(lines):
             lit = shine_through(emission.beams[int(name.split()[1])], grid)
             shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
-            outside.append(shade * _limit(layer, line, extinction.mass_bound))
-    longer = _WithOutside.apply(axis, lines, cells, torch.cat(outside))
-    return dict(zip(named, longer.split(sizes), strict=True))
-
-
-def _is_light(name: str) -> bool:
-    """Whether the field of that `name` goes on, linearly, up to faces."""
-    return name == "diffuse" or name.startswith("mass ")
+            outside = shade * _limit(outside, line, extinction.mass_bound)
+        extended[name] = _WithOutside.apply(axis, lines, field, outside)
+    return extended
 
 
 def _is_line(grid: Grid, axis: int, side: int) -> bool:
@@ -96,24 +86,37 @@ def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
 
 
 @remember
-def _lines(
-    is_line: Sequence[bool], is_light: Sequence[bool], dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """1 for each face and channel of light that goes on there, else 0: [6, C, 1, 1]."""
-    lines = torch.outer(torch.tensor(is_line), torch.tensor(is_light))
-    return lines.to(device, dtype)[..., None, None]
+def _places(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Where cells outside of those of `shape` stand in a field with a layer more [M]."""
+    is_outside = torch.ones([count + 2 for count in shape], dtype=torch.bool, device=device)
+    is_outside[1:-1, 1:-1, 1:-1] = False
+    return is_outside.flatten().nonzero()[:, 0]
 
 
 @remember
-def _places(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Where cells outside of those of `shape` stand in a field with a layer more, and where the
-    outermost cells stand that are next to them: [2, M].
+def _parts(
+    shape: tuple[int, ...], lines: Sequence[bool], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which of cells of `shape` [E] those outside [E] are made of, of `_places`, and how much [E].
+
+    They are as the nearest, and on `lines` on the one through that and the one before it.
     """
-    longer = [count + 2 for count in shape]
-    numbers = torch.arange(math.prod(longer), device=device).view(longer)
-    near = [torch.arange(n + 2, device=device).clamp(1, n) for n in shape]
-    nearest = numbers[near[0][:, None, None], near[1][:, None], near[2]]
-    return torch.stack([numbers, nearest])[:, numbers != nearest]
+    near, much = list[list[Tensor]](), list[list[Tensor]]()
+    for count, ends in zip(shape, (lines[:2], lines[2:4], lines[4:]), strict=True):
+        nearest = torch.arange(-1, count + 1, device=device).clamp(0, count - 1)
+        before, line = nearest.clone(), torch.zeros(count + 2, dtype=dtype, device=device)
+        before[0], before[-1] = min(1, count - 1), max(count - 2, 0)
+        line[0], line[-1] = ends[0] / 2, ends[1] / 2
+        near.append([nearest, before])
+        much.append([1 + line, -line])
+    outside, found = _places(shape, device), list[Tensor]()
+    for z, y, x in product(range(2), repeat=3):
+        cells = near[0][z][:, None, None] * shape[1] + near[1][y][:, None]
+        cells = (cells * shape[2] + near[2][x]).flatten()[outside]
+        parts = (much[0][z][:, None, None] * much[1][y][:, None] * much[2][x]).flatten()[outside]
+        places = parts.nonzero()[:, 0]
+        found += [cells[places], places, parts[places]]
+    return torch.cat(found[::3]), torch.cat(found[1::3]), torch.cat(found[2::3])
 
 
 def _shade(grid: Grid, shares: Tensor) -> Tensor:
@@ -123,24 +126,29 @@ def _shade(grid: Grid, shares: Tensor) -> Tensor:
         for count, (low, high) in zip(grid.shape, shares.view(3, 2), strict=True)
     )
     every = z[:, None, None] * y[:, None] * x
-    return every.flatten()[_places(tuple(grid.shape), shares.device)[0]]
+    return every.flatten()[_places(tuple(grid.shape), shares.device)]
 
 
 class _Outside(torch.autograd.Function):
-    """Of `cells` [C, z, y, x] what is next to cells outside, and what these have on `lines`.
+    """What `cells` [C, z, y, x] are next to those outside, and what these are on `lines`: [C, M].
 
-    [C, M] each. Linear: a line goes through the two outermost centers, and ends on the face.
+    Linear. The second is the first where there are no lines.
     """
 
     @staticmethod
-    def forward(cells: Tensor, lines: Tensor) -> tuple[Tensor, Tensor]:
-        longer = _longer(cells)
-        for face, line in zip(FACES, lines / 2, strict=True):
-            outer, last, before = _layers(longer, face)
-            torch.lerp(last, before, -line, out=outer)
-        outside, nearest = _places(tuple(cells.shape[1:]), cells.device)
-        flat = longer.flatten(1)
-        return flat[:, nearest], flat[:, outside]
+    def forward(cells: Tensor, lines: Sequence[bool]) -> tuple[Tensor, ...]:
+        shape, flat, found = tuple(cells.shape[1:]), cells.flatten(1), list[Tensor]()
+        count = len(_places(shape, cells.device))
+        for ends in ((False,) * len(FACES), lines) if any(lines) else (lines,):
+            near, places, parts = _parts(shape, ends, cells.dtype, cells.device)
+            if any(ends):
+                whole = cells.new_zeros(len(cells), count)
+                found.append(
+                    whole.scatter_add_(1, places.expand(len(cells), -1), flat[:, near] * parts)
+                )
+            else:
+                found.append(flat[:, near])
+        return found[0], found[-1] if len(found) > 1 else cells.new_empty(0)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -148,20 +156,18 @@ class _Outside(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor, None]:
-        total = bars[0].new_zeros(ctx.shape)
-        outside = _places(tuple(ctx.shape[1:]), total.device)[0]
-        for bar, lines in zip(bars, (0 * ctx.lines, ctx.lines / 2), strict=True):
-            longer = _longer(torch.zeros_like(total))
-            longer.view(len(bar), -1)[:, outside] = bar
-            for face, line in reversed(list(zip(FACES, lines, strict=True))):
-                outer, last, before = _layers(longer, face)
-                last.addcmul_(outer, 1 + line)
-                before.addcmul_(outer, line, value=-1)
-            total += longer[:, 1:-1, 1:-1, 1:-1]
-        return total, None
+        shape, total = (
+            tuple(ctx.shape[1:]),
+            bars[0].new_zeros(len(bars[0]), math.prod(ctx.shape[1:])),
+        )
+        for bar, ends in zip(bars, ((False,) * len(FACES), ctx.lines), strict=True):
+            if bar.numel():
+                near, places, parts = _parts(shape, ends, bar.dtype, bar.device)
+                total.scatter_add_(1, near.expand(len(bar), -1), bar[:, places] * parts)
+        return total.view(ctx.shape), None
 
     @staticmethod
-    def jvp(ctx: Any, change: Tensor, _: None) -> tuple[Tensor, Tensor]:
+    def jvp(ctx: Any, change: Tensor, _: None) -> tuple[Tensor, ...]:
         return _Outside.forward(change, ctx.lines)
 
 
@@ -172,13 +178,14 @@ class _WithOutside(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(axis: int | None, lines: Tensor, cells: Tensor, outside: Tensor) -> Tensor:
-        longer = _longer(cells)
-        longer.view(len(cells), -1)[:, _places(tuple(cells.shape[1:]), cells.device)[0]] = outside
-        for face, line in zip(FACES, lines, strict=True):
-            if face[0] != axis:
-                outer, last, _ = _layers(longer, face)
-                outer.lerp_(last, -line)
+    def forward(axis: int | None, lines: Sequence[bool], cells: Tensor, outside: Tensor) -> Tensor:
+        longer = cells.new_empty(len(cells), *(count + 2 for count in cells.shape[1:]))
+        longer[:, 1:-1, 1:-1, 1:-1] = cells
+        longer.view(len(cells), -1)[:, _places(tuple(cells.shape[1:]), cells.device)] = outside
+        for face, is_line in zip(FACES, lines, strict=True):
+            if is_line and face[0] != axis:
+                outer, last = _layers(longer, face)
+                outer.mul_(2).sub_(last)
         return longer
 
     @staticmethod
@@ -188,12 +195,12 @@ class _WithOutside(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> tuple[Any, ...]:
         longer = bar.clone()
-        for face, line in reversed(list(zip(FACES, ctx.lines, strict=True))):
-            if face[0] != ctx.axis:
-                outer, last, _ = _layers(longer, face)
-                last.addcmul_(outer, line, value=-1)
-                outer.mul_(1 + line)
-        outside = _places(tuple(ctx.shape[1:]), bar.device)[0]
+        for face, is_line in reversed(list(zip(FACES, ctx.lines, strict=True))):
+            if is_line and face[0] != ctx.axis:
+                outer, last = _layers(longer, face)
+                last -= outer
+                outer *= 2
+        outside = _places(tuple(ctx.shape[1:]), bar.device)
         return None, None, longer[:, 1:-1, 1:-1, 1:-1], longer.flatten(1)[:, outside]
 
     @staticmethod
@@ -201,21 +208,13 @@ class _WithOutside(torch.autograd.Function):
         ctx: Any, _axis: None, _lines: None, cells: Tensor | None, outside: Tensor | None
     ) -> Tensor:
         like = next(one for one in (cells, outside) if one is not None)
-        count = _places(tuple(ctx.shape[1:]), like.device).shape[1]
+        count = len(_places(tuple(ctx.shape[1:]), like.device))
         cells = like.new_zeros(ctx.shape) if cells is None else cells
         outside = like.new_zeros(len(cells), count) if outside is None else outside
         return _WithOutside.forward(ctx.axis, ctx.lines, cells, outside)
 
 
-def _longer(cells: Tensor) -> Tensor:
-    """`cells` [C, z, y, x] with a layer more on each side, which are zero."""
-    longer = cells.new_zeros(len(cells), *(count + 2 for count in cells.shape[1:]))
-    longer[:, 1:-1, 1:-1, 1:-1] = cells
-    return longer
-
-
 def _layers(longer: Tensor, face: tuple[int, int]) -> list[Tensor]:
-    """The layer on a face and the two before it, as views; of one layer of cells that, twice."""
+    """The layer on a face and the one before it, as views."""
     axis, side = face
-    places = 0, 1, 2 if longer.shape[1 + axis] > 3 else 1
-    return [longer.select(1 + axis, -1 - k if side else k) for k in places]
+    return [longer.select(1 + axis, -1 - k if side else k) for k in range(2)]
