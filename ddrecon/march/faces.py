@@ -55,7 +55,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
             lit = shine_through(emission.beams[int(name.split()[1])], grid)
             shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
             outside = shade * _limit(outside, line, extinction.mass_bound)
-        extended[name] = _WithOutside.apply(axis, lines, field, outside)
+        extended[name] = _WithOutside.apply(axis, lines, field, outside.to(field))
     return extended
 
 
