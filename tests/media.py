@@ -21,10 +21,10 @@ from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
-from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.tangents import varied
 from ddrecon.variables.values import with_values
 

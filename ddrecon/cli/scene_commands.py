@@ -344,7 +344,8 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, experiments, samples, noise, next_view, has_samples)
+    kept = samples if has_samples else 0
+    request = Request(session.seed, experiments, kept, noise, next_view)
     if not is_first():
         follow_uncertainty(taken, request)
         return

@@ -31,6 +31,8 @@ OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
 FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order in which layers are added."""
+NOWHERE = (False,) * len(FACES)
+"""At none of them."""
 
 
 def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
@@ -44,17 +46,20 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     is_line = tuple(_is_line(grid, *face) for face in FACES)
     extended, matter = dict[str, Tensor](), list[Tensor]()
     for name, field in emission.fields.items():
-        lines = is_line if name == "diffuse" or name.startswith("mass ") else (False,) * len(FACES)
-        outside, line = _Outside.apply(field, lines)
+        is_light = any(is_line) and (name == "diffuse" or name.startswith("mass "))
+        outside = _Outside.apply(field, NOWHERE)
         matter = matter or [outside]
-        if any(lines) and name == "diffuse":
-            scale = extinction.scale[: len(field)].view(-1, 1)
-            share = thinness(grid, scale * matter[0][: len(field)], OPAQUE)
-            outside = torch.lerp(outside, line, share)
-        elif any(lines):
-            lit = shine_through(emission.beams[int(name.split()[1])], grid)
-            shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
-            outside = shade * _limit(outside, line, extinction.mass_bound)
+        if is_light:
+            line = _Outside.apply(field, is_line)
+            if name == "diffuse":
+                scale = extinction.scale[: len(field)].view(-1, 1)
+                share = thinness(grid, scale * matter[0][: len(field)], OPAQUE)
+                outside = torch.lerp(outside, line, share)
+            else:
+                lit = shine_through(emission.beams[int(name.split()[1])], grid)
+                shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
+                outside = shade * _limit(outside, line, extinction.mass_bound)
+        lines = is_line if is_light else NOWHERE
         extended[name] = _WithOutside.apply(axis, lines, field, outside.to(field))
     return extended
 
@@ -130,45 +135,35 @@ def _shade(grid: Grid, shares: Tensor) -> Tensor:
 
 
 class _Outside(torch.autograd.Function):
-    """What `cells` [C, z, y, x] are next to those outside, and what these are on `lines`: [C, M].
-
-    Linear. The second is the first where there are no lines.
+    """What stands outside of `cells` [C, z, y, x], [C, M]: linear, and what is nearest but on
+    `lines`.
     """
 
     @staticmethod
-    def forward(cells: Tensor, lines: Sequence[bool]) -> tuple[Tensor, ...]:
-        shape, flat, found = tuple(cells.shape[1:]), cells.flatten(1), list[Tensor]()
-        count = len(_places(shape, cells.device))
-        for ends in ((False,) * len(FACES), lines) if any(lines) else (lines,):
-            near, places, parts = _parts(shape, ends, cells.dtype, cells.device)
-            if any(ends):
-                whole = cells.new_zeros(len(cells), count)
-                found.append(
-                    whole.scatter_add_(1, places.expand(len(cells), -1), flat[:, near] * parts)
-                )
-            else:
-                found.append(flat[:, near])
-        return found[0], found[-1] if len(found) > 1 else cells.new_empty(0)
+    def forward(cells: Tensor, lines: Sequence[bool]) -> Tensor:
+        shape = tuple(cells.shape[1:])
+        near, places, parts = _parts(shape, lines, cells.dtype, cells.device)
+        return _add_up(cells.flatten(1), near, places, parts, len(_places(shape, cells.device)))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
         ctx.shape, ctx.lines = inputs[0].shape, inputs[1]
 
     @staticmethod
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor, None]:
-        shape, total = (
-            tuple(ctx.shape[1:]),
-            bars[0].new_zeros(len(bars[0]), math.prod(ctx.shape[1:])),
-        )
-        for bar, ends in zip(bars, ((False,) * len(FACES), ctx.lines), strict=True):
-            if bar.numel():
-                near, places, parts = _parts(shape, ends, bar.dtype, bar.device)
-                total.scatter_add_(1, near.expand(len(bar), -1), bar[:, places] * parts)
-        return total.view(ctx.shape), None
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
+        shape = tuple(ctx.shape[1:])
+        near, places, parts = _parts(shape, ctx.lines, bar.dtype, bar.device)
+        return _add_up(bar, places, near, parts, math.prod(shape)).view(ctx.shape), None
 
     @staticmethod
-    def jvp(ctx: Any, change: Tensor, _: None) -> tuple[Tensor, ...]:
+    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
         return _Outside.forward(change, ctx.lines)
+
+
+def _add_up(values: Tensor, taken: Tensor, put: Tensor, parts: Tensor, count: int) -> Tensor:
+    """`parts` [E] of the `values` [C, ...] that are `taken` [E], summed where they are `put`."""
+    total = values.new_zeros(len(values), count)
+    return total.scatter_add_(1, put.expand(len(values), -1), values[:, taken] * parts)
 
 
 class _WithOutside(torch.autograd.Function):

@@ -1,9 +1,9 @@
 """Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E10.2).
 
 They are few, and look alike: a camera's turn and its shift, a lamp and an exposure, and the level
-of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J. It sets how
-far they go, not where they come to rest: differences of pictures do, found anew ever more rarely.
-The derivative downhill is exact at every step.
+of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J. The matrix
+decides how far a step goes, not where steps end: so J is made of differences of pictures, and found
+anew ever more rarely. The gradient is exact at every step.
 
 What is known of them without pictures are gauges, and how calibrations err. A gauge is a change of
 several parameters together that no picture shows, and that is not made: twice the exposure of all

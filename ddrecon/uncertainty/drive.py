@@ -26,7 +26,7 @@ from ddrecon.uncertainty.next_view import rank_views
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: so many `experiments`, and `samples` of what they leave open.
+    """What is asked for: so many `experiments`, and `samples` written of what is left open.
 
     `noise` is that of all pictures, if their scene is not to say; `next_view` what to rank.
     """
@@ -36,7 +36,6 @@ class Request:
     samples: int
     noise: Noise | None = None
     next_view: str | None = None
-    has_samples: bool = False
 
 
 def drive_uncertainty(
@@ -69,8 +68,8 @@ def drive_uncertainty(
         raise error.with_advice("what was done is kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
-    kept = request.samples if request.has_samples else 0
-    return write_found(Deviations(found), views, kept, path, perf_counter() - began)
+    seconds = perf_counter() - began
+    return write_found(Deviations(found), views, request.samples, path, seconds)
 
 
 def follow_uncertainty(run: Reconstruction, request: Request) -> None:

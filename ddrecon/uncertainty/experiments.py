@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.pictures.noise import LEAST, Noise
-from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -23,6 +22,7 @@ from ddrecon.reconstruct.setup import given_noise
 from ddrecon.reconstruct.shares import share_pictures
 from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene
+from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import with_values
 
 MORE_ROUNDS = 3

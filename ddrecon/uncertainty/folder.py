@@ -98,7 +98,7 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
         ),
         *(f"{name}: {_number(number)}" for name, number in record["numbers"].items()),
         *(
-            f"{'  then ' if place else 'next view: '}{view['name']} {_promise(view, place)}"
+            f"{'  then ' if place else 'next view: '}{view['name']} {_describe_angle(view, place)}"
             for place, view in enumerate(record["next_views"])
         ),
         record["assumed"],
@@ -134,7 +134,7 @@ def _number(number: Mapping[str, float | None]) -> str:
     return f"{number['value']:.5g} +- {known}"
 
 
-def _promise(view: Mapping[str, Any], place: int) -> str:
+def _describe_angle(view: Mapping[str, Any], place: int) -> str:
     """How far off the picture at this `place` in the ranking is."""
     tied = ", not to be distinguished from the first" if place and view["is_tied"] else ""
     nearest = "light" if view["light_directions"] else "picture"
@@ -153,7 +153,10 @@ def write_uncertainty_report(
         rows = [(name, _number(number)) for name, number in record["numbers"].items()]
         sections.append(section("Numbers", *_bars(record["numbers"]), table(["", ""], rows)))
     if record["next_views"]:
-        rows = [(each["name"], _promise(each, at)) for at, each in enumerate(record["next_views"])]
+        rows = [
+            (each["name"], _describe_angle(each, at))
+            for at, each in enumerate(record["next_views"])
+        ]
         sections.append(section("Next picture", table(["picture", ""], rows)))
     sections.append(section("How", paragraph(record["assumed"])))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"

@@ -29,8 +29,9 @@ def rank_views(scene: Scene, kind: str) -> list[dict[str, Any]]:
     """What `uncertainty.json` says of pictures that `scene` may get, best first.
 
     All are by its first camera: `ring`: it is turned around the volume; `lights`: the directional
-    lights are. `angle` [degrees] is how far off the nearest picture it looks from, or the nearest
-    light shines. Raises UsageError for lights where there are none.
+    lights are. Of each: `name`; `angle` [degrees], how far off the nearest picture it looks from,
+    or the nearest light shines; `matrix` [4, 4], camera to world; `light_directions` [n, 3]; and
+    whether it `is_tied` with the best. Raises UsageError for lights where there are none.
     """
     first, ranked = scene.views[0], list[dict[str, Any]]()
     suns = [light.direction for light in scene.lights if isinstance(light, DirectionalLight)]

@@ -1,9 +1,11 @@
 """`ddrecon uncertainty --next-view`: pictures by how far off those taken they are."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import Result
 
@@ -25,7 +27,7 @@ def test_cameras_and_lights_are_ranked(
         stdout = succeed(*sure, "--resume").stdout
         views = json.loads(Path(kind, "uncertainty.json").read_text())["next_views"]
         angles = [view["angle"] for view in views]
-        # The first candidate is what there is, and the third is opposite.
+        # One candidate is what there is.
         assert angles == sorted(angles, reverse=True) and views[0]["is_tied"]
         assert angles[-1] == pytest.approx(0, abs=0.1) and not views[-1]["is_tied"]
         told = stdout.count("not to be distinguished from the first")
@@ -39,5 +41,10 @@ def test_cameras_and_lights_are_ranked(
     # All travel as far down as the first, which is the scene's.
     ways = [view["light_directions"][0] for view in found["lights"].values()]
     assert {round(way[1] - ways[0][1], 5) for way in ways} == {0}
+    given = found["lights"]["light_000"]["light_directions"][0]
+    for view in found["lights"].values():
+        cosine = math.cos(math.radians(view["angle"]))
+        dot = np.dot(view["light_directions"][0], given) / np.dot(given, given)
+        assert cosine == pytest.approx(dot, abs=1e-5)
     for places in (away, ways):
         assert len({(round(x, 4), round(z, 4)) for x, _, z in places}) == 4

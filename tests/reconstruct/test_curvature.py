@@ -8,12 +8,12 @@ from media import data_product, half_empty, make_camera, make_scene, random_valu
 from torch import Tensor
 
 from ddrecon.losses import LOSSES, Target, compress, total_variation
-from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import stiffness_diagonal
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import ParameterSettings
+from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (3, 3, 3)

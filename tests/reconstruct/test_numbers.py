@@ -8,11 +8,11 @@ from media import data_product, make_camera, make_scene, random_values
 
 from ddrecon.losses import Target
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.numbers import Point, _sum_between, find_curvatures, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
+from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import value_of
 
 NAMES = (
