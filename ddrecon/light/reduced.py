@@ -194,5 +194,5 @@ def _lit_skies(lights: Sequence[object]) -> list[Sky]:
     return [
         sky
         for sky in skies
-        if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())
+        if len(sky.travel) and (is_varied(sky.irradiance) or bool((sky.irradiance != 0).any()))
     ]

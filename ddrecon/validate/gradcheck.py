@@ -13,6 +13,7 @@ converge slowly.
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +27,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError, UsageError, suggestion
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
-from ddrecon.renderer import render_each
+from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import (
@@ -39,6 +40,8 @@ from ddrecon.variables.values import (
 
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
+CLOSE = 1e-8
+"""Where differences agree so closely, no shorter step is tried."""
 NEGLIGIBLE = 1e-6
 """Errors are relative to the derivative they are of, or to this part of the parameter's largest
 where that is more. What the last digits of the loss can make is no error.
@@ -217,7 +220,7 @@ def _check_along(
     shorter = [steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
     for index, step in enumerate((*steps, *shorter)):
         is_usual, difference, error = index < len(steps), math.nan, math.nan
-        if not is_usual and min(tried)[0] <= AGREE_DIFFERENCES:
+        if tried and min(tried)[0] <= (CLOSE if is_usual else AGREE_DIFFERENCES):
             break
         # A step that leaves what is physical may have no solution.
         with contextlib.suppress(SolveError):
@@ -300,9 +303,15 @@ def loss_at(
     memory = SolveMemory(is_warm=False)
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
 
+    @functools.cache
+    def light_at_point() -> LightField:
+        return solve_light(with_values(exact, point), memory)
+
     def loss(values: Mapping[str, Tensor]) -> Tensor:
         changed = with_values(exact, {**point, **values})
-        images = render_each(changed, [changed.view(view.name) for view in views], memory)
+        is_of_views = all(name.startswith("views.") for name in values)
+        light = light_at_point() if is_of_views else solve_light(changed, memory)
+        images = [view_picture(light, changed, changed.view(view.name)) for view in views]
         losses = [
             Target.of(target, view.mask, kind, view.noise).loss_of(image)
             for image, target, view in zip(images, targets, views, strict=True)
