@@ -1,7 +1,4 @@
-"""What every test has: a seed of its own, one thread, and commands that run in this process.
-
-The torch engine runs unless a test, or the environment, asks for another.
-"""
+"""What every test has: a seed, one thread, the torch engine, and commands in this process."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -76,9 +73,7 @@ def suffix(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def run(folder: Path) -> Callable[..., Result]:
-    """Runs a command in the current folder, which the fixture `folder` of the tests has made; a
-    bug's exception is not swallowed.
-    """
+    """Runs a command in the current folder, which `folder` made; a bug's exception is raised."""
 
     def run_command(*arguments: str) -> Result:
         result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])

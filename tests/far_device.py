@@ -137,10 +137,7 @@ def _near(value: Any) -> Any:
 
 @contextlib.contextmanager
 def near_kernels() -> Iterator[None]:
-    """Fused kernels that are launched there run on the processor, and cut items as there.
-
-    Solves and sweeps take a GPU's ways.
-    """
+    """Fused kernels launched there run on the processor; solves and sweeps take a GPU's ways."""
     import warp as wp
 
     from ddrecon.diffusion.rounds import sweep

@@ -1,7 +1,4 @@
-"""Small random media, operators, cameras and scenes.
-
-Every test states what matters to it and nothing else.
-"""
+"""Small random media, operators, cameras and scenes."""
 
 import math
 from collections.abc import Callable
@@ -87,9 +84,7 @@ def make_scene(
     emission: Tensor | None = None,
     **diffusion: Any,
 ) -> Scene:
-    """A scene in the precision of `density`, solved as closely as that precision allows; lights
-    that are None are left out. Without transport rounds, unless `diffusion` asks for some.
-    """
+    """A scene in the precision of `density`, solved closely; without rounds, unless asked for."""
     grid = grid or box_grid((density.shape[0], density.shape[1], density.shape[2]))
     tensor = density.new_tensor
     sigma_a, sigma_s = (
@@ -124,9 +119,7 @@ def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator
 
 
 def dense_matrix(operator: Operator) -> Tensor:
-    """The matrix `[C, n, n]` of `operator`, written with loops and flat indices: a slow twin that
-    shares no code with it.
-    """
+    """The matrix `[C, n, n]` of `operator`, with loops and flat indices: a slow twin."""
     colors, *shape = operator.loss.shape
     strides = (shape[1] * shape[2], shape[2], 1)
     matrix = torch.zeros(colors, math.prod(shape), math.prod(shape), dtype=operator.loss.dtype)
@@ -183,9 +176,6 @@ def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
-    """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`.
-
-    A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
-    """
+    """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`."""
     weights = peaked_series(seen.phase, seen.degree, depth[..., None])
     return (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)

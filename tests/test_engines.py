@@ -1,7 +1,4 @@
-"""Both engines compute the same images and the same derivatives, whatever the scene.
-
-Of each kind of scene in configs/ in 64 bits, with fewer cells and pixels, and of random ones.
-"""
+"""Both engines compute the same images and derivatives, of configs and of random scenes."""
 
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -45,10 +42,7 @@ def variables_of(scene: Scene) -> list[str]:
 
 
 def outcome(scene: Scene, names: Sequence[str], engine: str, first: int = 0) -> list[Tensor]:
-    """The images, and the derivatives by `names` of a sum of their pixels, each by its weight.
-
-    Weights are drawn at random, from the seed `first` on.
-    """
+    """The images, and derivatives by `names` of a sum of pixels, weighted by the seed `first`."""
     use_engine(engine)
     values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
     changed = with_values(scene, values)

@@ -192,10 +192,7 @@ def test_parts_sum_to_the_picture() -> None:
 
 
 def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:
-    """The same scene in other units of length, x, y and z taking each other's place `turns` times.
-
-    The ground's up is then z, or x.
-    """
+    """The same scene in other units, x, y and z taking each other's place `turns` times."""
     volume, ground, (view,) = scene.volume, scene.ground, scene.views
     assert ground is not None
     grid, axes = volume.grid, [(axis + turns) % 3 for axis in range(3)]

@@ -71,9 +71,7 @@ def assert_near(found: Tensor, known: Tensor, close: float) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
-    """Low light that goes along x or z most is followed from between cells: moved along that, it is
-    not exactly the same.
-    """
+    """Low light along x or z is followed from between cells: moved, it is not exactly the same."""
     use_engine(engine)
     density, settings = half_empty(*SHAPE), KINDS[kind]
     close = 0.05 if kind in ("ground", "map") else 1e-10

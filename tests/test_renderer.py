@@ -118,9 +118,7 @@ def misses(camera: Camera, radius: float) -> Tensor:
 
 @pytest.mark.parametrize(("thickness", "g"), [(0.0, 0.5), (1.0, 0.5), (10.0, -0.5), (10.0, 0.0)])
 def test_a_white_furnace_is_white(thickness: float, g: float):
-    """Albedo 1 under radiance 1 from everywhere: radiance 1 everywhere, and not even rounding where
-    nothing is in the way.
-    """
+    """Albedo 1 under radiance 1 from everywhere: radiance 1, exactly so where nothing is."""
     scene = ball(thickness, g)
     image = render(scene)[0]
     is_miss = misses(scene.views[0].camera, RADIUS + 0.1)
@@ -146,9 +144,7 @@ def test_a_white_furnace_of_another_model_has_its_color(model: dict[str, str], g
 
 @pytest.mark.parametrize("g", [0.5, 0.9, -0.5])
 def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float):
-    """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a
-    wide slab.
-    """
+    """The beam's power plus 4 pi / 3 L1 is the same at every depth of a wide slab."""
     grid, sigma = Grid((8, 1, 1), (0.0, 0.0, 0.0), (1.0, 1e9, 1e9)), 3.0
     scene = make_scene(
         random_values(*grid.shape),

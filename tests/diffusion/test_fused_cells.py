@@ -1,7 +1,4 @@
-"""The fused kernels of D, of the system and of the flux compute what PyTorch's operations compute.
-
-Values and cotangents, for coefficients that are constant or differ from cell to cell.
-"""
+"""Fused kernels of D, system and flux compute what torch does: values and cotangents."""
 
 import itertools
 from collections.abc import Callable

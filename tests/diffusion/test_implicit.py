@@ -38,9 +38,7 @@ def solving(
 
 @pytest.fixture
 def inputs():
-    """source, loss and conductances of a small system of two colors, or of a gray operator under a
-    colored source.
-    """
+    """source, loss and conductances of two colors, or of a gray operator under a colored source."""
 
     def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
         faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]

@@ -29,9 +29,7 @@ def uneven(
     contrast: float = 1e3,
     dtype=torch.float64,
 ) -> Operator:
-    """Two colors: a smooth medium whose D spans `contrast`, and one of D = 0.1 everywhere; nothing
-    absorbs but the box's faces.
-    """
+    """Two colors: D that spans `contrast`, and D = 0.1; nothing absorbs but the box's faces."""
     grid = Grid(shape, tuple(-side / 2 for side in sides), tuple(side / 2 for side in sides))
     z, y, x = (torch.linspace(-1, 1, n + 2, dtype=torch.float64)[1:-1] for n in shape)
     ball = torch.exp(-4 * (z[:, None, None] ** 2 + (y[:, None] - 0.3) ** 2 + x**2))
@@ -152,9 +150,7 @@ def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
-    """Random in every cell they take more, but less than a third of those of conjugate gradients
-    alone.
-    """
+    """Random in every cell they take more, but less than a third of conjugate gradients alone."""
     source = random_values(1, 16, 16, 16, dtype=dtype)
     assert multigrid(patchy(4, 1e6, dtype), source, None, 1e-6).iterations <= 15
     operator = patchy(1, 1e6, dtype)

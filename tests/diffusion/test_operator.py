@@ -90,9 +90,7 @@ def test_energy_is_kept(
     has_source_flux: bool,
     has_outside: bool,
 ):
-    """Absorbed plus leaked, less what came in, is what was injected: scattering along source_flux
-    only moves light around.
-    """
+    """Absorbed plus leaked, less what came in, is what was injected: source_flux only moves."""
     injected = random_values(2, *grid.shape, seed=5)
     source_flux = [
         random_values(2, *grid.shape, seed=6 + axis) - 0.5 if has_source_flux else None

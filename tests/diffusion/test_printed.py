@@ -1,7 +1,4 @@
-"""The paper's own scheme: second order in smooth media, exact derivatives of itself.
-
-And its Algorithm 3: where it stops, and what it says where it diverges.
-"""
+"""The paper's scheme: second order in smooth media, exact derivatives; its Algorithm 3."""
 
 import itertools
 import math
@@ -73,9 +70,7 @@ def smooth_scene(cells: int = 6, **changes: Any) -> Scene:
 
 
 def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
-    """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin that shares no code with
-    the operator.
-    """
+    """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin of the operator."""
     grid, shape = operator.stencils.grid, operator.stencils.grid.shape
     number = {cell: n for n, cell in enumerate(itertools.product(*map(range, shape)))}
     matrix = torch.zeros(len(number), len(number), dtype=kappa.dtype)
@@ -117,9 +112,7 @@ def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, in
 
 
 def test_ghost_cells_hold_the_marshak_condition():
-    """On every face of the box: D (-grad L0 + kappa_s Q1) . n = (L0 - outside) / 2, written with
-    the values on its two sides.
-    """
+    """On every face: D (-grad L0 + kappa_s Q1) . n = (L0 - outside) / 2, by both sides' values."""
     grid, outside = (
         box_grid((3, 2, 4)),
         torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1),
@@ -317,9 +310,7 @@ def kappa_of(scene: Scene) -> Tensor:
 
 
 def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
-    """At a floor of 0.1; the cell named is the one whose neighbors differ most, by more than 4 of
-    its own kappa.
-    """
+    """At a floor of 0.1; the cell named differs most from its neighbors, by over 4 of its kappa."""
     scene = ball(20.0, 2.0, floor=0.1)
     with pytest.raises(SolveError, match=r"and above 4 .*diffusion\.scheme=conservative") as caught:
         solve_light(scene, SolveMemory())

@@ -1,7 +1,4 @@
-"""Every command line of the README and the documentation runs.
-
-In the order in which it stands there, on fewer cells, paths and samples.
-"""
+"""Every command line of the README and the documentation runs, in order, on fewer cells."""
 
 import re
 import shlex
@@ -34,9 +31,7 @@ def commands(page: Path) -> list[str]:
 
 
 def fewer_cells(scene: str) -> list[str]:
-    """Overrides that leave `scene` about 8 cells along its shortest side, where it says how many it
-    has.
-    """
+    """Overrides that leave `scene` about 8 cells along its shortest side, where it has a number."""
     found = re.search(
         r"^  resolution: \[(\d+), (\d+), (\d+)\]",
         Path(scene).read_text(encoding="utf-8"),
@@ -72,9 +67,7 @@ def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene
 
 @pytest.fixture
 def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder with the project's configs and data in it; few hard cases; a bench of few cells
-    and paths.
-    """
+    """A folder with configs and data; few hard cases; a bench of few cells and paths."""
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
         (tmp_path / name).symlink_to(ROOT / name)

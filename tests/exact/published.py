@@ -222,10 +222,7 @@ def loaded(scene: dict[str, Any], overrides: Sequence[str] = ()) -> Iterator[Sce
 
 @cache
 def h_at_nodes(albedo: float) -> Array:
-    """Ambartsumian's H at `NODES`, by means of old and new, of which each halves the error.
-
-    1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu'.
-    """
+    """Ambartsumian's H: 1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu'."""
     values = np.ones_like(NODES)
     for _ in range(50):
         values = (values + h_function(albedo, NODES, values)) / 2

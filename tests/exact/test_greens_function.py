@@ -11,9 +11,7 @@ from ddrecon.grid import Grid
 
 DIFFUSION = 0.3
 LENGTH = 0.06
-"""L [u]: the faces of the unit box are so far away, in units of it, that the medium might as well
-have none.
-"""
+"""L [u]: the faces of the unit box are so far away that the medium might as well have none."""
 NEAR, FAR = 0.1, 0.22
 
 

@@ -1,8 +1,4 @@
-"""What the configs' first lines tell people to type is understood by the program, and scenes on the
-pages are legal.
-
-(The commands on the pages are run by tests/docs.)
-"""
+"""What configs' first lines tell to type is understood, and scenes on the pages are legal."""
 
 import re
 import shlex
@@ -41,9 +37,7 @@ def commands() -> list[str]:
 
 
 def parsed(line: str) -> click.Context:
-    """The command line parsed, not run; raises click.UsageError for a command or an option that
-    does not exist.
-    """
+    """The command line parsed, not run; raises click.UsageError for what does not exist."""
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = main.get_command(click.Context(main), name)
     if command is None:

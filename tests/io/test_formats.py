@@ -1,8 +1,4 @@
-"""Every format of the tables `FORMATS` and `READERS`, a new one as well.
-
-What is written comes back in its place. What strangers made is legal or refused in one line with
-its path, at once; pickles are never loaded.
-"""
+"""Every format of `FORMATS` and `READERS`: round trips, and strangers' files refused in a line."""
 
 import io
 import os

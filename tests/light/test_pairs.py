@@ -53,9 +53,7 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
 
 @pytest.mark.parametrize("g", [-0.8, -0.4])
 def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
-    """E8.11's beams leave with F at the far end and G at the near one; the rest is the source of
-    E2.4, whose solution is balanced.
-    """
+    """E8.11's beams leave with F and G at the ends; the rest, the source of E2.4, is balanced."""
     density = 0.2 + torch.rand(9, 1, 1, dtype=torch.float64)
     scene = make_scene(
         density,

@@ -1,6 +1,4 @@
-"""Point lights: the inverse square law, limits in which they are parallel light, and what happens
-at the light itself.
-"""
+"""Point lights: the inverse square law, limits of parallel light, and the light itself."""
 
 import math
 from dataclasses import replace
@@ -128,9 +126,7 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order():
 
 
 def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
-    """kappa_s I / (4 pi) times the integral of 1 / r^2 along a ray: I (angle subtended) / (distance
-    of the ray).
-    """
+    """kappa_s I / (4 pi) times int 1 / r^2 along a ray: I (angle subtended) / (its distance)."""
     grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
     medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
     bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
@@ -205,9 +201,7 @@ def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
 
 
 def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
-    """3 / R^2, the mean of 1 / r^2 over a sphere of one cell's volume around the light, and no
-    flux: light leaves on all sides.
-    """
+    """3 / R^2, the mean of 1 / r^2 over a sphere of a cell's volume around the light; no flux."""
     grid = box_grid((5, 4, 6))
     received = receive_point_light(
         medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)),

@@ -37,9 +37,7 @@ def received(grid: Grid, density: Tensor, lights: list, **medium) -> Moments:
 
 @pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])
 def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float):
-    """What a column of any thickness absorbs and scatters is what the beam loses: E (1 -
-    exp(-depth)).
-    """
+    """What a column of any thickness absorbs and scatters the beam loses: E (1 - exp(-depth))."""
     grid = Grid((6, 1, 2), (0, 0, 0), (1.5, 1, 1))
     density = depth_per_cell / grid.spacing[0] * random_values(*grid.shape)
     light = DirectionalLight(
@@ -64,9 +62,7 @@ def test_the_flux_of_a_beam_is_its_mean_times_its_direction():
 
 
 def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
-    """Each attenuated by kappa z / |cosine|, averaged over the cell; none arrives from the sides,
-    which are too far away.
-    """
+    """Each attenuated by kappa z / |cosine|, averaged over the cell; the sides are too far away."""
     cells, thickness = 6, 0.8
     grid = Grid((cells, 9, 9), (0, -1e3, -1e3), (thickness, 1e3, 1e3))
     medium = medium_in(

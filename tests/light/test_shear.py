@@ -122,9 +122,7 @@ WIDTH = 0.09
 
 
 def blob(grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """A Gaussian in the middle of the box at cell centers, and its integral along `direction` from
-    infinity to there.
-    """
+    """A Gaussian at cell centers, and its integral along `direction` from infinity to there."""
     middle = [(low + high) / 2 for low, high in zip(grid.lower, grid.upper, strict=True)]
     offset = torch.stack(
         torch.broadcast_tensors(
@@ -184,9 +182,7 @@ def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.2, -0.3), (-1.0, -0.3, 0.1)], ids=str)
 def test_mass_is_conserved(direction: tuple[float, ...]):
-    """What a beam has met when it enters the last slice is all mass before it, as long as no shadow
-    leaves through the sides.
-    """
+    """A beam has met all mass before the last slice, where no shadow leaves through the sides."""
     grid = Grid((6, 20, 20), (0, 0, 0), (1.2, 5.0, 4.0))
     field = torch.zeros(1, *grid.shape, dtype=torch.float64)
     field[:, :, 7:13, 7:13] = random_values(6, 6, 6)

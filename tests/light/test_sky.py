@@ -1,6 +1,4 @@
-"""What an environment map sheds on a volume: its power and first moment, suns, and agreement with
-the simpler lights it can stand for.
-"""
+"""What an environment map sheds: power, first moment, suns; agreement with simpler lights."""
 
 import math
 from dataclasses import replace
@@ -49,9 +47,7 @@ def banded(height: int, width: int) -> Tensor:
 def hot_pixel(
     height: int, width: int, row: int, column: int
 ) -> tuple[EnvironmentLight, DirectionalLight]:
-    """A map that is black but for one pixel, and the parallel light that it amounts to, by the
-    pixel's solid angle and center.
-    """
+    """A map black but for one pixel, and the parallel light it is, by its solid angle."""
     radiance = torch.zeros(3, height, width, dtype=torch.float64)
     radiance[:, row, column] = torch.tensor([300.0, 200.0, 100.0])
     down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width

@@ -1,7 +1,4 @@
-"""The fused kernels of the view-ray integral compute what PyTorch's operations compute.
-
-Values, derivatives in reverse and in forward mode, for all that an emission can hold.
-"""
+"""The view-ray integral by fused kernels is torch's, in values, adjoints and tangents."""
 
 from pathlib import Path
 
@@ -191,10 +188,7 @@ def test_lattices_of_rays_are_marched_as_well():
 def test_packets_read_and_write_whole_rows(
     eye: tuple[float, float, float], dtype: torch.dtype, half_width: float
 ):
-    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it.
-
-    In a narrow view neighbors lie right of the same column, and at its ends beside the volume.
-    """
+    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it."""
     camera = make_camera(size=(24, 33), dtype=dtype, half_width=half_width, eye=eye)
     density = half_empty(18, 21, 19, dtype=dtype)
     scene = make_scene(density, g=0.5, camera=camera)

@@ -36,9 +36,7 @@ def blob(grid: Grid) -> Tensor:
 
 @pytest.fixture
 def scene_of():
-    """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell
-    apart.
-    """
+    """A blob in a small grid before light from behind, in many more pixels than rays tell apart."""
 
     def scene(view: dict, **changes) -> Scene:
         camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
@@ -81,9 +79,7 @@ def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
 
 @each_camera
 def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
-    """The pixels of the lattice's own rays need no interpolation: they are what marching those rays
-    gives.
-    """
+    """Pixels of the lattice's own rays are what marching those rays gives."""
     scene = scene_of(view)
     lattice = lattice_of(scene)[0]
     emission = _emission(solve_light(scene, SolveMemory()), lattice.rays)
@@ -101,9 +97,7 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
 
 @each_camera
 def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
-    """Fewer pixels are interpolated as the tolerance falls; what interpolation costs stays below
-    it, in the image's root mean square.
-    """
+    """Fewer pixels are interpolated as the tolerance falls; the RMS error stays below it."""
     scene = scene_of(view)
     own, errors = render(replace(scene, render=OWN)), []
     for tolerance in (1.0, 0.03, 0.003):

@@ -222,9 +222,7 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
 
 
 def test_the_transmittance_of_a_blob_converges_at_second_order():
-    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
-    distance b from its middle.
-    """
+    """A Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) at distance b."""
     camera = make_camera(eye=(0.3, 0.4, 2.5), size=(6, 6), half_width=0.1)
     counts, errors = [10, 20, 40], []
     bundle = cast_rays(camera)

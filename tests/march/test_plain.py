@@ -1,7 +1,4 @@
-"""View rays against plain sums of E2.1 to E2.3: the same integral, on other nodes, by other sums.
-
-Both are of second order in the length of a step, so what they differ by is too.
-"""
+"""View rays against plain sums of E2.1 to E2.3 on other nodes: they differ at second order."""
 
 import math
 from collections.abc import Callable
@@ -180,10 +177,7 @@ def march_twin(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tens
 
 
 def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
-    """How far apart the two marches are, relative to the norm, at STEPS.
-
-    Of each of the quantities `of(marcher, steps)`.
-    """
+    """How far apart the two marches' `of(marcher, steps)` are, relative to the norm, at STEPS."""
     apart = []
     for steps in STEPS:
         pairs = zip(of(march_fast, steps), of(march_twin, steps), strict=True)
@@ -252,10 +246,7 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
 )
 @pytest.mark.usefixtures("same_fields")
 def test_derivatives_agree_in_the_limit(name: str, view: str):
-    """By the medium, the lights and the camera.
-
-    The camera's is of first order: a density linear between cells has kinks, which nodes step over.
-    """
+    """By medium, lights and camera; its derivative is of first order: density has kinks."""
     lights = LIGHTS[name]
     scene = lit_scene(lights, VIEWS[view])
     of_lights = [

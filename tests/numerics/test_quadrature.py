@@ -18,9 +18,7 @@ def double_factorial(n: int) -> int:
 
 
 def sphere_mean(powers: tuple[int, int, int]) -> float:
-    """The mean of x^a y^b z^c over the unit sphere: 0 for an odd power, else (a-1)!! (b-1)!!
-    (c-1)!! / (a+b+c+1)!!.
-    """
+    """x^a y^b z^c over the sphere: (a-1)!! (b-1)!! (c-1)!! / (a+b+c+1)!!, or 0 for an odd power."""
     if any(power % 2 for power in powers):
         return 0.0
     return math.prod(double_factorial(power - 1) for power in powers) / double_factorial(

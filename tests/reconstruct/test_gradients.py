@@ -1,6 +1,4 @@
-"""View by view or all at once, the derivative is the same; its memory does not grow with the number
-of views.
-"""
+"""View by view or all at once, the derivative is the same; memory does not grow with views."""
 
 from dataclasses import replace
 

@@ -1,6 +1,4 @@
-"""The loop: it gets closer, it stays within bounds, it stops cleanly, and it goes on as if it had
-never stopped.
-"""
+"""The loop gets closer, stays within bounds, stops cleanly, and goes on as if never stopped."""
 
 import math
 from dataclasses import replace

@@ -1,6 +1,4 @@
-"""Learning rates: a rise, a fall, and the same run whatever the units; which views an iteration
-sees.
-"""
+"""Learning rates: a rise, a fall, the same run in all units; which views an iteration sees."""
 
 from dataclasses import replace
 

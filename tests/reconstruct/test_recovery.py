@@ -1,6 +1,4 @@
-"""What was changed is found again: scenes rendered by this program, started from wrong values of
-one kind or of all. By diffusion alone: the loop is tried here, not the rounds.
-"""
+"""What was changed is found again, of one kind or all; by diffusion alone."""
 
 import math
 from dataclasses import replace
@@ -82,9 +80,7 @@ def photographed(scene: Scene) -> Scene:
 def recovered(
     scene: Scene, starts: dict[str, Tensor], iterations: int, **settings: ParameterSettings
 ) -> Scene:
-    """What the loop makes of `scene` from `starts`, at one resolution, with default settings unless
-    given.
-    """
+    """What the loop makes of `scene` from `starts`, at one resolution, by defaults unless given."""
     parameters = {name: settings.get(name, ParameterSettings()) for name in starts}
     wanted = OptimizeSettings(parameters, iterations, refine_at=())
     return optimize(replace(scene, starts=starts, optimize=wanted)).scene

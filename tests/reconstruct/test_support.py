@@ -62,9 +62,7 @@ def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> None:
-    """Every ray of a pixel that shows something passes only through cells of the hull; with nothing
-    shown none stays, with everything all do.
-    """
+    """Rays of pixels that show something cross only the hull; with nothing shown none stays."""
     camera, grid = CAMERAS[name], box_grid((7, 6, 8))
     shown = torch.rand(camera.size, generator=torch.Generator().manual_seed(1)) > 0.995
     held, seen = hull_of(camera, shown, grid, 0.0)

@@ -132,10 +132,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
 
 
 def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
-    """What a run finds, and how far a sample about it is from it, in units of `scene_of`.
-
-    And how many iterations it took.
-    """
+    """What a run finds, how far a sample is from it, in units of `scene_of`, and its iterations."""
     torch.manual_seed(0)
     run = Reconstruction(in_units(scene_of(kind), density, length))
     while not run.is_done:

@@ -1,6 +1,4 @@
-"""A page needs nothing beside it, and text in it is text; curves lie where their numbers are, and
-volumes are shown cell for cell, in notebooks too.
-"""
+"""A page needs nothing beside it; curves lie where their numbers are, volumes are shown by cell."""
 
 import base64
 import gzip

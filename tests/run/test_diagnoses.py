@@ -31,10 +31,7 @@ SMALL = (
 
 
 def make_scene(*overrides: str) -> Scene:
-    """The ball's six training views and its test view, small, of a lopsided blob, with noise.
-
-    The density starts near the truth, so that few iterations do.
-    """
+    """The ball's views, small, of a lopsided blob with noise; the density starts near the truth."""
     scene = load_scene(BALL, overrides=(*SMALL, *overrides))
     z, y, x = scene.volume.grid.centers(scene.volume.density)
     blob = torch.exp(-((x - 0.05) ** 2 + 2 * (y + 0.1) ** 2 + (z + 0.05) ** 2) / 0.05)

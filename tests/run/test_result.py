@@ -1,6 +1,4 @@
-"""The result of a run is a scene file that renders as what was found does, whichever numbers were
-varied.
-"""
+"""The result of a run is a scene file that renders as what was found does."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Where parameters start: from the scene, a number, a color, a list or a file, as fields or single
-values; and what is refused.
-"""
+"""Where parameters start: from the scene, a number, a color, a list or a file."""
 
 from collections.abc import Callable
 from pathlib import Path

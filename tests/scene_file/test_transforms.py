@@ -1,6 +1,4 @@
-"""Camera files of NeRF, instant-ngp and nerfstudio: read as they are, written so that they come
-back, and refused by key.
-"""
+"""Camera files of NeRF, instant-ngp and nerfstudio: read, written, refused by key."""
 
 import json
 import math
@@ -54,9 +52,7 @@ def camera_of(view: ViewSection) -> PerspectiveSection:
 
 
 def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
-    """Pixel centers, +y up and looking along -z; what maps the world into other programs' boxes
-    changes nothing.
-    """
+    """Pixel centers, +y up and looking along -z; other programs' boxes change nothing."""
     read(transforms(tmp_path / "transforms.json", frame(None), **NERFSTUDIO))
     (view,) = load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views
     bundle, pose = cast_rays(view.camera), torch.tensor(POSE, dtype=torch.float64)
@@ -76,9 +72,7 @@ def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
 
 
 def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
-    """An angle alone, images without a suffix whose size is that of the image, and a file for each
-    split.
-    """
+    """An angle alone, images without a suffix, whose size is theirs, and a file for each split."""
     for split in ("train", "val"):
         transforms(
             tmp_path / f"transforms_{split}.json", frame(f"./{split}/r_0"), camera_angle_x=0.6

@@ -102,9 +102,7 @@ def nothing() -> None:
 
 
 def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from
-    its start.
-    """
+    """Runs that receive `count` signals, each within a quarter of the time a whole run takes."""
     faults, wrong, finished, number = 0, list[str](), 0, 0
     out = folder / "out_0"
     while faults < count or not finished:
@@ -129,9 +127,7 @@ def kill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
 
 
 def fill(folder: Path, count: int, whole: dict[str, object]) -> dict[str, object]:
-    """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints
-    are the largest of them.
-    """
+    """A run whose files cannot grow beyond a random size, `count` times, and then can."""
     out, wrong, faults = folder / "full", list[str](), 0
     largest = (folder / "whole" / "checkpoints" / "last.pt").stat().st_size
     for _ in range(count):

@@ -1,6 +1,4 @@
-"""What a result does not depend on: the run, the number of threads, the order of views, the size of
-chunks; little on precision.
-"""
+"""What a result does not depend on: run, threads, order of views, chunks; little on precision."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Scene files by strangers: whatever they say, `check` takes them or refuses them in lines that
-name the place, at once.
-"""
+"""Strangers' scene files are taken or refused in lines that name the place, at once."""
 
 import copy
 import os
@@ -31,14 +29,11 @@ CASES = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
-"""How every line begins: with the place in the scene or override, or with the path of a data file.
-"""
+"""How every line begins: the place in the scene or override, or the path of a data file."""
 
 
 def in_a_ring(scene: dict[str, Any]) -> dict[str, Any]:
-    """`scene` with a ring of views, and so without the parameter that is one of its own views'
-    camera.
-    """
+    """`scene` with a ring of views, and so without the parameter of one of its own cameras."""
     scene = copy.deepcopy({**scene, "views": RING})
     del scene["optimize"]["parameters"]["views.front.camera"]
     return scene
@@ -106,9 +101,7 @@ def texts(draw: Callable[..., Any]) -> bytes:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with the files that scenes name: good ones, a pipe, a loop of links, a
-    folder.
-    """
+    """The current folder, with the files that scenes name: good ones, a pipe, a loop, a folder."""
     monkeypatch.chdir(tmp_path)
     np.save("front.npy", np.full((6, 8, 3), 0.5, np.float32))
     np.save("to.npy", np.full((6, 8, 3), 0.5, np.float32))
@@ -127,9 +120,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
-    """Runs a command that must end at once, with 0, 2 or 3, lines that name the place, and no new
-    file; its exit code.
-    """
+    """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
     before = files_below(folder)
     with deadline():
         result = CliRunner().invoke(main, list(arguments))

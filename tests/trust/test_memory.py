@@ -1,7 +1,4 @@
-"""Memory is predicted before it is taken.
-
-Too much is refused with what would fit, and a shortage is one line.
-"""
+"""Memory is predicted; too much is refused with what would fit, and a shortage is one line."""
 
 import re
 from collections.abc import Callable

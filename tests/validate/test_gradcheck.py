@@ -1,6 +1,4 @@
-"""The derivative check passes for every kind of parameter, alone and together, and catches each
-derivative that is wrong.
-"""
+"""The derivative check passes for every kind of parameter, and catches each that is wrong."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,9 +31,7 @@ ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 def check(
     name: str, samples: int = 0, overrides: tuple[str, ...] = ONE_ROUND
 ) -> list[GradientCheck]:
-    """Of one view, above a ground for its own number alone, and under few lights, or the one whose
-    number it is: all are in the check of all.
-    """
+    """Of one view, above a ground for its number alone, under the light whose number it is."""
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
     seen = name.split(".")[1] if name.startswith("views.") else "front"
     ground = scene.ground if name.startswith("ground.") else None

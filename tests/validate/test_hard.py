@@ -81,9 +81,7 @@ def solved(case: HardCase) -> Callable[[float], Balance]:
 
 @pytest.mark.parametrize("ambient", [0.0, 0.5])
 def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
-    """All it has too much of is absorbed or leaks too much; with g not 0, a little of what leaks is
-    none of its own.
-    """
+    """All it has too much of is absorbed or leaks; with g not 0, a little is none of its own."""
     balance = solved(replace(SMALL, ambient=ambient))
     assert balance(1.0).residual < 1e-11 and balance(1.0).energy < 1e-11
     assert balance(1.001).residual == pytest.approx(1e-3, rel=1e-6)
@@ -115,9 +113,7 @@ def checkerboard(shape: tuple[int, int, int]) -> Tensor:
 def test_isotropic_light_is_never_negative_in_the_dark(
     density: Callable[..., Tensor], sigma_a: float, sigma_s: float
 ):
-    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either
-    sign, and L0 may dip below zero.
-    """
+    """An M-matrix with a source >= 0; with g not 0, -div(D kappa_s Q1) may make L0 dip below 0."""
     scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).diffuse.mean
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0

@@ -1,6 +1,4 @@
-"""Derivative images: equal to central differences of the image, component by component, and to what
-closed forms say.
-"""
+"""Derivative images equal central differences of the image, and what closed forms say."""
 
 import pytest
 import torch

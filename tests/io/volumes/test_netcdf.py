@@ -1,6 +1,4 @@
-"""netCDF: axes told by CF attributes or by name, in any order, direction and unit of length; what
-does not fit is refused with advice.
-"""
+"""netCDF: axes told by CF attributes or by name, in any order, direction and unit of length."""
 
 from pathlib import Path
 from typing import Any
@@ -29,9 +27,7 @@ def written(
     kind: str = "NETCDF4",
     **axes: tuple[Any, dict[str, str]],
 ) -> Path:
-    """A file with the variable `QN` on `dimensions`, and a coordinate and its attributes for each
-    of `axes`.
-    """
+    """A file with `QN` on `dimensions`, and a coordinate and its attributes for each of `axes`."""
     with netcdf.Dataset(path, "w", format=kind) as file:
         for name, count in zip(dimensions.split(), values.shape, strict=True):
             file.createDimension(name, count)

@@ -1,6 +1,4 @@
-"""Archives of numpy, .vol and .vti, and what every volume must be: what is not is refused with
-advice.
-"""
+"""Archives of numpy, .vol and .vti, and what every volume must be."""
 
 import struct
 from pathlib import Path
