@@ -141,10 +141,8 @@ def dense_matrix(operator: Operator) -> Tensor:
 
 def convergence_order(steps: list[float], errors: list[float]) -> float:
     """The slope of log error against log step: the order of convergence."""
-    x, y = (
-        torch.tensor(steps, dtype=torch.float64).log(),
-        torch.tensor(errors, dtype=torch.float64).log(),
-    )
+    x = torch.tensor(steps, dtype=torch.float64).log()
+    y = torch.tensor(errors, dtype=torch.float64).log()
     x = x - x.mean()
     return float((x * y).sum() / (x * x).sum())
 

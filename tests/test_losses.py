@@ -20,10 +20,8 @@ def box(cells: int, side: float = 1.0) -> Grid:
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None:
-    image, target = (
-        torch.rand(3, 4, 5, dtype=torch.float64),
-        torch.rand(3, 4, 5, dtype=torch.float64),
-    )
+    image = torch.rand(3, 4, 5, dtype=torch.float64)
+    target = torch.rand(3, 4, 5, dtype=torch.float64)
     assert image_loss(loss, target, target) == 0
     values = [
         float(image_loss(loss, target + part * (image - target), target))
@@ -90,9 +88,8 @@ def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones(
     small, large, larger = (
         float(image_loss("huber", target + error, target)) for error in (0.01, 10.0, 20.0)
     )
-    assert small == pytest.approx(1e-4, rel=1e-9) and larger - large == pytest.approx(
-        2 * HUBER * 10, rel=1e-9
-    )
+    assert small == pytest.approx(1e-4, rel=1e-9)
+    assert larger - large == pytest.approx(2 * HUBER * 10, rel=1e-9)
 
 
 def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:

@@ -24,14 +24,11 @@ def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
     camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 0.7
     moved = turn_camera(camera, axis, angle, CENTER)
     change = moved.pose[:, :3] @ camera.pose[:, :3].T
-    middle, along = (
-        torch.tensor(CENTER, dtype=torch.float64),
-        torch.eye(3, dtype=torch.float64)[axis],
-    )
+    middle = torch.tensor(CENTER, dtype=torch.float64)
+    along = torch.eye(3, dtype=torch.float64)[axis]
     assert torch.allclose(change @ change.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
-    assert torch.allclose(change @ along, along, atol=1e-14) and float(
-        change.trace()
-    ) == pytest.approx(1 + 2 * math.cos(angle))
+    assert torch.allclose(change @ along, along, atol=1e-14)
+    assert float(change.trace()) == pytest.approx(1 + 2 * math.cos(angle))
     assert torch.allclose(
         moved.pose[:, 3] - middle, change @ (camera.pose[:, 3] - middle), atol=1e-14
     )

@@ -32,11 +32,9 @@ def test_json(succeed: Run) -> None:
     report = json.loads(succeed("info", "density.npz", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
     field = report["fields"]["density"]
-    assert (
-        field["colors"] == 1
-        and 0 < field["min"] < field["mean"] < field["max"] < 1
-        and field["filled"] == 1
-    )
+    assert field["colors"] == 1
+    assert 0 < field["min"] < field["mean"] < field["max"] < 1
+    assert field["filled"] == 1
 
 
 def test_the_volume_of_a_scene(succeed: Run) -> None:

@@ -159,10 +159,8 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     assert "; lower optimize.parameters.density.lr (now 1e+37); " in line
     assert "; the state after 0 iterations is kept in out/checkpoints/last.pt" in line
     state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
-    assert (
-        torch.isfinite(state["parameters"]["density"]["value"]).all()
-        and state["total"]["iteration"] == len(rows("out")) - 1
-    )
+    assert torch.isfinite(state["parameters"]["density"]["value"]).all()
+    assert state["total"]["iteration"] == len(rows("out")) - 1
 
 
 def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -170,10 +170,8 @@ def test_light_in_empty_space_flows_no_faster_than_it_may(name: str):
 
 @each_formula
 def test_flux_never_exceeds_radiance(limiter):
-    extinction, steepness = (
-        torch.logspace(-6, 6, 61, dtype=torch.float64),
-        torch.logspace(-6, 6, 49, dtype=torch.float64)[:, None],
-    )
+    extinction = torch.logspace(-6, 6, 61, dtype=torch.float64)
+    steepness = torch.logspace(-6, 6, 49, dtype=torch.float64)[:, None]
     assert bool((steepness * limiter(extinction, steepness**2) < 1).all())
 
 

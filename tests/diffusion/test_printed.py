@@ -113,10 +113,8 @@ def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, in
 
 def test_ghost_cells_hold_the_marshak_condition():
     """On every face: D (-grad L0 + kappa_s Q1) . n = (L0 - outside) / 2, by both sides' values."""
-    grid, outside = (
-        box_grid((3, 2, 4)),
-        torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1),
-    )
+    grid = box_grid((3, 2, 4))
+    outside = torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1)
     kappa, u, *flux = (random_values(2, *grid.shape, seed=seed) for seed in range(5))
     ghosts = Ghosts.of(
         kappa, Moments(u, (flux[0], flux[1], flux[2])), outside, Stencils.on(grid, u)
@@ -149,10 +147,8 @@ def manufactured(position: list[Tensor]) -> tuple[Tensor, ...]:
     z, y, x = (axis.requires_grad_() for axis in position)
     u, bump = torch.ones_like(z), torch.ones_like(z)
     for t, length in zip((z, y, x), EXTENT, strict=True):
-        u, bump = (
-            u * (1 + t * (length - t) / (2 * D_AT_FACES * length)),
-            bump * torch.sin(math.pi * t / length),
-        )
+        u = u * (1 + t * (length - t) / (2 * D_AT_FACES * length))
+        bump = bump * torch.sin(math.pi * t / length)
     diffusion, absorption = D_AT_FACES * (1 + bump), 1 + torch.cos(z) * y
     flux = [
         torch.sin(math.pi * t / length) * (1 + x * y)

@@ -112,9 +112,8 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float, up: str):
 @pytest.mark.parametrize(("height", "width"), SIZES, ids=str)
 def test_solid_angles_sum_to_the_sphere(height: int, width: int):
     area, *vector = pixel_moments(height, width).sum((1, 2))
-    assert area == pytest.approx(4 * math.pi, rel=1e-13) and vector == pytest.approx(
-        [0, 0, 0], abs=1e-13
-    )
+    assert area == pytest.approx(4 * math.pi, rel=1e-13)
+    assert vector == pytest.approx([0, 0, 0], abs=1e-13)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
@@ -172,10 +171,8 @@ def test_what_is_seen_has_both_derivatives(name: str):
 
 
 def test_straight_up_has_finite_derivatives():
-    light, way = (
-        light_of(random_values(2, 4, 5)),
-        torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True),
-    )
+    light = light_of(random_values(2, 4, 5))
+    way = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(way.detach(), torch.ones_like(way))

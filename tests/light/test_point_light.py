@@ -160,15 +160,11 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
         density = 8 * torch.exp(
             -sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))) / 0.04
         )
-        scene, towards = (
-            make_scene(density, grid=grid, model="none"),
-            torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64),
-        )
+        scene = make_scene(density, grid=grid, model="none")
+        towards = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
         intensity = torch.tensor([3.0], dtype=torch.float64)
-        point, parallel = (
-            PointLight(1e6 * towards, 1e12 * intensity),
-            DirectionalLight(-towards, intensity),
-        )
+        point = PointLight(1e6 * towards, 1e12 * intensity)
+        parallel = DirectionalLight(-towards, intensity)
         images = [render(replace(scene, lights=[light])) for light in (point, parallel)]
         errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
     assert (

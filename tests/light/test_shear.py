@@ -159,10 +159,8 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order(direction: tuple[f
 def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, seed: int):
     """Entered mass commutes with every symmetry of the cube, cells being turned with the field."""
     generator = torch.Generator().manual_seed(seed)
-    field, direction = (
-        torch.rand(4, 3, 5, generator=generator, dtype=torch.float64),
-        torch.rand(3, generator=generator, dtype=torch.float64) - 0.5,
-    )
+    field = torch.rand(4, 3, 5, generator=generator, dtype=torch.float64)
+    direction = torch.rand(3, generator=generator, dtype=torch.float64) - 0.5
     direction = direction / direction.norm()
     grid = Grid((4, 3, 5), (0, 0, 0), (1.0, 1.3, 0.9))
     flips = [axis for axis, sign in enumerate(signs) if sign < 0]

@@ -135,11 +135,9 @@ def test_a_hot_pixel_is_a_directional_light(place: tuple[int, int, int, int]):
 
 
 def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():
-    scene, one, other = (
-        make_scene(half_empty(*SHAPE), g=0.4),
-        random_values(3, 6, 8, seed=1),
-        random_values(3, 6, 8, seed=2),
-    )
+    scene = make_scene(half_empty(*SHAPE), g=0.4)
+    one = random_values(3, 6, 8, seed=1)
+    other = random_values(3, 6, 8, seed=2)
 
     def image(radiance: Tensor, scale: float) -> Tensor:
         return render(replace(scene, lights=[light_of(radiance, scale, rotation=12.0)]))

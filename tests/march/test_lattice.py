@@ -87,10 +87,8 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
     own_places = replace(lattice, places=places)
     monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated, own = (
-        march_rays(emission, lattice.rays, INTERPOLATED),
-        march_rays(emission, lattice.rays, OWN),
-    )
+    interpolated = march_rays(emission, lattice.rays, INTERPOLATED)
+    own = march_rays(emission, lattice.rays, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 

@@ -80,10 +80,8 @@ def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
         if d == 0 and not low < o < high:
             return 0.0
         if d != 0:
-            near, far = (
-                max(near, min((low - o) / d, (high - o) / d)),
-                min(far, max((low - o) / d, (high - o) / d)),
-            )
+            near = max(near, min((low - o) / d, (high - o) / d))
+            far = min(far, max((low - o) / d, (high - o) / d))
     return max(far - near, 0.0)
 
 

@@ -154,10 +154,8 @@ def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
     cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
     depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double().view(-1, 1, 1)
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
-    along, exact = (
-        seen.along(depth.expand(-1, 1, 41), cosine)[:, 0],
-        summed_series(seen, depth.movedim(1, 0), cosine)[0],
-    )
+    along = seen.along(depth.expand(-1, 1, 41), cosine)[:, 0]
+    exact = summed_series(seen, depth.movedim(1, 0), cosine)[0]
     torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
     assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
 
@@ -221,12 +219,10 @@ def test_scaling_leaves_the_transport_extinction_alone(g: float):
 
 @pytest.mark.parametrize("medium_of", [scale_medium, keep_medium])
 def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of):
-    sigma_a, sigma_s, density, grid = (
-        random_values(3, seed=1),
-        random_values(3, seed=2),
-        random_values(2, 3, 4),
-        box_grid((2, 3, 4)),
-    )
+    sigma_a = random_values(3, seed=1)
+    sigma_s = random_values(3, seed=2)
+    density = random_values(2, 3, 4)
+    grid = box_grid((2, 3, 4))
     fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]
     constant, varying = (
         medium_of(Volume(grid, density, *sigmas, scalar(0.3)))

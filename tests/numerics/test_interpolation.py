@@ -47,10 +47,8 @@ each_size = pytest.mark.parametrize("sizes", SIZES, ids=str)
 @pytest.mark.parametrize("is_forward", [False, True])
 def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward: bool):
     """Also where forward mode is on, and cells are gathered."""
-    values, points = (
-        random_values(2, 3, *sizes),
-        2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3,
-    )
+    values = random_values(2, 3, *sizes)
+    points = 2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3
     with forward_ad.dual_level() if is_forward else nullcontext():
         sampled = sample(values, points)
     for n, p in itertools.product(range(2), range(9)):
@@ -65,10 +63,8 @@ def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward
 def test_both_modes_have_derivatives(
     sizes: tuple[int, ...], smooth: ThirdOrder | None, wanted: tuple[bool, bool]
 ):
-    values, points = (
-        random_values(2, 3, *sizes),
-        2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2,
-    )
+    values = random_values(2, 3, *sizes)
+    points = 2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2
     inputs = [
         tensor.requires_grad_(is_wanted)
         for tensor, is_wanted in zip((values, points), wanted, strict=True)

@@ -99,10 +99,8 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) ->
     scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = open_tracer(scene, scene.views, threads=2)
-    theirs, ours = (
-        Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)]),
-        Traced.of([tracer.trace(0, seed, 256) for seed in range(3)]),
-    )
+    theirs = Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)])
+    ours = Traced.of([tracer.trace(0, seed, 256) for seed in range(3)])
     assert max(theirs.noise, ours.noise) < 0.15
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
 

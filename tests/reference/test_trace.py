@@ -28,10 +28,8 @@ pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra 
 LOWER, UPPER = (-0.2, -0.8, -0.3), (0.8, 0.4, 0.5)
 """A box around (0.3, -0.2, 0.1), whose sides differ."""
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-ONES, COLORS = (
-    torch.ones(3, dtype=torch.float64),
-    torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64),
-)
+ONES = torch.ones(3, dtype=torch.float64)
+COLORS = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 SIDES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 

@@ -130,9 +130,8 @@ def test_json_is_a_scene_too(tmp_path: Path, read: Read):
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(tree, indent=1))
     loaded = read_scene(path).tree
-    assert loaded.diffusion.tolerance == 1e-05 and loaded.lights[0] == DirectionalSection(
-        (-2, -2, -1), 3.141592653589793
-    )
+    assert loaded.diffusion.tolerance == 1e-05
+    assert loaded.lights[0] == DirectionalSection((-2, -2, -1), 3.141592653589793)
     assert loaded.volume == read(SCENE).tree.volume
 
 

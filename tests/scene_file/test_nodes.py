@@ -43,11 +43,9 @@ def value_of(text: str) -> object:
 
 
 def test_quoted_scalars_are_text():
-    assert (
-        value_of('"1e3"') == "1e3"
-        and value_of("'true'") == "true"
-        and value_of('{\n\t"a": "\\u0041"\n}')["a"].value == "A"
-    )
+    assert value_of('"1e3"') == "1e3"
+    assert value_of("'true'") == "true"
+    assert value_of('{\n\t"a": "\\u0041"\n}')["a"].value == "A"
 
 
 def plain(node: Node) -> object:

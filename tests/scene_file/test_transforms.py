@@ -81,14 +81,13 @@ def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
         read(changed(views={"transforms": ["transforms_train.json", "transforms_val.json"]}))
     )
     assert train.image == tmp_path / "train/r_0.png" and val.image == tmp_path / "val/r_0.png"
-    assert (train.split, val.split) == ("train", "test") and (train.name, val.name) == (
+    assert (train.split, val.split) == ("train", "test")
+    assert (train.name, val.name) == (
         "train_r_0",
         "val_r_0",
     )
-    assert (
-        camera_of(train).fov == pytest.approx(math.degrees(0.6))
-        and camera_of(train).resolution is None
-    )
+    assert camera_of(train).fov == pytest.approx(math.degrees(0.6))
+    assert camera_of(train).resolution is None
 
 
 def test_a_frame_takes_precedence_over_its_file(read: Read, tmp_path: Path) -> None:
@@ -229,16 +228,14 @@ def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
     again = read(changed(views={"transforms": "out/transforms.json"}))
     for one, other in zip(scene_file.tree.views, again.tree.views, strict=True):
         assert other.image is not None and (one.name, one.split) == (other.name, other.split)
-        assert (
-            other.image.resolve() == one.image and (other.mask and other.mask.resolve()) == one.mask
-        )
+        assert other.image.resolve() == one.image
+        assert (other.mask and other.mask.resolve()) == one.mask
     for one, other in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):
         torch.testing.assert_close(
             cast_rays(one.camera).direction, cast_rays(other.camera).direction, rtol=0, atol=1e-14
         )
-        assert (
-            torch.equal(one.camera.pose, other.camera.pose) and one.camera.size == other.camera.size
-        )
+        assert torch.equal(one.camera.pose, other.camera.pose)
+        assert one.camera.size == other.camera.size
 
 
 def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:

@@ -100,9 +100,8 @@ def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
     one, other = (
         optimize(each).scene.volume for each in (scene, replace(scene, views=scene.views[::-1]))
     )
-    assert torch.allclose(one.density, other.density, rtol=EQUAL) and torch.allclose(
-        one.g, other.g, rtol=EQUAL
-    )
+    assert torch.allclose(one.density, other.density, rtol=EQUAL)
+    assert torch.allclose(one.g, other.g, rtol=EQUAL)
 
 
 @pytest.mark.parametrize("model", ["flux_limited", "p1"])

@@ -48,10 +48,8 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
         assert kept.failures() == [] and kept.row().endswith("pass |")
     result = replace(KEPT, **change)
     assert result.failures() == [bound] and result.row().endswith(f"FAIL: {bound} |")
-    assert (
-        table([KEPT, result])[-1] == "2 cases, 1 failed"
-        and describe([KEPT, result])["passed"] is False
-    )
+    assert table([KEPT, result])[-1] == "2 cases, 1 failed"
+    assert describe([KEPT, result])["passed"] is False
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):

@@ -91,9 +91,8 @@ def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
     pytest.importorskip("OpenImageIO")
     pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
     paths = write_linear(tmp_path / "front.single", pixels)
-    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"] and set(
-        tmp_path.iterdir()
-    ) == set(paths)
+    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"]
+    assert set(tmp_path.iterdir()) == set(paths)
     assert np.load(paths[1]).dtype == np.float32
     assert all(np.array_equal(read_image(path).pixels, pixels.astype(np.float32)) for path in paths)
 
@@ -126,9 +125,8 @@ def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
     stored[0, :, 3] = 0, 51, 255
     iio.imwrite(tmp_path / "a.png", stored)
     image = read_image(tmp_path / "a.png")
-    assert (
-        image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1]) and image.coverage is not None
-    )
+    assert image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1])
+    assert image.coverage is not None
     assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
 
 
