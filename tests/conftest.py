@@ -20,6 +20,10 @@ torch.set_num_threads(1)  # tests run side by side, one a core
 settings.register_profile("patient", deadline=None)  # how loaded the machine is does not matter
 settings.load_profile("patient")
 ask_python(everything=False)
+if find_spec("warp") and "OPTIMIZE_KERNELS" not in os.environ:
+    import warp
+
+    warp.config.optimization_level = 0  # compiles in half the time
 
 
 @pytest.fixture(autouse=True)

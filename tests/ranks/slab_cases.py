@@ -283,8 +283,11 @@ def compare(engine: str) -> dict[str, dict[str, float]]:
 
 def compile_once(lock: Path) -> None:
     """Has one rank compile each kernel, while the others wait."""
+    import warp
+
     from ddrecon.kernels import launch
 
+    warp.config.optimization_level = 0
     load = launch.load
 
     def load_by_turns(*kernel: Any) -> None:
