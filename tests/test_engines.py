@@ -120,14 +120,8 @@ LIGHTS = {
     "points": {"ambient": (0.3,)},
     "sky": {"directional": None},
 }
-KINDS = [
-    ("gray", "gray beam"),
-    ("colored", "beam"),
-    ("colored", "sky"),
-    ("cellwise", "points"),
-    ("cellwise", "ambient"),
-    ("black", "points"),
-]
+KINDS = [("gray", "gray beam"), ("colored", "beam"), ("colored", "sky"), ("black", "points")]
+KINDS += [("cellwise", "points"), ("cellwise", "ambient")]
 VIEWS = {
     "far": {"eye": (0.3, 0.4, 3.0), "half_width": 0.25},
     "near": {"eye": (1.1, 0.5, 0.9), "half_width": 0.9},
@@ -164,12 +158,11 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
     )
     tensor = density.new_tensor
     if lit == "points":
+        beam = tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
         scene.lights += [
             PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
             PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3])),
-            BeamLight(
-                tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
-            ),
+            BeamLight(*beam),
         ]
     if lit == "sky":
         sky = random_values(3, 4, 8, seed=seed + 3, dtype=dtype)

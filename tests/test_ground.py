@@ -200,15 +200,11 @@ def moved(scene: Scene, turns: int = 0, size: float = 1.0) -> Scene:
     pose = view.camera.pose.roll(turns, 0) * tensor(1, 1, 1, size)
     sun, sky, lamp = scene.lights
     place, intensity = size * lamp.position.roll(turns), size**2 * lamp.intensity
+    grid = Grid(tuple(grid.shape[axis] for axis in axes), tuple(lower), tuple(upper))
+    sigmas = volume.sigma_a / size, volume.sigma_s / size
     return replace(
         scene,
-        volume=Volume(
-            Grid(tuple(grid.shape[axis] for axis in axes), tuple(lower), tuple(upper)),
-            volume.density.permute(axes),
-            volume.sigma_a / size,
-            volume.sigma_s / size,
-            volume.phase,
-        ),
+        volume=Volume(grid, volume.density.permute(axes), *sigmas, volume.phase),
         lights=[
             replace(sun, direction=sun.direction.roll(turns)),
             sky,

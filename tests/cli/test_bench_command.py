@@ -31,17 +31,11 @@ def test_cases_within_their_bounds_pass(run: Run) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     header, _, *rows, verdict = result.stdout.splitlines()
     assert header.startswith("| case")
-    assert [row.split("|")[1].strip() for row in rows] == [
-        "vacuum",
-        "full",
-    ]
+    assert [row.split("|")[1].strip() for row in rows] == ["vacuum", "full"]
     assert verdict == "2 cases, 0 failed" and all(row.endswith("pass |") for row in rows)
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is True
-    assert [case["case"] for case in report["cases"]] == [
-        "vacuum",
-        "full",
-    ]
+    assert [case["case"] for case in report["cases"]] == ["vacuum", "full"]
     assert json.loads(Path("out/hard.json").read_text()) == report
 
 

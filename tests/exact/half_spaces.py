@@ -31,19 +31,10 @@ def half_space(
     layers = ratio ** torch.arange(cells, dtype=torch.float64)
     density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)
     grid = Grid((cells, 1, 1), (0.0, -5e8, -5e8), (1.0, 5e8, 5e8))
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=(1 - albedo,),
-        sigma_s=(albedo,),
-        g=g,
-        directional=(IRRADIANCE,),
-        travel=(math.sqrt(1 - sun**2), 0.0, sun),
-        closure="smooth",
-        floor=1e-6,
-        transport_rounds=rounds,
-        degree=5,
-    )
+    light = {"directional": (IRRADIANCE,), "travel": (math.sqrt(1 - sun**2), 0.0, sun)}
+    medium = {"sigma_a": (1 - albedo,), "sigma_s": (albedo,), "g": g}
+    settings = {"closure": "smooth", "floor": 1e-6, "transport_rounds": rounds, "degree": 5}
+    scene = make_scene(density, grid=grid, **light, **medium, **settings)
     return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
 
 

@@ -47,16 +47,12 @@ def test_an_even_box_shines_by_its_length(engine: str, model: str, density: floa
     torch.testing.assert_close(image, (COLORS * length).view(3, 1, 1).expand_as(image))
 
 
+MODELS = [{"transport_rounds": 2}, {"transport_rounds": 2, "g": 0.5, "degree": 3}]
+MODELS += [{"model": "flux_limited"}, {"scheme": "printed"}]
+
+
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"transport_rounds": 2},
-        {"transport_rounds": 2, "g": 0.5, "degree": 3},
-        {"model": "flux_limited"},
-        {"scheme": "printed"},
-    ],
-)
+@pytest.mark.parametrize("more", MODELS, ids=str)
 def test_what_is_as_hot_as_its_surroundings_looks_like_them(
     engine: str, more: dict[str, Any]
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from media import box_grid, make_camera
+from media import box_grid, make_camera, tensor
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
@@ -22,17 +22,11 @@ CAMERAS = {
     "pinhole": make_camera(size=(30, 36)),
     "oblong": replace(make_camera(size=(30, 36)), principal_point=(0.4, 0.55), pixel_aspect=1.2),
     "parallel": make_camera(size=(30, 36), half_width=0.7, is_perspective=False),
-    "opencv": replace(
-        make_camera(size=(30, 36)),
-        lens="opencv",
-        distortion=torch.tensor([-0.2, 0.05, 0, 0, 0.002, -0.001], dtype=torch.float64),
-    ),
-    "fisheye": replace(
-        make_camera(eye=(0.1, 0.2, 0.9), size=(30, 36), half_width=1.2),
-        lens="fisheye",
-        distortion=torch.tensor([0.02, -0.01, 0, 0], dtype=torch.float64),
-    ),
 }
+LENSES = {"opencv": tensor(-0.2, 0.05, 0, 0, 0.002, -0.001), "fisheye": tensor(0.02, -0.01, 0, 0)}
+WIDE = make_camera(eye=(0.1, 0.2, 0.9), size=(30, 36), half_width=1.2)
+CAMERAS["opencv"] = replace(CAMERAS["pinhole"], lens="opencv", distortion=LENSES["opencv"])
+CAMERAS["fisheye"] = replace(WIDE, lens="fisheye", distortion=LENSES["fisheye"])
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -25,11 +25,8 @@ GAINS = {"one": 1.2, "two": 1 / 1.2}
 CAMERAS = {
     "density": ParameterSettings(tv=1e-3, support=MASKS, support_margin=0.0),
     "lights.0.irradiance": ParameterSettings(),
-    **{
-        f"views.{view}.{key}": ParameterSettings()
-        for key in ("exposure", "camera")
-        for view in EYES
-    },
+    **{f"views.{view}.exposure": ParameterSettings() for view in EYES},
+    **{f"views.{view}.camera": ParameterSettings() for view in EYES},
 }
 SMOOTH = ParameterSettings(tv=1e-3)
 SECTIONS = {

@@ -65,9 +65,8 @@ def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, wha
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2, 1] = pixels[3, 0] = value
     np.save(tmp_path / "a.npy", pixels)
-    with pytest.raises(
-        FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
-    ):
+    told = rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
+    with pytest.raises(FormatError, match=told):
         read_image(tmp_path / "a.npy")
 
 
@@ -162,10 +161,8 @@ def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
 
 
 def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
-    stored = np.array(
-        [[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8
-    )
-    iio.imwrite(tmp_path / "m.png", stored)
+    stored = [[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]
+    iio.imwrite(tmp_path / "m.png", np.array([stored], np.uint8))
     mask = read_mask(tmp_path / "m.png").pixels[..., 0]
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
 
