@@ -112,11 +112,7 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
     ],
 )
 def test_what_pictures_do_not_tell_is_asked_for(
-    scene: Callable[..., Path],
-    refuse: Callable[..., list[str]],
-    make: dict[str, float],
-    overrides: list[str],
-    line: str,
+    scene: Callable[..., Path], refuse, make: dict[str, float], overrides: list[str], line: str
 ) -> None:
     scene(**make)
     (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))

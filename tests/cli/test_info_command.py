@@ -48,7 +48,5 @@ def test_the_volume_of_a_scene(succeed: Run) -> None:
 
 def test_an_image(succeed: Run) -> None:
     np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
-    assert (
-        succeed("info", "picture.npy").stdout
-        == "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
-    )
+    told = "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
+    assert succeed("info", "picture.npy").stdout == told

@@ -20,10 +20,7 @@ CHANGES = {
     "scene.yaml -D volume.g=2": (2, "-D volume.g=2: volume.g: must be below 1, found 2"),
     "gone.yaml": (2, "gone.yaml: cannot be read: No such file or directory"),
     ". ": (2, ".: holds no result.yaml"),
-    "scene.yaml -D views.0.camera.resolution=[8,8]": (
-        3,
-        "front.npy: is 8 x 6 pixels, but views.0.camera has 8 x 8",
-    ),
+    "scene.yaml -D views.0.camera.resolution=[8,8]": (3, "front.npy: is 8 x 6 pixels, but views"),
 }
 """What every command refuses, in place of its scene."""
 TABLE = """

@@ -108,8 +108,7 @@ EXTENT = (1.0, 1.2, 0.8)
 
 
 def manufactured(position: list[Tensor]) -> tuple[Tensor, ...]:
-    """L0, D, kappa_a, kappa_s Q0, kappa_s Q1 and L1 at `position` (z, y, x) that fulfill E2.4-E2.6
-    in a box from 0 to EXTENT.
+    """L0, D, kappa_a, kappa_s Q0, kappa_s Q1 and L1 at (z, y, x) that fulfill E2.4-E2.6.
 
     Along each axis L0 is 1 + t (L - t) / (2 D L), so that L0 / 2 = -D dL0/dn on both faces, where D
     is D_AT_FACES but not flat, and where Q1 runs along the face.

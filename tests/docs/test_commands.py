@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ddrecon.bench import plume
+from ddrecon.bench import measure, plume
 from ddrecon.cli.commands import main
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
@@ -61,20 +61,25 @@ def quick(command: str) -> list[str]:
     return [name, *rest, *added]
 
 
+def few(variants: Callable[..., dict]) -> Callable[..., dict]:
+    return lambda *scene: dict([*variants(*scene).items()][:3])
+
+
 def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:
     return lambda *arguments: [scene_at_level(scene, 4) for scene in load(*arguments)]
 
 
 @pytest.fixture
 def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder with configs and data; few hard cases; a bench of few cells and paths."""
+    """A folder with configs and data; few hard cases; a bench of few cells."""
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
         (tmp_path / name).symlink_to(ROOT / name)
     for name in list(CASES)[2:]:
         monkeypatch.delitem(CASES, name)
     monkeypatch.setattr(plume, "load_pair", coarse(plume.load_pair))
-    monkeypatch.setattr("ddrecon.bench.measure.QUICK_PATHS", (1, 2))
+    monkeypatch.setattr(measure, "QUICK_PATHS", (1, 2))
+    monkeypatch.setattr(measure, "variants_of", few(measure.variants_of))
 
 
 @pytest.mark.parametrize("page", list(filter(commands, PAGES)), ids=lambda page: page.stem)

@@ -16,24 +16,15 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 def scenes() -> list[str]:
     """Every block of YAML on a page that is a whole scene."""
-    texts = [page.read_text(encoding="utf-8") for page in PAGES]
-    return [
-        block
-        for text in texts
-        for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    ]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def commands() -> list[str]:
     """Every `ddrecon ...` in comments of configs."""
     configs = sorted((ROOT / "configs").rglob("*.yaml"))
-    return [
-        line
-        for config in configs
-        for line in re.findall(
-            r"^#.*?(ddrecon .*)$", config.read_text(encoding="utf-8"), re.MULTILINE
-        )
-    ]
+    text = "\n".join(config.read_text(encoding="utf-8") for config in configs)
+    return re.findall(r"^#.*?(ddrecon .*)$", text, re.MULTILINE)
 
 
 def parsed(line: str) -> click.Context:

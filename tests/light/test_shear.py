@@ -30,9 +30,8 @@ def sum_mass_to_cells(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Ten
 def by_rays(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
     """The mass [z, y, x], and how far each cell's ray stays from the sides [cells].
 
-    From every cell's center back towards the light, a slice at a time: the field where the ray
-    meets the slices, and midway between two of them the mean of both. The sides are the outermost
-    cells' centers. Shares no code with the package.
+    From every cell's center back towards the light, a slice at a time: the field on slices, and
+    midway between two of them the mean of both. The sides are the outermost cells' centers.
     """
     speed = [d / h for d, h in zip(direction.tolist(), grid.spacing, strict=True)]
     axis = max(range(3), key=lambda a: abs(speed[a]))

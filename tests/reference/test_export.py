@@ -43,15 +43,12 @@ np.save(path + ".npy", np.array(image, np.float64))
 
 
 def opened(path: Path, **options: Any) -> np.ndarray:
-    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes
-    its EXR reader has hung.
+    """The scene as a user's Mitsuba shows it: after other scenes its EXR reader has hung.
 
-    On two threads, as the tracer: the random numbers of the variant `scalar_rgb` depend on
-    how many there are.
+    On two threads, as the tracer: random numbers of `scalar_rgb` depend on how many there are.
     """
-    subprocess.run(
-        [sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120
-    )
+    command = [sys.executable, "-c", OPEN, str(path), json.dumps(options)]
+    subprocess.run(command, check=True, timeout=120)
     return np.load(f"{path}.npy")
 
 

@@ -122,20 +122,12 @@ def test_a_result_has_the_phase_function_that_was_found(
 
 
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
-    write_field(
-        tmp_path / "start.npz",
-        "density",
-        np.full((4, 5, 6), 0.3),
-        np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]]),
-    )
+    box = np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]])
+    write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), box)
     text = CROSS_SECTIONS["sigma_t, albedo"]
     found = finished(tmp_path, text, "density: {}")
-    scene = (
-        (tmp_path / "scene.yaml")
-        .read_text()
-        .replace("density: 0.4", "density: {file: start.npz}")
-        .replace("  resolution: [6, 5, 4]\n", "")
-    )
+    text = (tmp_path / "scene.yaml").read_text().replace("  resolution: [6, 5, 4]\n", "")
+    scene = text.replace("density: 0.4", "density: {file: start.npz}")
     (tmp_path / "scene.yaml").write_text(scene)
     assert (
         load_scene(tmp_path / "scene.yaml").volume.grid

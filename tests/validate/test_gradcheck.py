@@ -16,14 +16,9 @@ from ddrecon.variables.values import variable_names
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
-SMALL = [
-    "volume.resolution=[6, 5, 4]",
-    "views.0.camera.resolution=[7, 6]",
-    "views.1.camera.resolution=[6, 5]",
-    "views.2.camera.resolution=[5, 6]",
-    "views.3.camera.resolution=[6, 5]",
-    "lights.2.directions=3",
-]
+SIZES = ([7, 6], [6, 5], [5, 6], [6, 5])
+SMALL = ["volume.resolution=[6, 5, 4]", "lights.2.directions=3"]
+SMALL += [f"views.{index}.camera.resolution={size}" for index, size in enumerate(SIZES)]
 NAMES = tuple(load_scene(CONFIG).starts)
 ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 

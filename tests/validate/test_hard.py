@@ -53,12 +53,8 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
-    name = "g -0.99, density jumps by 1e6"
-    monkeypatch.setattr(
-        import_module("ddrecon.renderer"),
-        "sharpen",
-        lambda medium, means: means - 1e3 * means.detach().max(),
-    )
+    name, renderer = "g -0.99, density jumps by 1e6", import_module("ddrecon.renderer")
+    monkeypatch.setattr(renderer, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
     assert run_case(name, CASES[name], CPU).failures() == ["radiance"]
 
 
@@ -117,31 +113,23 @@ def test_isotropic_light_is_never_negative_in_the_dark(
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0
 
 
+FINITE = {
+    "checkerboard": (checkerboard(SHAPE), {}),
+    "hot voxel": (hot_voxel(SHAPE), {}),
+    "one cell": (half_full((1, 1, 1)), {}),
+    # Squares overflow there; so do exponentials of what rounding makes of no depth.
+    "thick": (1e10 * half_full(SHAPE), {}),
+    "opaque": (1e20 * half_full(SHAPE), {}),
+    # There the direction from the cell towards the camera is nothing but rounding.
+    "eye in a center": (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
+    "eye on a face": (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
+}
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(
-    ("density", "view"),
-    [
-        (checkerboard(SHAPE), {}),
-        (hot_voxel(SHAPE), {}),
-        (half_full((1, 1, 1)), {}),
-        # Squares overflow there; so do exponentials of what rounding makes of no depth.
-        (1e10 * half_full(SHAPE), {}),
-        (1e20 * half_full(SHAPE), {}),
-        # There the direction from the cell towards the camera is nothing but rounding.
-        (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
-        (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
-    ],
-    ids=[
-        "checkerboard",
-        "hot voxel",
-        "one cell",
-        "thick",
-        "opaque",
-        "eye at the center of a cell",
-        "eye on a face",
-    ],
-)
-def test_image_and_gradient_are_finite(density: Tensor, view: dict, dtype: torch.dtype):
+@pytest.mark.parametrize("case", FINITE)
+def test_image_and_gradient_are_finite(case: str, dtype: torch.dtype):
+    density, view = FINITE[case]
     density = density.to(dtype).requires_grad_()
     camera = make_camera(dtype=dtype, **view)
     image = render(make_scene(density, camera=camera, g=0.4, ambient=(0.5,)))
