@@ -24,6 +24,12 @@ if find_spec("warp") and "OPTIMIZE_KERNELS" not in os.environ:
     import warp
 
     warp.config.optimization_level = 0  # compiles in half the time
+LONGEST = "test_slabs", "test_shared_runs", "test_vectorized"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest begin first: no process waits for another at the end, or does them again."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 @pytest.fixture(autouse=True)

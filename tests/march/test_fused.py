@@ -22,14 +22,9 @@ from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused import kernels
 from ddrecon.march.fused.cells import Cells, mark_kernel
-from ddrecon.march.fused.kernels import (
-    Case,
-    Layout,
-    adjoint_kernel,
-    integral_kernel,
-    tangent_kernel,
-)
+from ddrecon.march.fused.kernels import Case, Layout
 
 pytestmark = pytest.mark.slow
 
@@ -227,8 +222,11 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     one = Layout(1, 1, 1, 0, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
     steep = Layout(1, 1, 1, 0, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
-    packets = [mark_kernel(32), integral_kernel(steep, False)]
-    packets += [tangent_kernel(one, Case(False, True, True)), adjoint_kernel(several, Case(False))]
+    packets = [mark_kernel(32), kernels.integral_kernel(steep, False)]
+    packets += [
+        kernels.tangent_kernel(one, Case(False, True, True)),
+        kernels.adjoint_kernel(several, Case(False)),
+    ]
     assert_compiles(packets, tmp_path)
 
 

@@ -11,17 +11,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render, solve_light
-from ddrecon.validate.hard import (
-    CASES,
-    TOLERANCE,
-    Balance,
-    HardCase,
-    HardResult,
-    balance_of,
-    describe,
-    run_case,
-    table,
-)
+from ddrecon.validate import hard
+from ddrecon.validate.hard import CASES, TOLERANCE, HardCase, HardResult, balance_of, run_case
 
 CPU = torch.device("cpu")
 SMALL = HardCase(torch.ones, shape=(4, 5, 6), g=0.4)
@@ -48,8 +39,8 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
         assert kept.failures() == [] and kept.row().endswith("pass |")
     result = replace(KEPT, **change)
     assert result.failures() == [bound] and result.row().endswith(f"FAIL: {bound} |")
-    assert table([KEPT, result])[-1] == "2 cases, 1 failed"
-    assert describe([KEPT, result])["passed"] is False
+    assert hard.table([KEPT, result])[-1] == "2 cases, 1 failed"
+    assert hard.describe([KEPT, result])["passed"] is False
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
@@ -63,10 +54,10 @@ def test_a_solve_that_gives_up_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(import_module("ddrecon.diffusion.solvers.multigrid"), "MAX_ITERATIONS", 8)
     result = run_case("small", SMALL, CPU)
     assert "did not reach its tolerance" in result.failures()[0]
-    assert describe([result])["passed"] is False and "did not reach" in table([result])[2]
+    assert hard.describe([result])["passed"] is False and "did not reach" in hard.table([result])[2]
 
 
-def solved(case: HardCase) -> Callable[[float], Balance]:
+def solved(case: HardCase) -> Callable[[float], hard.Balance]:
     """The balance of the solution of `case` in float64, times a factor."""
     scene, memory = case.scene(torch.float64, CPU), SolveMemory()
     render(scene, memory=memory)
