@@ -1,7 +1,4 @@
-"""What every test has: a seed of its own, one thread, and commands that run in this process.
-
-The torch engine runs unless a test, or the environment, asks for another.
-"""
+"""What every test has: a seed, one thread, the torch engine, and commands in this process."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -23,6 +20,16 @@ torch.set_num_threads(1)  # tests run side by side, one a core
 settings.register_profile("patient", deadline=None)  # how loaded the machine is does not matter
 settings.load_profile("patient")
 ask_python(everything=False)
+if find_spec("warp") and "OPTIMIZE_KERNELS" not in os.environ:
+    import warp
+
+    warp.config.optimization_level = 0  # compiles in half the time
+LONGEST = "test_slabs", "test_shared_runs", "test_vectorized"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest begin first: no process waits for another at the end, or does them again."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 @pytest.fixture(autouse=True)
@@ -76,9 +83,7 @@ def suffix(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def run(folder: Path) -> Callable[..., Result]:
-    """Runs a command in the current folder, which the fixture `folder` of the tests has made; a
-    bug's exception is not swallowed.
-    """
+    """Runs a command in the current folder, which `folder` made; a bug's exception is raised."""
 
     def run_command(*arguments: str) -> Result:
         result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])

@@ -14,9 +14,7 @@ class Overdue(BaseException):
 
 @contextmanager
 def deadline(seconds: float = LONGEST) -> Iterator[None]:
-    """Raises Overdue where the block takes more than `seconds` of processor time, also if that is
-    known only at its end.
-    """
+    """Raises Overdue where the block takes more than `seconds` of the processor, if at its end."""
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         raise Overdue(f"more than {seconds} s")

@@ -1,8 +1,7 @@
 """A device without a GPU: its tensors have numbers, and refuse what CUDA's refuse.
 
-A tensor there is a `Far` one around one of the processor's, `near`, which computes for it. To torch
-it is of a device of its own: whatever is made there, and every operation that one of them takes
-part in, comes by `_run`. To ddrecon it is on a GPU, whose ways it goes.
+A `Far` tensor is around one of the processor's, `near`. To torch it is of a device of its own:
+what is made there, and every operation with it, comes by `_run`. To ddrecon it is on a GPU.
 """
 
 from __future__ import annotations
@@ -137,10 +136,7 @@ def _near(value: Any) -> Any:
 
 @contextlib.contextmanager
 def near_kernels() -> Iterator[None]:
-    """Fused kernels that are launched there run on the processor, and cut items as there.
-
-    Solves and sweeps take a GPU's ways.
-    """
+    """Fused kernels launched there run on the processor; solves and sweeps take a GPU's ways."""
     import warp as wp
 
     from ddrecon.diffusion.rounds import sweep

@@ -1,7 +1,4 @@
-"""Small random media, operators, cameras and scenes.
-
-Every test states what matters to it and nothing else.
-"""
+"""Small random media, operators, cameras and scenes."""
 
 import math
 from collections.abc import Callable
@@ -37,9 +34,8 @@ def tensor(*values: float) -> Tensor:
 
 
 def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
-        dtype
-    )
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(shape, generator=generator, dtype=torch.float64).to(dtype)
 
 
 def half_empty(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -65,12 +61,8 @@ def make_camera(
 ) -> Camera:
     """A camera at `eye` (x, y, z) looking at the origin."""
     origin = torch.tensor(eye, dtype=kind.get("dtype", torch.float64))
-    return Camera(
-        look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0])),
-        size,
-        half_width,
-        is_perspective,
-    )
+    pose = look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0]))
+    return Camera(pose, size, half_width, is_perspective)
 
 
 def make_scene(
@@ -87,28 +79,21 @@ def make_scene(
     emission: Tensor | None = None,
     **diffusion: Any,
 ) -> Scene:
-    """A scene in the precision of `density`, solved as closely as that precision allows; lights
-    that are None are left out. Without transport rounds, unless `diffusion` asks for some.
-    """
+    """A scene in the precision of `density`, solved closely; without rounds, unless asked for."""
     grid = grid or box_grid((density.shape[0], density.shape[1], density.shape[2]))
     tensor = density.new_tensor
     sigma_a, sigma_s = (
         sigma if isinstance(sigma, Tensor) else tensor(sigma) for sigma in (sigma_a, sigma_s)
     )
-    lights: list[Any] = (
-        [DirectionalLight(tensor(travel), tensor(directional))] if directional else []
-    )
+    lights: list[Any] = []
+    lights += [DirectionalLight(tensor(travel), tensor(directional))] if directional else []
     lights += [AmbientLight(tensor(ambient))] if ambient else []
     camera = camera or make_camera(dtype=density.dtype)
     tolerance = 1e-13 if density.dtype == torch.float64 else 1e-6
     diffusion = {"tolerance": tolerance, "transport_rounds": 0} | diffusion
-    return Scene(
-        Volume(grid, density, sigma_a, sigma_s, tensor(g), emission=emission),
-        lights,
-        [View("view", camera)],
-        RenderSettings(),
-        DiffusionSettings(**diffusion),
-    )
+    volume = Volume(grid, density, sigma_a, sigma_s, tensor(g), emission=emission)
+    settings = RenderSettings(), DiffusionSettings(**diffusion)
+    return Scene(volume, lights, [View("view", camera)], *settings)
 
 
 def march_rays(emission: Emission, rays: Rays, settings: RenderSettings) -> tuple[Tensor, Tensor]:
@@ -124,9 +109,7 @@ def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator
 
 
 def dense_matrix(operator: Operator) -> Tensor:
-    """The matrix `[C, n, n]` of `operator`, written with loops and flat indices: a slow twin that
-    shares no code with it.
-    """
+    """The matrix `[C, n, n]` of `operator`, with loops and flat indices: a slow twin."""
     colors, *shape = operator.loss.shape
     strides = (shape[1] * shape[2], shape[2], 1)
     matrix = torch.zeros(colors, math.prod(shape), math.prod(shape), dtype=operator.loss.dtype)
@@ -148,10 +131,8 @@ def dense_matrix(operator: Operator) -> Tensor:
 
 def convergence_order(steps: list[float], errors: list[float]) -> float:
     """The slope of log error against log step: the order of convergence."""
-    x, y = (
-        torch.tensor(steps, dtype=torch.float64).log(),
-        torch.tensor(errors, dtype=torch.float64).log(),
-    )
+    x = torch.tensor(steps, dtype=torch.float64).log()
+    y = torch.tensor(errors, dtype=torch.float64).log()
     x = x - x.mean()
     return float((x * y).sum() / (x * x).sum())
 
@@ -166,6 +147,30 @@ def render_tangent(
             key: (primal.clone(), torch.zeros_like(primal) if tangent is None else tangent.clone())
             for key, (primal, tangent) in pairs.items()
         }
+
+
+def assert_derivatives(
+    total: Callable[[dict[str, Tensor]], Tensor], values: dict[str, Tensor], error: float = 1e-5
+) -> None:
+    """Asserts that tangent, adjoint and differences of `total` agree, along a way in all `values`.
+
+    Each of them changes it alike: none can hide behind the others.
+    """
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+    bars, ways = torch.autograd.grad(total(leaves), [*leaves.values()]), {}
+    for seed, (name, bar) in enumerate(zip(values, bars, strict=True)):
+        way = random_values(*bar.shape, seed=seed) * bar.sign()
+        ways[name] = way / (bar * way).sum()
+    with forward_ad.dual_level():
+        duals = {n: forward_ad.make_dual(value.detach(), ways[n]) for n, value in values.items()}
+        tangent = float(forward_ad.unpack_dual(total(duals)).tangent)
+    assert abs(tangent / len(values) - 1) < 1e-9
+    with torch.no_grad():
+        up, down = (
+            total({name: value + step * ways[name] for name, value in values.items()})
+            for step in (1e-5, -1e-5)
+        )
+    assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
 
 
 def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
@@ -183,9 +188,6 @@ def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
-    """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`.
-
-    A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
-    """
+    """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`."""
     weights = peaked_series(seen.phase, seen.degree, depth[..., None])
     return (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)

@@ -1,6 +1,4 @@
-"""A Python that has the module `openvdb`: this one, or else the system's, where apt-get has put
-Debian's python3-openvdb.
-"""
+"""A Python that has the module `openvdb`: this one, or the system's, of Debian's package."""
 
 import functools
 import json

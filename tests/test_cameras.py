@@ -25,13 +25,10 @@ def camera(
 def test_a_pose_is_rigid_and_looks_at_its_target():
     pose = look_at(ORIGIN, TARGET, UP)
     right, up, backward, origin = pose.unbind(1)
-    torch.testing.assert_close(
-        pose[:, :3].T @ pose[:, :3], torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-15
-    )
+    turn, middle = pose[:, :3], origin - backward * (TARGET - ORIGIN).norm()
+    torch.testing.assert_close(turn.T @ turn, torch.eye(3).double(), rtol=0, atol=1e-15)
     torch.testing.assert_close(torch.linalg.cross(right, up), backward, rtol=0, atol=1e-15)
-    torch.testing.assert_close(
-        origin - backward * (TARGET - ORIGIN).norm(), TARGET, rtol=0, atol=1e-14
-    )
+    torch.testing.assert_close(middle, TARGET, rtol=0, atol=1e-14)
     assert up @ UP > 0 and abs(right @ UP) < 1e-15
 
 
@@ -53,20 +50,16 @@ def test_every_ray_against_explicit_pixel_arithmetic(
     view = replace(view, pixel_aspect=aspect, principal_point=middle)
     bundle = cast_rays(view, (0.25, 0.75))
     right, up, backward, origin = view.pose.unbind(1)
-    height, width = view.size
+    (height, width), both = view.size, (bundle.origin, bundle.direction)
     for row in range(height):
         for column in range(width):
             x = 2 * ((column + 0.75) / width - middle[0]) * view.half_width
             y = 2 * (middle[1] * height - (row + 0.25)) / width * view.half_width * aspect
             shift = x * right + y * up
-            start, toward = (
-                (origin, shift - backward) if is_perspective else (origin + shift, -backward)
-            )
-            index = row * width + column
-            torch.testing.assert_close(bundle.origin[index].flip(0), start, rtol=0, atol=1e-14)
-            torch.testing.assert_close(
-                bundle.direction[index].flip(0), toward / toward.norm(), rtol=0, atol=1e-15
-            )
+            ends = (origin, shift - backward) if is_perspective else (origin + shift, -backward)
+            place, way = (part[row * width + column].flip(0) for part in both)
+            torch.testing.assert_close(place, ends[0], rtol=0, atol=1e-14)
+            torch.testing.assert_close(way, ends[1] / ends[1].norm(), rtol=0, atol=1e-15)
 
 
 def test_only_perspective_rays_meet():
@@ -77,26 +70,22 @@ def test_only_perspective_rays_meet():
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective: bool):
     """Also where its size is no whole fraction, and whatever the principal point."""
-    view = replace(
-        camera((7, 11), is_perspective=is_perspective), principal_point=(0.3, 0.6), pixel_aspect=1.1
-    )
+    view = camera((7, 11), is_perspective=is_perspective)
+    view = replace(view, principal_point=(0.3, 0.6), pixel_aspect=1.1)
     assert view.resize(100).size == (1, 1)
     for factor in (2, 3, 100):
         for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
             small, large = cast_rays(view.resize(factor), corner), cast_rays(view, corner)
-            torch.testing.assert_close(
-                small.direction[index], large.direction[index], rtol=0, atol=1e-15
-            )
-            torch.testing.assert_close(small.origin[index], large.origin[index], rtol=0, atol=1e-14)
+            for name, error in (("direction", 1e-15), ("origin", 1e-14)):
+                one, other = (getattr(rays, name)[index] for rays in (small, large))
+                torch.testing.assert_close(one, other, rtol=0, atol=error)
 
 
 @given(st.integers(1, 64))
 def test_samples_are_centers_of_equal_parts(samples: int):
     offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
     assert len({(round(a, 9), round(b, 9)) for a, b in offsets.tolist()}) == samples
-    torch.testing.assert_close(
-        offsets.mean(0), torch.full((2,), 0.5, dtype=torch.float64), rtol=0, atol=1e-14
-    )
+    assert offsets.mean(0).tolist() == pytest.approx([0.5, 0.5], abs=1e-14)
     rows, columns = (len(set(line.tolist())) for line in offsets.unbind(1))
     assert rows * columns == samples
     second_moments = ((offsets - 0.5) ** 2).mean(0)
@@ -129,13 +118,10 @@ def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change: torch.Tensor):
 
     turn = change.clone()
     turn[3:] = 0
-    torch.testing.assert_close(
-        seen(twist(camera(), turn, PIVOT)), seen(camera()), rtol=0, atol=1e-13
-    )
-    shift = change - turn
-    torch.testing.assert_close(
-        seen(twist(camera(), shift, PIVOT)), seen(camera()) - shift[3:], rtol=0, atol=1e-13
-    )
+    shift, known = change - turn, seen(camera())
+    turned, shifted = (seen(twist(camera(), each, PIVOT)) for each in (turn, shift))
+    torch.testing.assert_close(turned, known, rtol=0, atol=1e-13)
+    torch.testing.assert_close(shifted, known - shift[3:], rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -145,6 +131,5 @@ def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis:
     change[axis] = math.pi / 2
     before, after = camera().pose, twist(camera(), change, PIVOT).pose
     torch.testing.assert_close(after[:, axis], before[:, axis], rtol=0, atol=1e-13)
-    torch.testing.assert_close(
-        after[:, (axis + 1) % 3], before[:, (axis + 2) % 3], rtol=0, atol=1e-13
-    )
+    following, next_one = after[:, (axis + 1) % 3], before[:, (axis + 2) % 3]
+    torch.testing.assert_close(following, next_one, rtol=0, atol=1e-13)

@@ -1,7 +1,4 @@
-"""Both engines compute the same images and the same derivatives, whatever the scene.
-
-Of each kind of scene in configs/ in 64 bits, with fewer cells and pixels, and of random ones.
-"""
+"""Both engines compute the same images and derivatives, of configs and of random scenes."""
 
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -45,10 +42,7 @@ def variables_of(scene: Scene) -> list[str]:
 
 
 def outcome(scene: Scene, names: Sequence[str], engine: str, first: int = 0) -> list[Tensor]:
-    """The images, and the derivatives by `names` of a sum of their pixels, each by its weight.
-
-    Weights are drawn at random, from the seed `first` on.
-    """
+    """The images, and derivatives by `names` of a sum of pixels, weighted by the seed `first`."""
     use_engine(engine)
     values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
     changed = with_values(scene, values)
@@ -126,14 +120,8 @@ LIGHTS = {
     "points": {"ambient": (0.3,)},
     "sky": {"directional": None},
 }
-KINDS = [
-    ("gray", "gray beam"),
-    ("colored", "beam"),
-    ("colored", "sky"),
-    ("cellwise", "points"),
-    ("cellwise", "ambient"),
-    ("black", "points"),
-]
+KINDS = [("gray", "gray beam"), ("colored", "beam"), ("colored", "sky"), ("black", "points")]
+KINDS += [("cellwise", "points"), ("cellwise", "ambient")]
 VIEWS = {
     "far": {"eye": (0.3, 0.4, 3.0), "half_width": 0.25},
     "near": {"eye": (1.1, 0.5, 0.9), "half_width": 0.9},
@@ -170,12 +158,11 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
     )
     tensor = density.new_tensor
     if lit == "points":
+        beam = tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
         scene.lights += [
             PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
             PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3])),
-            BeamLight(
-                tensor([0.1, 1.0, 0.05]), tensor([-0.2, -1.0, -0.1]), tensor([0.5]), tensor(0.2)
-            ),
+            BeamLight(*beam),
         ]
     if lit == "sky":
         sky = random_values(3, 4, 8, seed=seed + 3, dtype=dtype)

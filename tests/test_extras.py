@@ -1,6 +1,4 @@
-"""Optional packages: each belongs to an extra that pip knows, and where one is absent, the user is
-told which.
-"""
+"""Optional packages: each belongs to an extra, which is named where it is absent."""
 
 import ast
 import re

@@ -18,6 +18,7 @@ from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import optimize
+from ddrecon.scene import View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names
 
@@ -128,6 +129,10 @@ def test_iterations_there_find_what_they_find_on_the_processor(engine: str) -> N
         assert one.test_psnr == pytest.approx(other.test_psnr, abs=1e-2)
 
 
+def mean_square(_: View, image: Tensor) -> Tensor:
+    return image.square().mean()
+
+
 EVERY_KIND = ["lights.2.directions=2", "diffusion.transport_rounds=1", "diffusion.degree=1"]
 GROUND = ["diffusion.transport_rounds=0", "optimize.parameters={density: {}, ground.albedo: {}}"]
 GROUND += ["lights=[{type: directional, direction: [-1, -2, -1], irradiance: 3}]"]
@@ -144,19 +149,14 @@ def test_every_kind_of_derivative_is_found_there(overrides: list[str], engine: s
     for device in (FAR, torch.device("cpu")):
         is_near = engine == "torch" or device != FAR
         with contextlib.nullcontext() if is_near else near_kernels():
-            scene = load_scene(
-                CONFIGS / "gradcheck_all.yaml",
-                overrides=["volume.resolution=[3, 4, 3]", "volume.density=0.5", *overrides],
-                dtype=torch.float64,
-                device=device,
-            )
+            small = ["volume.resolution=[3, 4, 3]", "volume.density=0.5", *overrides]
+            kind = {"dtype": torch.float64, "device": device}
+            scene = load_scene(CONFIGS / "gradcheck_all.yaml", overrides=small, **kind)
             scene = scene if overrides is GROUND else replace(scene, ground=None)
             names = scene.optimize.parameters.keys() & set(variable_names(scene))
             values = {name: value_of(scene, name).requires_grad_() for name in names}
             names = [view.name for view in scene.views]
-            gradients = differentiate(
-                scene, names, values, lambda _, image: image.square().mean(), SolveMemory()
-            ).gradients
-            found.append({name: one.cpu() for name, one in gradients.items()})
+            gone_back = differentiate(scene, names, values, mean_square, SolveMemory())
+            found.append({name: one.cpu() for name, one in gone_back.gradients.items()})
     for name, there in found[0].items():
         torch.testing.assert_close(there, found[1][name], rtol=1e-6, atol=1e-12)

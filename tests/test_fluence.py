@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from media import box_grid, make_scene, random_values, tensor
+from media import assert_derivatives, box_grid, make_scene, random_values, tensor
 from torch import Tensor
-from torch.autograd import forward_ad
 
 import ddrecon
 from ddrecon.balance import find_balance, lines
@@ -64,19 +63,7 @@ def test_fluence_has_tangent_adjoint_and_differences(light: Light, scene: dict[s
     def loss(named: dict[str, Tensor]) -> Tensor:
         return (weights * ddrecon.fluence(with_values(world, named))).sum()
 
-    shifts = {n: random_values(*v.shape, seed=2).view(v.shape) - 0.4 for n, v in values.items()}
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    bars = torch.autograd.grad(loss(leaves), list(leaves.values()))
-    adjoint = sum((bar * shifts[n]).sum() for n, bar in zip(names, bars, strict=True))
-    with forward_ad.dual_level():
-        duals = {n: forward_ad.make_dual(v.clone(), shifts[n]) for n, v in values.items()}
-        tangent = forward_ad.unpack_dual(loss(duals)).tangent
-    with torch.no_grad():
-        up, down = (
-            loss({n: v + sign * 1e-5 * shifts[n] for n, v in values.items()}) for sign in (1, -1)
-        )
-    assert float(tangent) == pytest.approx(float(adjoint), rel=1e-10)
-    assert float(up - down) / 2e-5 == pytest.approx(float(adjoint), rel=1e-6)
+    assert_derivatives(loss, values)
 
 
 def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face() -> None:

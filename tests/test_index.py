@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import assert_derivatives, make_camera, make_scene, random_values, tensor
 from torch import Tensor
-from torch.autograd import forward_ad
 
 import ddrecon
 from ddrecon.balance import find_balance
@@ -23,12 +22,7 @@ from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transm
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
-BEAM = (
-    torch.tensor([0.1, 2.0, 0.0], dtype=torch.float64),
-    torch.tensor([-0.2, -2.0, 0.1], dtype=torch.float64),
-    torch.tensor([2.0], dtype=torch.float64),
-    torch.tensor(0.3, dtype=torch.float64),
-)
+BEAM = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
 
 
 def within(index: float, density: Tensor, **changes: Any) -> Scene:
@@ -138,19 +132,7 @@ def test_images_have_tangent_adjoint_and_differences(
     def loss(named: dict[str, Tensor]) -> Tensor:
         return (weights * ddrecon.render(with_values(world, named))).sum()
 
-    shifts = {n: random_values(*v.shape, seed=2).view(v.shape) - 0.4 for n, v in values.items()}
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    bars = torch.autograd.grad(loss(leaves), list(leaves.values()))
-    adjoint = sum((bar * shifts[n]).sum() for n, bar in zip(names, bars, strict=True))
-    with forward_ad.dual_level():
-        duals = {n: forward_ad.make_dual(v.clone(), shifts[n]) for n, v in values.items()}
-        tangent = forward_ad.unpack_dual(loss(duals)).tangent
-    with torch.no_grad():
-        up, down = (
-            loss({n: v + step * shifts[n] for n, v in values.items()}) for step in (1e-6, -1e-6)
-        )
-    torch.testing.assert_close(adjoint, tangent, rtol=1e-11, atol=0)
-    torch.testing.assert_close(tangent, (up - down) / 2e-6, rtol=1e-6, atol=0)
+    assert_derivatives(loss, values)
 
 
 SCENE = """

@@ -42,9 +42,8 @@ def test_function_transforms_agree_with_backward(name: str) -> None:
 
 
 def small_layer(dtype: torch.dtype = torch.float64, **kind: object) -> VolumeRenderer:
-    scene = make_scene(
-        random_values(*SHAPE, dtype=dtype), ambient=(0.2,), tolerance=1e-6, g=0.3, **kind
-    )
+    density = random_values(*SHAPE, dtype=dtype)
+    scene = make_scene(density, ambient=(0.2,), tolerance=1e-6, g=0.3, **kind)
     scene.starts["density"] = random_values(*SHAPE, dtype=dtype)
     return VolumeRenderer(scene)
 
@@ -62,9 +61,8 @@ def test_the_scene_moves_with_the_layer() -> None:
     assert single.scene.views[0].camera.pose.dtype == torch.float32
     assert single.scene.starts["density"].dtype == torch.float32
     assert value_of(small_layer().to("meta").scene, "lights.0.irradiance").device.type == "meta"
-    with pytest.raises(
-        UsageError, match=r"not computed in torch\.float16; leave the layer in float3"
-    ):
+    told = r"not computed in torch\.float16; leave the layer in float3"
+    with pytest.raises(UsageError, match=told):
         single.half()
     assert single().dtype == torch.float32
 
@@ -88,15 +86,10 @@ def test_a_batch_is_its_entries_one_by_one() -> None:
     """Of densities, cross sections and light directions; the derivative as well."""
     layer = small_layer()
     densities = random_values(3, *SHAPE, seed=1).requires_grad_()
-    batch = {
-        "density": densities,
-        "sigma_s": random_values(3, 3, seed=2),
-        "g": torch.tensor([0.1, 0.3, 0.5], dtype=torch.float64),
-        "values": {
-            "lights.0.direction": random_values(3, 3, seed=3) - 2.0,
-            "lights.1.radiance": random_values(3, seed=4),
-        },
-    }
+    values = {"lights.0.direction": random_values(3, 3, seed=3) - 2.0}
+    values["lights.1.radiance"] = random_values(3, seed=4)
+    batch = {"density": densities, "sigma_s": random_values(3, 3, seed=2), "values": values}
+    batch["g"] = torch.tensor([0.1, 0.3, 0.5], dtype=torch.float64)
     images = layer(**batch)
     weight = random_values(*images.shape, seed=5)
     (gradient,) = torch.autograd.grad((images * weight).sum(), densities)

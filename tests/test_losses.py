@@ -20,10 +20,8 @@ def box(cells: int, side: float = 1.0) -> Grid:
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None:
-    image, target = (
-        torch.rand(3, 4, 5, dtype=torch.float64),
-        torch.rand(3, 4, 5, dtype=torch.float64),
-    )
+    image = torch.rand(3, 4, 5, dtype=torch.float64)
+    target = torch.rand(3, 4, 5, dtype=torch.float64)
     assert image_loss(loss, target, target) == 0
     values = [
         float(image_loss(loss, target + part * (image - target), target))
@@ -42,10 +40,9 @@ def test_a_loss_of_radiance_grows_with_the_square_of_all_brightness(loss: str) -
 def test_small_errors_are_those_of_displayed_values() -> None:
     target = torch.linspace(0.0005, 0.99, 60, dtype=torch.float64).view(3, 4, 5)
     error = 1e-6 * torch.linspace(-1, 1, 60, dtype=torch.float64).view(3, 4, 5)
-    shown = torch.from_numpy(srgb.encode((target + error).numpy()) - srgb.encode(target.numpy()))
-    assert float(image_loss("display", target + error, target)) == pytest.approx(
-        float(shown.square().mean()), rel=1e-4
-    )
+    shown = srgb.encode((target + error).numpy()) - srgb.encode(target.numpy())
+    found = float(image_loss("display", target + error, target))
+    assert found == pytest.approx(np.square(shown).mean(), rel=1e-4)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -74,15 +71,13 @@ def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
 
 def test_psnr_has_white_for_its_peak() -> None:
     """Of values, and of those that are displayed."""
-    assert Target.of(torch.ones(3, 8, 8), None).psnr_of(
-        torch.ones(3, 8, 8) + 0.01
-    ) == pytest.approx(40, abs=1e-3)
+    one = torch.ones(3, 8, 8)
+    assert Target.of(one, None).psnr_of(one + 0.01) == pytest.approx(40, abs=1e-3)
     target = torch.full((3, 8, 8), 0.2)
     shown = float(srgb.encode(np.array(0.2))) + 0.01
     brighter = torch.full((3, 8, 8), float(srgb.decode(np.array(shown))))
-    assert float(Target.of(target, None, "display").psnr_of(brighter)) == pytest.approx(
-        40, abs=1e-2
-    )
+    found = float(Target.of(target, None, "display").psnr_of(brighter))
+    assert found == pytest.approx(40, abs=1e-2)
 
 
 def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones() -> None:
@@ -90,9 +85,8 @@ def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones(
     small, large, larger = (
         float(image_loss("huber", target + error, target)) for error in (0.01, 10.0, 20.0)
     )
-    assert small == pytest.approx(1e-4, rel=1e-9) and larger - large == pytest.approx(
-        2 * HUBER * 10, rel=1e-9
-    )
+    assert small == pytest.approx(1e-4, rel=1e-9)
+    assert larger - large == pytest.approx(2 * HUBER * 10, rel=1e-9)
 
 
 def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
@@ -109,17 +103,15 @@ def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
 def test_masked_pixels_do_not_count(loss: str) -> None:
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
     spoiled, noise = torch.where(mask > 0, target, target + 100), Noise(0.01, 0.0)
-    assert image_loss(loss, image, spoiled, mask, noise) == image_loss(
-        loss, image, target, mask, noise
-    )
+    one, other = (image_loss(loss, image, each, mask, noise) for each in (spoiled, target))
+    assert one == other
 
 
 def test_what_counts_is_averaged() -> None:
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
     kept = mask.bool()
-    assert float(image_loss("l2", image, target, mask)) == pytest.approx(
-        float(((image - target)[:, kept] ** 2).mean()), rel=1e-6
-    )
+    expected = float(((image - target)[:, kept] ** 2).mean())
+    assert float(image_loss("l2", image, target, mask)) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("cells", [8, 16, 32])
@@ -132,9 +124,8 @@ def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells: int) ->
 
 def test_total_variation_does_not_depend_on_world_scale() -> None:
     field = torch.rand(6, 6, 6, dtype=torch.float64)
-    assert float(total_variation(field, box(6))) == pytest.approx(
-        float(total_variation(field, box(6, 7.0))), rel=1e-12
-    )
+    one, other = (float(total_variation(field, box(6, side))) for side in (1.0, 7.0))
+    assert one == pytest.approx(other, rel=1e-12)
 
 
 @pytest.mark.parametrize("of", [torch.clone, lambda x: compress(x, 0.1)])

@@ -1,9 +1,6 @@
-"""The derivative by every block of cells against path replay backpropagation (Mitsuba 3) for the
-plume of data/plume.
+"""The plume's derivative by blocks of 4^3 cells, against path replay backpropagation (Mitsuba 3).
 
-`data/plume/gradient.npz` holds d(mean of the image)/d(density) summed over blocks of 4^3 cells, and
-its standard error. That estimator sees no empty cells, so blocks of a mean density below 0.05 are
-left out.
+That estimator sees no empty cells: blocks of a mean density below 0.05 are left out.
 """
 
 from pathlib import Path

@@ -24,17 +24,13 @@ def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
     camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 0.7
     moved = turn_camera(camera, axis, angle, CENTER)
     change = moved.pose[:, :3] @ camera.pose[:, :3].T
-    middle, along = (
-        torch.tensor(CENTER, dtype=torch.float64),
-        torch.eye(3, dtype=torch.float64)[axis],
-    )
+    middle = torch.tensor(CENTER, dtype=torch.float64)
+    along = torch.eye(3, dtype=torch.float64)[axis]
     assert torch.allclose(change @ change.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
-    assert torch.allclose(change @ along, along, atol=1e-14) and float(
-        change.trace()
-    ) == pytest.approx(1 + 2 * math.cos(angle))
-    assert torch.allclose(
-        moved.pose[:, 3] - middle, change @ (camera.pose[:, 3] - middle), atol=1e-14
-    )
+    assert torch.allclose(change @ along, along, atol=1e-14)
+    assert float(change.trace()) == pytest.approx(1 + 2 * math.cos(angle))
+    before, after = (each.pose[:, 3] - middle for each in (camera, moved))
+    assert torch.allclose(after, change @ before, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -53,19 +49,16 @@ def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
     assert torch.allclose(views[0].camera.pose, scene.views[0].camera.pose, atol=1e-15)
     center, axis = scene.volume.grid.center_xyz, upright_axis([view.camera for view in scene.views])
-    assert torch.allclose(
-        turn_camera(views[7].camera, axis, math.pi / 4, center).pose,
-        views[0].camera.pose,
-        atol=1e-14,
-    )
+    again = turn_camera(views[7].camera, axis, math.pi / 4, center).pose
+    assert torch.allclose(again, views[0].camera.pose, atol=1e-14)
 
 
 def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it() -> None:
     density, grid = random_values(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
-    scene = make_scene(density, grid=grid, directional=None, ambient=(1.0,))
-    turned_density = (
-        density.transpose(0, 2).flip(0).contiguous()
-    )  # what was along z is along x, what was along x along -z
-    other = make_scene(turned_density, grid=grid, directional=None, ambient=(1.0,))
+    sky = {"directional": None, "ambient": (1.0,)}
+    scene = make_scene(density, grid=grid, **sky)
+    # What was along z is along x, what was along x along -z.
+    turned = density.transpose(0, 2).flip(0).contiguous()
+    other = make_scene(turned, grid=grid, **sky)
     other.views = place_turntable(scene, scene.views[0], 4)
     assert torch.allclose(render(scene), render(other, "ring_001"), atol=1e-9)

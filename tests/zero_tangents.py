@@ -1,7 +1,4 @@
-"""In forward mode torch asks Python for the shape of every tangent that is zero, 0.25 ms each time.
-
-That is most of the time of small scenes. C++ knows sums and products as well.
-"""
+"""In forward mode torch asks Python for zeros' shapes, 0.25 ms each; C++ knows sums, products."""
 
 import torch
 

@@ -53,12 +53,8 @@ def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
     image = torch.ones(3, 2, 2)
     truth = Traced(image.numpy(), 0.09)
     told = {"base": (1.02, 1.0), "slower": (1.0, 2.0), "Mitsuba 16 paths a pixel": (1.3, 72.0)}
-    rows = with_best(
-        [
-            row_of(name, [Shot(factor * image, None, seconds, 0.0, 16)], None, truth)
-            for name, (factor, seconds) in told.items()
-        ]
-    )
+    shots = {n: Shot(factor * image, None, time, 0.0, 16) for n, (factor, time) in told.items()}
+    rows = with_best([row_of(name, [shot], None, truth) for name, shot in shots.items()])
     _, _, *lines, remark = bench_lines(rows)
     assert [line.split(" | ")[7] for line in lines] == ["< 0.03", "< 0.03", "0.286"]
     assert [row.name for row in rows if row.is_best] == ["base"]

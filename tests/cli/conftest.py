@@ -17,9 +17,7 @@ Run = Callable[..., Result]
 
 @pytest.fixture(autouse=True)
 def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What commands change in their process is put back; Ctrl-C works even where the tests run in
-    the background.
-    """
+    """What commands change in their process is put back; Ctrl-C works in the background too."""
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
@@ -57,9 +55,7 @@ def succeed(run: Run) -> Run:
 
 @pytest.fixture
 def refuse(run: Run, folder: Path) -> Callable[..., list[str]]:
-    """Runs a command that must exit with `code`, print nothing and leave every file as it was; the
-    lines on stderr.
-    """
+    """The lines on stderr of a command that must exit with `code`, and print and write nothing."""
 
     def run_badly(code: int, *arguments: str) -> list[str]:
         before = contents(folder)

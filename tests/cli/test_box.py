@@ -36,11 +36,7 @@ def scene(folder: Path) -> Callable[..., Path]:
     """Writes a film of a ball in two places, before what pictures show without it."""
 
     def write(
-        lens: str = "pinhole",
-        behind: float = 0.0,
-        ball: float = 0.5,
-        more: str = "",
-        radius: float = RADIUS,
+        lens: str = "pinhole", behind: float = 0, ball: float = 0.5, more: str = "", radius=RADIUS
     ) -> Path:
         views = [
             f"  - {{name: v{i}, image: 'v{i}_{{frame}}.npy', {more} camera: {{{LENSES[lens]}, "
@@ -53,11 +49,9 @@ def scene(folder: Path) -> Callable[..., Path]:
         for frame, center in enumerate(CENTERS):
             for i in range(len(PLACES)):
                 np.save(f"v{i}_{frame}.npy", np.zeros((70, 90, 3), np.float32))
-            sizes = [
-                "volume.bounds={min: [-1, -1, -1], max: [1, 1, 1]}",
-                "volume.resolution=[4, 4, 4]",
-            ]
-            for i, view in enumerate(load_scene(path, overrides=sizes).views):
+            box = "volume.bounds={min: [-1, -1, -1], max: [1, 1, 1]}"
+            sized = load_scene(path, overrides=[box, "volume.resolution=[4, 4, 4]"])
+            for i, view in enumerate(sized.views):
                 rays = cast_rays(view.camera)
                 away = torch.tensor(center[::-1]) - rays.origin
                 along = (away * rays.direction).sum(1, keepdim=True)
@@ -80,11 +74,8 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
     for axis in range(3):
         low, high = (end([c[axis] for c in CENTERS]) for end in (min, max))
         # Two pixels on each side are asked for, and the ball seen through a cell is in all of it.
-        for side in (
-            low - RADIUS - volume.bounds.min[axis],
-            volume.bounds.max[axis] - RADIUS - high,
-        ):
-            assert pixel < side < 9 * pixel
+        ends = low - RADIUS - volume.bounds.min[axis], volume.bounds.max[axis] - RADIUS - high
+        assert pixel < min(ends) <= max(ends) < 9 * pixel
     cells = np.subtract(volume.bounds.max, volume.bounds.min) / volume.resolution
     np.testing.assert_allclose(cells, 2 * pixel, rtol=0.05)
     dump_scene(describe(found), Path("plain.yaml"))
@@ -99,9 +90,8 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
     dark = scene(behind=0.9, ball=0.4, more="background: 0.9,")
     assert read_scene(dark).tree.volume == bright
     np.save("empty.npy", np.full((70, 90, 3), 0.9, np.float32))
-    assert (
-        read_scene(scene(behind=0.9, ball=0.4, more="background: empty.npy,")).tree.volume == bright
-    )
+    dark = scene(behind=0.9, ball=0.4, more="background: empty.npy,")
+    assert read_scene(dark).tree.volume == bright
     told = run("check", "auto.yaml").stdout
     assert f"from {list(bright.bounds.min)} to {list(bright.bounds.max)}" in told
     assert "within bounds: {min: [" in told
@@ -112,29 +102,17 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
 @pytest.mark.parametrize(
     ("make", "overrides", "line"),
     [
-        (
-            {"behind": 0.9, "radius": 0.5},
-            [],
-            "view 'v0' shows something along most of its edges, so its backgr",
-        ),
+        ({"behind": 0.9, "radius": 0.5}, [], "view 'v0' shows something along most of its edges,"),
         ({}, [f"views.{i}.split=test" for i in range(3)], "no training views all show something"),
         ({}, [f"views.{i}.split=test" for i in range(2)], "the views leave it open; more from oth"),
-        (
-            {"behind": 0.9},
-            [],
-            "no training views all show something: give background where smoke is",
-        ),
+        ({"behind": 0.9}, [], "no training views all show something: give background where"),
         ({}, ["views.0.camera.target=[0, 6, 0]"], "of each place some view shows nothing"),
         ({}, ["volume.bounds=null"], "volume.resolution: auto takes volume.bounds, a box in num"),
         ({}, ["frames.last=2"], "does not exist"),
     ],
 )
 def test_what_pictures_do_not_tell_is_asked_for(
-    scene: Callable[..., Path],
-    refuse: Callable[..., list[str]],
-    make: dict[str, float],
-    overrides: list[str],
-    line: str,
+    scene: Callable[..., Path], refuse, make: dict[str, float], overrides: list[str], line: str
 ) -> None:
     scene(**make)
     (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))

@@ -23,35 +23,26 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize(
-    ("override", "present", "absent"),
-    [
-        ("volume.g=0.3", "fluxes Q1 and L1 (g is not 0)", "no fluxes"),
-        ("volume.g=0.5", "angles to degree 3: 16 moments of light (g is not 0)", "no fluxes"),
-        ("volume.g=-0.8", "beams in pairs: a backward peak turns 0.262 of", "delta-Eddington"),
-        ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
-        ("diffusion.scheme=printed", "printed scheme by Jacobi", "multigrid"),
-        (
-            "diffusion.model=flux_limited",
-            "flux_limited diffusion, marshak limiter, damped Picard iteration with multigrid",
-            "closure",
-        ),
-        ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
-        ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
-        ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),
-        (
-            "lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]",
-            "1 directional light",
-            "ambient",
-        ),
-        (
-            "lights=[{type: point, position: [0, 2, 0], intensity: 1}]",
-            "towards 1 point light",
-            "directional",
-        ),
-        ("volume.sigma_s=2", "1 color channel", "3 color channels"),
-    ],
-)
+LIMITED = "flux_limited diffusion, marshak limiter, damped Picard iteration with multigrid"
+SUN = "lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]"
+LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
+PHYSICS = [
+    ("volume.g=0.3", "fluxes Q1 and L1 (g is not 0)", "no fluxes"),
+    ("volume.g=0.5", "angles to degree 3: 16 moments of light (g is not 0)", "no fluxes"),
+    ("volume.g=-0.8", "beams in pairs: a backward peak turns 0.262 of", "delta-Eddington"),
+    ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
+    ("diffusion.scheme=printed", "printed scheme by Jacobi", "multigrid"),
+    ("diffusion.model=flux_limited", LIMITED, "closure"),
+    ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
+    ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
+    ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),
+    (SUN, "1 directional light", "ambient"),
+    (LAMP, "towards 1 point light", "directional"),
+    ("volume.sigma_s=2", "1 color channel", "3 color channels"),
+]
+
+
+@pytest.mark.parametrize(("override", "present", "absent"), PHYSICS)
 def test_only_the_physics_a_scene_needs(
     succeed: Run, override: str, present: str, absent: str
 ) -> None:
@@ -65,21 +56,18 @@ def test_suns_and_sky_of_an_environment_map(succeed: Run) -> None:
     pixels = np.ones((32, 64, 3), np.float32)
     pixels[[8, 20], [10, 40]] = 3000
     np.save("sky.npy", pixels)
-    report = succeed(
-        "check", "scene.yaml", "-D", "lights=[{type: environment, file: sky.npy}]"
-    ).stdout
-    assert (
-        "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow"
-        in report
-    )
+    sky = "lights=[{type: environment, file: sky.npy}]"
+    told = "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow"
+    assert told in succeed("check", "scene.yaml", "-D", sky).stdout
 
 
 def test_json(succeed: Run) -> None:
     report = json.loads(succeed("check", "scene.yaml", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
-    assert [
-        (view["name"], view["width"], view["height"], view["split"]) for view in report["views"]
-    ] == [("front", 8, 6, "train"), ("side", 8, 6, "test")]
+    views = [
+        [view[key] for key in ("name", "width", "height", "split")] for view in report["views"]
+    ]
+    assert views == [["front", 8, 6, "train"], ["side", 8, 6, "test"]]
     assert report["optimizes"] == {"density": 120} and report["memory_bytes"] > 0
 
 

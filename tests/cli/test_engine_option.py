@@ -53,13 +53,11 @@ def test_version_names_the_engine(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert result.stderr.startswith("DDRECON_ENGINE=cuda: no such engine; known: ")
 
 
+WARP = "engine: warp (view rays, light, diffusion, transport rounds)"
+
+
 @pytest.mark.parametrize(
-    ("name", "line"),
-    [
-        ("warp", "engine: warp (view rays, light, diffusion, transport rounds)"),
-        ("auto", "engine: warp (view rays, light, diffusion, transport rounds)"),
-        ("torch", "engine: torch"),
-    ],
+    ("name", "line"), [("warp", WARP), ("auto", WARP), ("torch", "engine: torch")]
 )
 def test_check_names_it(succeed: Run, name: str, line: str) -> None:
     assert line in succeed("check", "scene.yaml", "--engine", name).stdout.splitlines()
@@ -108,11 +106,8 @@ def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.Mo
     command = "optimize", "scene.yaml", "-o", "out", "--engine"
     (line,) = refuse(3, *command, "warp")
     assert line == 'engine warp needs warp: pip install "ddrecon[fast]"'
-    gone = "CUDA graphs are no longer there; take warp"
-    for name, answer in {
-        "cuda": "no such engine; known: auto, torch, warp",
-        "warp-graph": gone,
-    }.items():
+    unknown, gone = "no such engine; known: auto, torch, warp", "CUDA graphs are no longer there"
+    for name, answer in {"cuda": unknown, "warp-graph": f"{gone}; take warp"}.items():
         assert f"'{name}' is not one of" in refuse(2, *command, name)[-1]
         monkeypatch.setenv("DDRECON_ENGINE", name)
         assert refuse(2, *command[:-1]) == [f"DDRECON_ENGINE={name}: {answer}"]

@@ -23,10 +23,8 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert result.stdout == "written: smoke.xml, smoke.sigma_t.vol\n"
     root = ElementTree.parse("smoke.xml").getroot()
     assert [sensor.attrib["id"] for sensor in root.iter("sensor")] == ["sensor_0", "sensor_1"]
-    assert {emitter.attrib["type"] for emitter in root.iter("emitter")} == {
-        "directional",
-        "constant",
-    }
+    kinds = {emitter.attrib["type"] for emitter in root.iter("emitter")}
+    assert kinds == {"directional", "constant"}
 
 
 def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
@@ -63,9 +61,8 @@ def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
     succeed("export", "density.npz", "smoke.albedo.vol", "-o", f"both{suffix}")
     assert field_names(Path(f"both{suffix}")) == ["density", "albedo"]
     for name, source in (("density", "density.npz"), ("albedo", "smoke.albedo.vol")):
-        assert np.array_equal(
-            read_field(Path(f"both{suffix}"), name).values, read_field(Path(source), name).values
-        )
+        both, known = (read_field(Path(one), name) for one in (f"both{suffix}", source))
+        assert np.array_equal(both.values, known.values)
 
 
 def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
@@ -97,9 +94,8 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
         f"fields: density; the same everywhere, not written: {constants}",
         "written: run.vdb",
     ]
-    ours, theirs = (
-        read_field(Path(name), "density") for name in ("run.vdb", "run/volumes/density.npz")
-    )
+    files = "run.vdb", "run/volumes/density.npz"
+    ours, theirs = (read_field(Path(name), "density") for name in files)
     assert np.array_equal(ours.values, theirs.values) and np.array_equal(ours.bounds, theirs.bounds)
     by_cell = "-D", "volume.sigma_s={file: density.npz, name: density}"
     succeed("export", "scene.yaml", "-o", "by_cell.npz", *by_cell)
@@ -108,9 +104,8 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
     succeed("optimize", "scene.yaml", "-o", "field", "-q", "--iterations", "2", "-D", sought)
     assert "sigma_t 6.5 5.5 4.5" in succeed("export", "field", "-o", "field.npz").stdout
     assert field_names(Path("field.npz")) == ["density", "albedo"]
-    assert refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1].startswith(
-        "Error: one scene"
-    )
+    told = refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1]
+    assert told.startswith("Error: one scene")
 
 
 @pytest.mark.parametrize(("name", "colors"), [("g", ()), ("albedo", (3,)), ("velocity", (3,))])

@@ -15,6 +15,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("shapes_by_python")]
 
 def test_commands_end_well_there(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Session, "start", lambda _: FAR)
+    text = Path("scene.yaml").read_text()
+    Path("scene.yaml").write_text(text.replace("  - {type: ambient, radiance: 0.1}\n", ""))
     succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "2")
     succeed("optimize", "scene.yaml", "-o", "run", "--iterations", "3", "--resume")
     succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1")

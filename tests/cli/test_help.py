@@ -27,15 +27,12 @@ def test_help_imports_nothing_heavy() -> None:
 @pytest.mark.parametrize("command", main.commands)
 def test_a_command_says_what_it_does(command: str) -> None:
     result = CliRunner().invoke(main, [command, "--help"])
-    assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in " ".join(
-        result.stdout.split()
-    )
+    assert result.exit_code == 0
+    assert main.commands[command].help.splitlines()[0] in " ".join(result.stdout.split())
     assert "--debug" in result.stdout
     computes = command not in ("watch", "info", "export")
-    assert all(
-        (f" {option} " in result.stdout) == computes
-        for option in ("--device", "--engine", "--threads", "--seed", "--quiet")
-    )
+    for option in ("--device", "--engine", "--threads", "--seed", "--quiet"):
+        assert (f" {option} " in result.stdout) == computes
     assert ("-D KEY.PATH=VALUE" in result.stdout) == (command != "watch")
 
 
@@ -43,7 +40,6 @@ def test_version(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DDRECON_ENGINE", "torch")
     python = ".".join(map(str, sys.version_info[:3]))
     (line,) = CliRunner().invoke(main, ["--version"]).stdout.splitlines()
-    assert line.startswith(
-        f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, engine torch, device "
-    )
+    versions = f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, engine torch, "
+    assert line.startswith(f"{versions}device ")
     assert line.endswith(" cpu") or torch.cuda.is_available()

@@ -32,11 +32,9 @@ def test_json(succeed: Run) -> None:
     report = json.loads(succeed("info", "density.npz", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
     field = report["fields"]["density"]
-    assert (
-        field["colors"] == 1
-        and 0 < field["min"] < field["mean"] < field["max"] < 1
-        and field["filled"] == 1
-    )
+    assert field["colors"] == 1
+    assert 0 < field["min"] < field["mean"] < field["max"] < 1
+    assert field["filled"] == 1
 
 
 def test_the_volume_of_a_scene(succeed: Run) -> None:
@@ -50,7 +48,5 @@ def test_the_volume_of_a_scene(succeed: Run) -> None:
 
 def test_an_image(succeed: Run) -> None:
     np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
-    assert (
-        succeed("info", "picture.npy").stdout
-        == "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
-    )
+    told = "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
+    assert succeed("info", "picture.npy").stdout == told

@@ -16,10 +16,8 @@ class PressAt(importlib.abc.MetaPathFinder):
 """
 CHECK = "from ddrecon.cli import main; main(['check', 'scene.yaml'])"
 MOMENTS = {
-    **{
-        f"{module} is imported": f"sys.meta_path.insert(0, PressAt({module!r})); {CHECK}"
-        for module in ("click", "torch")
-    },
+    "click is imported": f"sys.meta_path.insert(0, PressAt('click')); {CHECK}",
+    "torch is imported": f"sys.meta_path.insert(0, PressAt('torch')); {CHECK}",
     "a command runs": f"""
 import ddrecon.scene_file.load as load
 load._text = lambda path: press()
@@ -36,7 +34,6 @@ load._text = read
 
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_an_interrupt_is_one_line(folder: object, moment: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PRESS + MOMENTS[moment]], capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", PRESS + MOMENTS[moment]]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")

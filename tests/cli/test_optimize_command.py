@@ -91,20 +91,16 @@ def test_the_environment(succeed: Run) -> None:
     given = {"threads": 1, "seed": 7, "dtype": "float64", "device": "cpu"}
     options = [word for name, value in given.items() for word in (f"--{name}", str(value))]
     succeed(*OPTIMIZE, "out", *options, "--iterations", "1")
-    assert (given | {"torch": torch.__version__}).items() <= read_json(
-        "out/environment.json"
-    ).items()
+    told = read_json("out/environment.json")
+    assert (given | {"torch": torch.__version__}).items() <= told.items()
     assert torch.get_num_threads() == 1
 
 
 def test_previews_along_the_way(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out", "--preview-every", "2")
-    names = {path.stem for path in Path("out/previews").iterdir()}
-    assert names == {
-        f"{name}{mark}"
-        for name in ("density.slices", "front", "side")
-        for mark in ("", ".000002", ".000004")
-    }
+    names, marks = ("density.slices", "front", "side"), ("", ".000002", ".000004")
+    found = {path.stem for path in Path("out/previews").iterdir()}
+    assert found == {f"{name}{mark}" for name in names for mark in marks}
 
 
 def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
@@ -153,16 +149,13 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     result = run(*OPTIMIZE, "out", "-D", overrides[0], "-D", overrides[1])
     assert (result.exit_code, result.stdout) == (4, "")
     (line,) = result.stderr.splitlines()
-    assert re.match(
-        r"iteration 2: .* not finite; at most, density at voxel \[\d, \d, \d\] is \d", line
-    )
+    told = r"iteration 2: .* not finite; at most, density at voxel \[\d, \d, \d\] is \d"
+    assert re.match(told, line)
     assert "; lower optimize.parameters.density.lr (now 1e+37); " in line
     assert "; the state after 0 iterations is kept in out/checkpoints/last.pt" in line
     state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
-    assert (
-        torch.isfinite(state["parameters"]["density"]["value"]).all()
-        and state["total"]["iteration"] == len(rows("out")) - 1
-    )
+    assert torch.isfinite(state["parameters"]["density"]["value"]).all()
+    assert state["total"]["iteration"] == len(rows("out")) - 1
 
 
 def test_a_run_that_ends_by_itself_says_why(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,6 @@
 
 import csv
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,9 +20,8 @@ OPTIMIZE = ["optimize", "scene.yaml", "-q", "--iterations", "4", *FINER, "-o"]
 
 
 def iterations(folder: str) -> list[int]:
-    return [
-        int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
-    ]
+    _, *rows = Path(folder, "loss.csv").read_text().splitlines()
+    return [int(row.split(",")[0]) for row in rows]
 
 
 def cells(folder: str) -> list[int]:
@@ -47,26 +43,21 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
     monkeypatch.setattr(owner, name, pressed)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name", "call"),
-    [
-        pytest.param(loop, "differentiate", 3, id="after a render at a new resolution"),
-        pytest.param(Parameter, "step", 1, id="after the first step"),
-        pytest.param(Parameter, "step", 3, id="after a later step"),
-    ],
-)
+MOMENTS = {
+    "after a render at a new resolution": (loop, "differentiate", 3),
+    "after the first step": (Parameter, "step", 1),
+    "after a later step": (Parameter, "step", 3),
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
 def test_an_interrupted_run_goes_on_to_the_same_bits(
-    run: Run,
-    succeed: Run,
-    density_of: DensityOf,
-    monkeypatch: pytest.MonkeyPatch,
-    owner: Any,
-    name: str,
-    call: int,
+    run: Run, succeed: Run, density_of: DensityOf, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
+    call = MOMENTS[moment][-1]
     succeed(*OPTIMIZE, "whole")
     with monkeypatch.context() as patch:
-        press_ctrl_c_in(patch, owner, name, call)
+        press_ctrl_c_in(patch, *MOMENTS[moment])
         result = run(*OPTIMIZE, "parts")
     assert (result.exit_code, result.stdout) == (130, "")
     assert len(result.stderr.splitlines()) == 1 and "interrupted" in result.stderr
@@ -87,34 +78,3 @@ def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
     succeed("optimize", "out/scene.yaml", "-q", "--iterations", "5", "-o", "out", "--resume")
     assert iterations("out") == [1, 2, 3, 4, 5] and set(cells("out")[2:]) == {reached}
     assert Path("out/loss.csv").read_text().startswith(first)
-
-
-def wait_for_rows(process: subprocess.Popen[str], log: Path, count: int) -> None:
-    end = time.monotonic() + 60
-    while not log.exists() or log.read_text().count("\n") <= count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-@pytest.mark.slow
-def test_ctrl_c_in_a_terminal(folder: Path, succeed: Run) -> None:
-    command = [sys.executable, "-m", "ddrecon", "optimize", "scene.yaml", "-o", "out"]
-    command += ["--iterations", "100000"]
-    process = subprocess.Popen(
-        command,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        wait_for_rows(process, Path("out/loss.csv"), 3)
-        process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert (process.returncode, stdout) == (130, "") and "Traceback" not in stderr
-    done = len(iterations("out"))
-    succeed("optimize", "scene.yaml", "-q", "-o", "out", "--resume", "--iterations", str(done + 2))
-    assert iterations("out") == list(range(1, done + 3))

@@ -5,22 +5,23 @@ import sys
 from pathlib import Path
 
 SCENE = "{volume: {bounds: 3, resolution: [1, 1], densty: 1}, views: [{camera: {}}]}"
-COMMANDS = (
-    ["check", "missing.yaml"],
-    ["check", "missing"],
-    ["check", "wrong.yaml"],
-    ["optimize", "wrong.yaml", "-o", "out", "--iterations", "3"],
-    ["render", "wrong.yaml", "-o", "out", "--ring", "3"],
-    ["render", "scene.yaml", "-o", "out", "-D", "volume.g=2"],
-    ["gradcheck", "scene.yaml", "-D", "volume.desity=1"],
-    ["reference", "scene.yaml", "-o", "out", "-D", "views=3"],
-    ["bench", "scene.yaml", "-D", "volume"],
-    ["info", "wrong.yaml"],
-    ["export", "wrong.yaml", "-o", "out.vdb"],
-    ["check", "scene.yaml", "--dtype", "float16"],
-    ["info", "gone.vdb"],
-    ["export", "gone.npz", "-o", "out.vdb"],
-)
+TABLE = """
+check missing.yaml
+check missing
+check wrong.yaml
+optimize wrong.yaml -o out --iterations 3
+render wrong.yaml -o out --ring 3
+render scene.yaml -o out -D volume.g=2
+gradcheck scene.yaml -D volume.desity=1
+reference scene.yaml -o out -D views=3
+bench scene.yaml -D volume
+info wrong.yaml
+export wrong.yaml -o out.vdb
+check scene.yaml --dtype float16
+info gone.vdb
+export gone.npz -o out.vdb
+"""
+COMMANDS = [line.split() for line in TABLE.strip().splitlines()]
 PROGRAM = f"""
 import sys
 from click.testing import CliRunner

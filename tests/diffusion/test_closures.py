@@ -56,10 +56,7 @@ def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
 
 
 def mean_inverse_distance(grid: Grid, points: Tensor, part: float = 1.0) -> Tensor:
-    """That of the origin to a cell of `grid` at each of `points` [N, 3], by Gauss-Legendre.
-
-    `part`: of the widths of a cell.
-    """
+    """That of the origin to a cell, `part` of it wide, at `points` [N, 3], by Gauss-Legendre."""
     nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(20))
     size = part * torch.tensor(grid.spacing, dtype=torch.float64)
     within = torch.cartesian_prod(nodes, nodes, nodes) / 2 * size
@@ -96,9 +93,7 @@ def test_flat_cells_have_distances_of_their_shape():
 
 
 def sphere(grid: Grid, radius: float) -> tuple[Tensor, Tensor]:
-    """The distance of cells to the middle of `grid`, `[1, z, y, x]`, and a sphere of extinction 200
-    there.
-    """
+    """The distance of cells to the middle, `[1, z, y, x]`, and a sphere of extinction 200 there."""
     z, y, x = grid.centers(torch.zeros((), dtype=torch.float64))
     distance = (z * z + y * y + x * x).sqrt()[None]
     return distance, 200 * (distance < radius).double()
@@ -106,9 +101,7 @@ def sphere(grid: Grid, radius: float) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("half_side", [0.5, 1.0])
 def test_light_around_a_sphere_leaves_it_by_marshaks_condition_whatever_the_box(half_side: float):
-    """D = distance / 4 makes L0 fall as 1 / distance^2, so that F = L0 / 2 on every sphere: on the
-    medium's surface as on the box.
-    """
+    """D = distance / 4 makes L0 fall as 1 / distance^2: F = L0 / 2 on the medium as on the box."""
     grid = Grid((24, 24, 24), (-half_side,) * 3, (half_side,) * 3)
     distance, kappa = sphere(grid, 0.25)
     empty = kappa == 0

@@ -20,13 +20,9 @@ def make_problem(shape: tuple[int, int, int], has_flux: bool) -> DiffusionProble
     sigma, g = torch.tensor([0.5, 6.0], dtype=torch.float64), 0.4 * has_flux
     volume = Volume(box_grid(shape), half_empty(*shape), sigma[:1], sigma[1:], sigma.new_tensor(g))
     mean, z, y, x = (random_values(1, *shape, seed=seed) for seed in range(1, 5))
-    return DiffusionProblem(
-        scale_medium(volume),
-        lambda extinction: 1 / (3 * extinction + 0.5),
-        Moments(mean, (z - 0.5, y - 0.5, x - 0.5) if has_flux else None),
-        torch.full((1, 1, 1, 1), OUTSIDE, dtype=torch.float64),
-        has_flux,
-    )
+    source = Moments(mean, (z - 0.5, y - 0.5, x - 0.5) if has_flux else None)
+    outside, medium = torch.full_like(mean[:, :1, :1, :1], OUTSIDE), scale_medium(volume)
+    return DiffusionProblem(medium, lambda k: 1 / (3 * k + 0.5), source, outside, has_flux)
 
 
 class FaceByFace:
@@ -57,16 +53,16 @@ class FaceByFace:
     def system(self) -> tuple[Tensor, Tensor]:
         """The matrix [n, n] and right side [n] of E2.4: outflow + kappa_a u = kappa_s Q0."""
         number = {c: n for n, c in enumerate(itertools.product(*map(range, self.shape)))}
-        absorption = self.problem.medium.absorption.value[0]
+        absorption, spacing = (
+            self.problem.medium.absorption.value[0],
+            self.problem.medium.grid.spacing,
+        )
         matrix = torch.zeros(len(number), len(number), dtype=torch.float64)
         right = self.gain.flatten().clone()
         for cell, row in number.items():
             matrix[row, row] += absorption[cell]
             for axis, side in itertools.product(range(3), (-1, 1)):
-                h, (own, other, known) = (
-                    self.problem.medium.grid.spacing[axis],
-                    self.flux(cell, axis, side),
-                )
+                h, (own, other, known) = spacing[axis], self.flux(cell, axis, side)
                 matrix[row, row] += own / h
                 right[row] -= known / h
                 if (beside := self.neighbor(cell, axis, side)) is not None:

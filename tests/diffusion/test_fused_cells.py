@@ -1,7 +1,4 @@
-"""The fused kernels of D, of the system and of the flux compute what PyTorch's operations compute.
-
-Values and cotangents, for coefficients that are constant or differ from cell to cell.
-"""
+"""Fused kernels of D, system and flux compute what torch does: values and cotangents."""
 
 import itertools
 from collections.abc import Callable
@@ -134,10 +131,8 @@ def test_the_product_with_the_operator_is_torchs(shape: Shape, colors: tuple[int
     """What changes of a solve start from: A may have one color where light has three."""
     of_medium, of_light = colors
     diffusion, absorption = (random_values(of_medium, *shape, seed=seed) for seed in (1, 2))
-    operator, u = (
-        make_operator(box_grid(shape), diffusion + 0.1, absorption),
-        random_values(of_light, *shape, seed=3),
-    )
+    operator = make_operator(box_grid(shape), diffusion + 0.1, absorption)
+    u = random_values(of_light, *shape, seed=3)
     found = subtract_product(u, u, operator.loss, *operator.conductances)
     torch.testing.assert_close(found, u - operator.apply(u), rtol=1e-13, atol=1e-13)
     use_engine("torch")

@@ -17,13 +17,8 @@ from ddrecon.diffusion.solvers import SOLVERS, hierarchy
 CASES = [("conjugate_gradient", shape) for shape in [(2, 3, 2), (1, 2, 4), (1, 1, 1)]] + [
     (solver, (2, 1, 2)) for solver in SOLVERS
 ]
-TO_ROUNDING: dict[str, Any] = {
-    "eps": 1e-5,
-    "atol": 1e-8,
-    "rtol": 1e-7,
-    "check_forward_ad": True,
-    "fast_mode": True,
-}
+MODES: dict[str, Any] = {"check_forward_ad": True, "fast_mode": True}
+TO_ROUNDING = {"eps": 1e-5, "atol": 1e-8, "rtol": 1e-7, **MODES}
 
 
 def solving(
@@ -38,19 +33,13 @@ def solving(
 
 @pytest.fixture
 def inputs():
-    """source, loss and conductances of a small system of two colors, or of a gray operator under a
-    colored source.
-    """
+    """source, loss and conductances of two colors, or of a gray operator under a colored source."""
 
     def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
         faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]
-        return [
-            random_values(2, *shape) - 0.5,
-            *(
-                1 + random_values(colors, *size, seed=1 + i)
-                for i, size in enumerate([shape, *faces])
-            ),
-        ]
+        sizes = enumerate([shape, *faces], 1)
+        others = [1 + random_values(colors, *size, seed=seed) for seed, size in sizes]
+        return [random_values(2, *shape) - 0.5, *others]
 
     return make
 
@@ -97,12 +86,8 @@ def test_every_solve_is_recorded(inputs):
     u.sum().backward()
     with forward_ad.dual_level():
         solving(memory)(forward_ad.make_dual(source.detach(), source.detach()), *coefficients)
-    assert [record.kind for record in memory.records] == [
-        "forward",
-        "adjoint",
-        "forward",
-        "tangent",
-    ]
+    kinds = ["forward", "adjoint", "forward", "tangent"]
+    assert [record.kind for record in memory.records] == kinds
     assert all(record.residual <= 1e-14 and record.seconds > 0 for record in memory.records)
 
 

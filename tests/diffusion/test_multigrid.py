@@ -24,14 +24,9 @@ FORMS = {
 
 
 def uneven(
-    shape: tuple[int, int, int],
-    sides: tuple[float, ...] = (1, 1, 1),
-    contrast: float = 1e3,
-    dtype=torch.float64,
+    shape: tuple[int, int, int], sides=(1, 1, 1), contrast: float = 1e3, dtype=torch.float64
 ) -> Operator:
-    """Two colors: a smooth medium whose D spans `contrast`, and one of D = 0.1 everywhere; nothing
-    absorbs but the box's faces.
-    """
+    """Two colors: D that spans `contrast`, and D = 0.1; nothing absorbs but the box's faces."""
     grid = Grid(shape, tuple(-side / 2 for side in sides), tuple(side / 2 for side in sides))
     z, y, x = (torch.linspace(-1, 1, n + 2, dtype=torch.float64)[1:-1] for n in shape)
     ball = torch.exp(-4 * (z[:, None, None] ** 2 + (y[:, None] - 0.3) ** 2 + x**2))
@@ -56,11 +51,9 @@ def patchy(patch: int, contrast: float, dtype: torch.dtype, cells: int = 16) -> 
 def matrix_of(cycle, shape: tuple[int, ...]) -> Tensor:
     """The matrix [C, n, n] of a linear function of [C, z, y, x]."""
     size = math.prod(shape[1:])
-    columns = [
-        cycle(unit.view(1, *shape[1:]).repeat(shape[0], 1, 1, 1))
-        for unit in torch.eye(size, dtype=torch.float64)
-    ]
-    return torch.stack([column.flatten(1) for column in columns], -1)
+    units = torch.eye(size, dtype=torch.float64).view(-1, 1, *shape[1:])
+    columns = [cycle(unit.repeat(shape[0], 1, 1, 1)).flatten(1) for unit in units]
+    return torch.stack(columns, -1)
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, None], ids=str)
@@ -90,23 +83,18 @@ def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
     operator = patchy_box(shape, wraps)
     way, coarse = coarsen(operator, axis)
     fine, u = random_values(2, *shape, seed=5), random_values(2, *coarse.loss.shape[1:], seed=6)
-    torch.testing.assert_close(
-        (way.restrict(fine) * u).sum(), (fine * way.prolong(u)).sum(), rtol=1e-13, atol=0
-    )
-    torch.testing.assert_close(
-        way.prolong(torch.ones_like(u)), torch.ones_like(fine), rtol=0, atol=0
-    )
+    one, other = (way.restrict(fine) * u).sum(), (fine * way.prolong(u)).sum()
+    torch.testing.assert_close(one, other, rtol=1e-13, atol=0)
+    assert torch.equal(way.prolong(torch.ones_like(u)), torch.ones_like(fine))
     torch.testing.assert_close(coarse.loss.sum(), operator.loss.sum())
 
 
 def patchy_box(shape: tuple[int, ...], wraps: bool = False) -> Operator:
-    sizes = (
-        [n - (a == axis and not wraps) for a, n in zip(AXES, shape, strict=True)] for axis in AXES
-    )
-    faces = [
-        random_values(2, *size, seed=axis) + 0.01 for axis, size in zip(AXES, sizes, strict=True)
-    ]
-    return Operator((faces[0], faces[1], faces[2]), random_values(2, *shape, seed=9))
+    faces = []
+    for axis in AXES:
+        size = [n - (a == axis and not wraps) for a, n in zip(AXES, shape, strict=True)]
+        faces.append(random_values(2, *size, seed=axis) + 0.01)
+    return Operator(tuple(faces), random_values(2, *shape, seed=9))
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 4), (7, 6, 5)])
@@ -142,37 +130,26 @@ def test_iterations_do_not_grow_with_the_number_of_cells():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch.dtype):
     shape, sides = FORMS[form]
-    assert (
-        multigrid(
-            uneven(shape, sides, dtype=dtype), random_values(2, *shape, dtype=dtype), None, 1e-6
-        ).iterations
-        <= 15
-    )
+    operator, source = uneven(shape, sides, dtype=dtype), random_values(2, *shape, dtype=dtype)
+    assert multigrid(operator, source, None, 1e-6).iterations <= 15
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
-    """Random in every cell they take more, but less than a third of those of conjugate gradients
-    alone.
-    """
+    """Random in every cell they take more, but less than a third of conjugate gradients alone."""
     source = random_values(1, 16, 16, 16, dtype=dtype)
     assert multigrid(patchy(4, 1e6, dtype), source, None, 1e-6).iterations <= 15
     operator = patchy(1, 1e6, dtype)
-    assert (
-        3 * multigrid(operator, source, None, 1e-6).iterations
-        < conjugate_gradient(operator, source, None, 1e-6).iterations
-    )
+    few, many = (solve(operator, source, None, 1e-6) for solve in (multigrid, conjugate_gradient))
+    assert 3 * few.iterations < many.iterations
 
 
 def test_conductances_shared_by_colors_may_be_given_once():
     shape = (6, 9, 7)
     operator = uneven(shape)
-    shared = Operator(
-        tuple(c[:1] for c in operator.conductances),
-        operator.loss[:1] + torch.tensor([0.0, 1.0, 5.0]).view(-1, 1, 1, 1),
-    )
+    loss = operator.loss[:1] + torch.tensor([0.0, 1.0, 5.0]).view(-1, 1, 1, 1)
+    shared = Operator(tuple(c[:1] for c in operator.conductances), loss)
     spread = Operator(tuple(c.expand(3, -1, -1, -1) for c in shared.conductances), shared.loss)
     source = random_values(3, *shape)
-    torch.testing.assert_close(
-        multigrid(shared, source, None, 1e-9).value, multigrid(spread, source, None, 1e-9).value
-    )
+    one, other = (multigrid(each, source, None, 1e-9).value for each in (shared, spread))
+    torch.testing.assert_close(one, other)

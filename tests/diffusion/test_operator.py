@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from media import box_grid, convergence_order, dense_matrix, make_operator, random_values
+from media import box_grid, convergence_order, dense_matrix, make_operator, random_values, tensor
 from torch import Tensor
 
 from ddrecon.diffusion.operator import (
@@ -42,20 +42,14 @@ def operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     return make_operator(grid, diffusion, absorption)
 
 
-def inner(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum((1, 2, 3))
-
-
 def test_the_operator_is_the_matrix_written_with_loops(operator: Operator):
-    u = random_values(*operator.loss.shape)
-    expected = (dense_matrix(operator) @ u.flatten(1)[..., None]).view_as(u)
-    torch.testing.assert_close(operator.apply(u), expected, rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(
-        operator.diagonal.flatten(1),
-        dense_matrix(operator).diagonal(dim1=1, dim2=2),
-        rtol=1e-14,
-        atol=0,
+    u, matrix = random_values(*operator.loss.shape), dense_matrix(operator)
+    expected, diagonal = (
+        (matrix @ u.flatten(1)[..., None]).view_as(u),
+        torch.linalg.diagonal(matrix),
     )
+    torch.testing.assert_close(operator.apply(u), expected, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(operator.diagonal.flatten(1), diagonal, rtol=1e-14, atol=0)
 
 
 def test_the_operator_is_a_positive_definite_m_matrix(operator: Operator):
@@ -83,24 +77,13 @@ def test_accumulate_is_the_transpose_of_difference(grid: Grid):
 @pytest.mark.parametrize("has_outside", [False, True])
 @pytest.mark.parametrize("has_source_flux", [False, True])
 def test_energy_is_kept(
-    grid: Grid,
-    diffusion: Tensor,
-    absorption: Tensor,
-    operator: Operator,
-    has_source_flux: bool,
-    has_outside: bool,
+    grid: Grid, diffusion: Tensor, absorption, operator, has_source_flux: bool, has_outside: bool
 ):
-    """Absorbed plus leaked, less what came in, is what was injected: scattering along source_flux
-    only moves light around.
-    """
+    """Absorbed plus leaked, less what came in, is what was injected: source_flux only moves."""
     injected = random_values(2, *grid.shape, seed=5)
-    source_flux = [
-        random_values(2, *grid.shape, seed=6 + axis) - 0.5 if has_source_flux else None
-        for axis in AXES
-    ]
-    outside = (
-        torch.tensor([0.7, 1.3], dtype=torch.float64).view(2, 1, 1, 1) if has_outside else None
-    )
+    flux = [random_values(2, *grid.shape, seed=6 + axis) - 0.5 for axis in AXES]
+    source_flux = flux if has_source_flux else [None] * 3
+    outside = tensor(0.7, 1.3).view(2, 1, 1, 1) if has_outside else None
     source = injected + boundary_loss(diffusion, grid) * outside if has_outside else injected
     for axis in AXES:
         faces = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
@@ -108,22 +91,18 @@ def test_energy_is_kept(
     u = torch.linalg.solve(dense_matrix(operator), source.flatten(1)).view_as(source)
     volume, leaked = math.prod(grid.spacing), torch.zeros(2, dtype=torch.float64)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        faces = face_fluxes(u, source_flux[axis - 1], diffusion, grid, axis, outside).movedim(
-            axis, 0
-        )
+        faces = face_fluxes(u, source_flux[axis - 1], diffusion, grid, axis, outside)
+        faces = faces.movedim(axis, 0)
         leaked += (faces[-1] - faces[0]).sum((1, 2)) * volume / step
-    absorbed = inner(absorption, u) * volume
-    torch.testing.assert_close(
-        absorbed + leaked, injected.sum((1, 2, 3)) * volume, rtol=1e-10, atol=0
-    )
+    absorbed, given = ((one * volume).sum((1, 2, 3)) for one in (absorption * u, injected))
+    torch.testing.assert_close(absorbed + leaked, given, rtol=1e-10, atol=0)
 
 
 def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, diffusion: Tensor):
-    radiance = torch.tensor([0.7, 1.3], dtype=torch.float64).view(2, 1, 1, 1)
+    radiance = tensor(0.7, 1.3).view(2, 1, 1, 1)
+    inside = radiance.expand_as(diffusion)
     for axis in AXES:
-        assert not face_fluxes(
-            radiance.expand_as(diffusion), None, diffusion, grid, axis, radiance
-        ).any()
+        assert not face_fluxes(inside, None, diffusion, grid, axis, radiance).any()
 
 
 D_AT_FACES = 0.2
@@ -131,8 +110,7 @@ EXTENT = (1.0, 1.2, 0.8)
 
 
 def manufactured(position: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """u, D, kappa_a and the source that makes u the solution, at `position` (z, y, x), in a box
-    from 0 to EXTENT.
+    """u, D, kappa_a and the source that makes u the solution, at `position` (z, y, x).
 
     Along each axis u is 1 + t (L - t) / (2 D L), so that u / 2 = -D du/dn on both faces; D departs
     from D_AT_FACES inside only.
@@ -148,52 +126,43 @@ def manufactured(position: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor
 
     u, diffusion = fields()
     divergence = torch.zeros_like(z)
-    for axis, slope in zip(
-        (z, y, x), torch.autograd.grad(u.sum(), (z, y, x), create_graph=True), strict=True
-    ):
-        divergence = (
-            divergence + torch.autograd.grad((diffusion * slope).sum(), axis, create_graph=True)[0]
-        )
+    slopes = torch.autograd.grad(u.sum(), (z, y, x), create_graph=True)
+    for axis, slope in zip((z, y, x), slopes, strict=True):
+        divergence += torch.autograd.grad((diffusion * slope).sum(), axis, retain_graph=True)[0]
     absorption = 1 + torch.cos(z) * y
     return tuple(t.detach() for t in (u, diffusion, absorption, absorption * u - divergence))
 
 
-def discrete_error(cells: int, solve) -> float:
+def discrete_error(cells: int) -> float:
     grid = Grid((cells, cells, cells // 2), (0.0, 0.0, 0.0), EXTENT)
-    position = [
-        axis.clone()
-        for axis in torch.broadcast_tensors(*grid.centers(torch.zeros(1, dtype=torch.float64)))
-    ]
+    position = [axis.clone() for axis in torch.broadcast_tensors(*grid.centers(tensor(0)))]
     u, diffusion, absorption, source = (field[None] for field in manufactured(position))
-    error = solve(make_operator(grid, diffusion, absorption), source) - u
+    operator = make_operator(grid, diffusion, absorption)
+    error = conjugate_gradient(operator, source, None, 1e-11).value - u
     return float((error**2).mean().sqrt() / (u**2).mean().sqrt())
 
 
 def test_a_manufactured_solution_is_approached_at_second_order():
     counts = [8, 16, 32]
-    errors = [
-        discrete_error(cells, lambda op, s: conjugate_gradient(op, s, None, 1e-11).value)
-        for cells in counts
-    ]
+    errors = [discrete_error(cells) for cells in counts]
     assert convergence_order([1 / cells for cells in counts], errors) >= 1.9, errors
 
 
 def test_the_source_flux_of_a_slab_is_exact():
-    """One dimension, D and kappa_s Q1 constant, nothing else: L0 is linear between the faces and
-    odd about the middle.
+    """In one dimension L0 is linear between the faces, and F = D kappa_s Q1 - D L0' constant.
 
-    F is then constant, q = D kappa_s Q1 - D L0', and F = L0 / 2 at the far face, F = -L0 / 2 at the
-    near one: by antisymmetry L0 = slope (t - L/2) with D (Q - slope) = slope L / 4.
+    F = L0 / 2 at the far face, -L0 / 2 at the near one: by antisymmetry L0 = slope (t - L/2) with
+    D (Q - slope) = slope L / 4.
     """
     length, flux, coefficient = 2.0, 0.7, 0.3
     grid = Grid((9, 1, 1), (0.0, 0.0, 0.0), (length, 1e9, 1e9))
     diffusion = torch.full((1, *grid.shape), coefficient, dtype=torch.float64)
     faces = face_fluxes(None, torch.full_like(diffusion, flux), diffusion, grid, 1)
     operator = make_operator(grid, diffusion, torch.zeros_like(diffusion))
-    u = torch.linalg.solve(
-        dense_matrix(operator)[0], -(faces.diff(dim=1) / grid.spacing[0]).flatten()
+    source = -(faces.diff(dim=1) / grid.spacing[0]).flatten()
+    u, slope = (
+        torch.linalg.solve(dense_matrix(operator)[0], source),
+        flux / (1 + length / 4 / coefficient),
     )
-    slope = flux / (1 + length / 4 / coefficient)
-    torch.testing.assert_close(
-        u, slope * (grid.centers(u)[0].flatten() - length / 2), rtol=1e-6, atol=1e-8
-    )
+    expected = slope * (grid.centers(u)[0].flatten() - length / 2)
+    torch.testing.assert_close(u, expected, rtol=1e-6, atol=1e-8)

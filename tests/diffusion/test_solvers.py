@@ -19,9 +19,7 @@ each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
 
 @pytest.fixture
 def system():
-    """An operator whose first color has equal conductances everywhere and whose last spans
-    `contrast`, and a source.
-    """
+    """A source, and an operator: one color of equal conductances, and one that spans `contrast`."""
 
     def make(dtype: torch.dtype, contrast: float = 1e3, colors: int = 2) -> tuple[Operator, Tensor]:
         spread = torch.linspace(0, 1, colors, dtype=torch.float64).view(-1, 1, 1, 1)
@@ -37,9 +35,7 @@ def system():
 
 
 def relative_residual(operator: Operator, u: Tensor, source: Tensor) -> float:
-    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest
-    over colors; in float64.
-    """
+    """The residual promised: by diagonal^(-1/2), relative to the source, largest over colors."""
     operator = Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
     source, scale = source.double(), operator.diagonal.rsqrt()
     residual = (scale * (source - operator.apply(u.double()))).flatten(1).norm(dim=1)
@@ -98,9 +94,7 @@ def test_a_color_without_source_stays_dark_beside_another(solve, system):
 
 
 def test_a_source_makes_light_everywhere(solve, system):
-    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of
-    the solve.
-    """
+    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance."""
     operator, source = system(torch.float64, contrast=10.0)
     source = torch.zeros_like(source)
     source[:, 0, 0, 0] = 1

@@ -1,7 +1,4 @@
-"""Every command line of the README and the documentation runs.
-
-In the order in which it stands there, on fewer cells, paths and samples.
-"""
+"""Every command line of the README and the documentation runs, in order, on fewer cells."""
 
 import re
 import shlex
@@ -11,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ddrecon.bench import plume
+from ddrecon.bench import measure, plume
 from ddrecon.cli.commands import main
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
@@ -34,9 +31,7 @@ def commands(page: Path) -> list[str]:
 
 
 def fewer_cells(scene: str) -> list[str]:
-    """Overrides that leave `scene` about 8 cells along its shortest side, where it says how many it
-    has.
-    """
+    """Overrides that leave `scene` about 8 cells along its shortest side, where it has a number."""
     found = re.search(
         r"^  resolution: \[(\d+), (\d+), (\d+)\]",
         Path(scene).read_text(encoding="utf-8"),
@@ -66,22 +61,25 @@ def quick(command: str) -> list[str]:
     return [name, *rest, *added]
 
 
+def few(variants: Callable[..., dict]) -> Callable[..., dict]:
+    return lambda *scene: dict([*variants(*scene).items()][:3])
+
+
 def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:
     return lambda *arguments: [scene_at_level(scene, 4) for scene in load(*arguments)]
 
 
 @pytest.fixture
 def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder with the project's configs and data in it; few hard cases; a bench of few cells
-    and paths.
-    """
+    """A folder with configs and data; few hard cases; a bench of few cells."""
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
         (tmp_path / name).symlink_to(ROOT / name)
     for name in list(CASES)[2:]:
         monkeypatch.delitem(CASES, name)
     monkeypatch.setattr(plume, "load_pair", coarse(plume.load_pair))
-    monkeypatch.setattr("ddrecon.bench.measure.QUICK_PATHS", (1, 2))
+    monkeypatch.setattr(measure, "QUICK_PATHS", (1, 2))
+    monkeypatch.setattr(measure, "variants_of", few(measure.variants_of))
 
 
 @pytest.mark.parametrize("page", list(filter(commands, PAGES)), ids=lambda page: page.stem)

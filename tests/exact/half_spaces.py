@@ -1,9 +1,7 @@
-"""Half-spaces for comparison with exact solutions: one column of cells, seen from above.
+"""Half-spaces: one column of cells, 1e9 times as wide as deep, seen from above.
 
-Only optical depth matters, so the half-space is one column of cells, 1e9 times as wide as deep
-(nothing leaves sideways), whose density grows downwards: from a few thousandths of an optical depth
-a cell at the surface to hundreds at the bottom. The closure's floor is set to nothing: what is
-compared is P1 itself, or what transport rounds make of it.
+Density grows downwards, from thousandths of an optical depth a cell to hundreds. The closure's
+floor is nothing: what is compared is P1 itself, or what transport rounds make of it.
 """
 
 import math
@@ -31,31 +29,18 @@ def half_space(
     layers = ratio ** torch.arange(cells, dtype=torch.float64)
     density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)
     grid = Grid((cells, 1, 1), (0.0, -5e8, -5e8), (1.0, 5e8, 5e8))
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=(1 - albedo,),
-        sigma_s=(albedo,),
-        g=g,
-        directional=(IRRADIANCE,),
-        travel=(math.sqrt(1 - sun**2), 0.0, sun),
-        closure="smooth",
-        floor=1e-6,
-        transport_rounds=rounds,
-        degree=5,
-    )
+    light = {"directional": (IRRADIANCE,), "travel": (math.sqrt(1 - sun**2), 0.0, sun)}
+    medium = {"sigma_a": (1 - albedo,), "sigma_s": (albedo,), "g": g}
+    settings = {"closure": "smooth", "floor": 1e-6, "transport_rounds": rounds, "degree": 5}
+    scene = make_scene(density, grid=grid, **light, **medium, **settings)
     return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
 
 
 def looking_down(cosine: float) -> Camera:
     """One pixel on the surface that looks into the medium at `cosine` with the normal."""
     target = torch.tensor([0.0, math.sqrt(1 - cosine**2), cosine], dtype=torch.float64)
-    return Camera(
-        look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0])),
-        (1, 1),
-        1e-6,
-        is_perspective=False,
-    )
+    pose = look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0]))
+    return Camera(pose, (1, 1), 1e-6, is_perspective=False)
 
 
 def seen(scene: Scene) -> list[float]:

@@ -1,12 +1,9 @@
 """Layers without end sideways and a cloud, as scenes and by independent means.
 
-A scene holds the layer between z = -depth and 0 in equal cells, lit from above by a sun of
-irradiance pi. Optical depths are lengths. What is looked at are its reflectance `R`, its
-transmittance `T` with the light that is not scattered, and pi I / (mu0 pi) at `VIEWS`: `up` above
-and `down` below it.
-
-Half-spaces that scatter isotropically are known by Ambartsumian's H, the others by discrete
-ordinates (PythonicDISORT), the cloud by the consensus of many codes.
+A layer lies between z = -depth and 0 in equal cells, under a sun of irradiance pi; optical depths
+are lengths. `R` is its reflectance, `T` its transmittance with light that is not scattered, `up`
+and `down` are pi I / (mu0 pi) at `VIEWS` above and below. Ambartsumian's H, discrete ordinates
+(PythonicDISORT) and, of the cloud, the consensus of many codes say what is right.
 """
 
 import json
@@ -98,14 +95,9 @@ class Layer:
         depth, layers = self.shown_depth, round(self.shown_depth / self.cell)
         columns = max(round(self.across / self.cell), 1)
         half = self.across / 2 or 5e5 * depth
-        return {
-            "bounds": {"min": [-half, -half, -depth], "max": [half, half, 0.0]},
-            "resolution": [columns, columns, layers],
-            "density": 1.0,
-            "sigma_t": 1.0,
-            "albedo": self.albedo,
-            "phase": self.phase,
-        }
+        box = {"min": [-half, -half, -depth], "max": [half, half, 0.0]}
+        cells = {"bounds": box, "resolution": [columns, columns, layers], "density": 1.0}
+        return cells | {"sigma_t": 1.0, "albedo": self.albedo, "phase": self.phase}
 
     def balance(self) -> Seen:
         """Its reflectance `R` and transmittance `T` by the energy balance, and `A`, the rest."""
@@ -127,9 +119,8 @@ class Layer:
         ]
         radiance = show(_scene(self.volume, self.sun, cameras), overrides) / self.sun
         found: Seen = {}
-        for (_, height, flux, views), part in zip(
-            sides, np.split(radiance, len(sides)), strict=True
-        ):
+        parts = np.split(radiance, len(sides))
+        for (_, height, flux, views), part in zip(sides, parts, strict=True):
             at_nodes, found[views] = np.split(part.flatten(), [len(FLUX_NODES)])
             direct = math.exp(height / self.sun) if flux == "T" else 0.0
             found[flux] = 2 * (FLUX_WEIGHTS * FLUX_NODES * at_nodes).sum() + direct
@@ -187,14 +178,9 @@ class StepCloud:
 
 def _camera(side: list[float], target: list[float], width: float, pixels: int) -> dict[str, Any]:
     """A row of pixels of parallel rays, `width` wide, that look from `side` of `target`."""
-    return {
-        "type": "orthographic",
-        "origin": [there + part for there, part in zip(target, side, strict=True)],
-        "target": target,
-        "up": [0, 1, 0],
-        "width": width,
-        "resolution": [pixels, 1],
-    }
+    origin = [there + part for there, part in zip(target, side, strict=True)]
+    pose = {"origin": origin, "target": target, "up": [0, 1, 0]}
+    return pose | {"type": "orthographic", "width": width, "resolution": [pixels, 1]}
 
 
 def _scene(volume: dict[str, Any], sun: float, cameras: list[dict[str, Any]]) -> dict[str, Any]:
@@ -222,10 +208,7 @@ def loaded(scene: dict[str, Any], overrides: Sequence[str] = ()) -> Iterator[Sce
 
 @cache
 def h_at_nodes(albedo: float) -> Array:
-    """Ambartsumian's H at `NODES`, by means of old and new, of which each halves the error.
-
-    1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu'.
-    """
+    """Ambartsumian's H: 1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu'."""
     values = np.ones_like(NODES)
     for _ in range(50):
         values = (values + h_function(albedo, NODES, values)) / 2
@@ -242,10 +225,8 @@ def h_function(albedo: float, cosines: Array, at_nodes: Array | None = None) -> 
 def h_reflection(albedo: float, sun: float) -> Seen:
     """A half-space that scatters isotropically: R(mu) = w / 4 / (mu + mu0) H(mu) H(mu0)."""
     h_sun = h_function(albedo, np.array(sun))
-    return {
-        "R": 1 - h_sun * math.sqrt(1 - albedo),
-        "up": albedo / 4 / (VIEWS + sun) * h_function(albedo, VIEWS) * h_sun,
-    }
+    up = albedo / 4 / (VIEWS + sun) * h_function(albedo, VIEWS) * h_sun
+    return {"R": 1 - h_sun * math.sqrt(1 - albedo), "up": up}
 
 
 def ordinates(layer: Layer, views: Array = VIEWS) -> Seen:

@@ -25,9 +25,7 @@ CONFIGS = [
     for config in sorted((ROOT / "configs").glob("*.yaml"))
     if config.stem not in ("gradcheck_all", "ground")
 ]
-"""Those with images to reconstruct from; the derivatives of the first other are checked in
-tests/validate.
-"""
+"""Those with images; the derivatives of the first other are checked in tests/validate."""
 
 KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
 

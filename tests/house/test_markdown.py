@@ -28,10 +28,7 @@ CLOSED = re.compile(r"[.:!?][)\]\"'*_]*$")
 
 
 def split_into_blocks(text: str) -> Iterator[list[str]]:
-    """Paragraphs, headings and list items of a page, a list of lines each.
-
-    Code, tables, comments and pictures are left out.
-    """
+    """Paragraphs, headings and list items of a page, a list of lines each; no code or tables."""
     paragraph: list[str] = []
     is_code = False
     for line in [*text.splitlines(), ""]:

@@ -1,8 +1,4 @@
-"""What the configs' first lines tell people to type is understood by the program, and scenes on the
-pages are legal.
-
-(The commands on the pages are run by tests/docs.)
-"""
+"""What configs' first lines tell to type is understood, and scenes on the pages are legal."""
 
 import re
 import shlex
@@ -20,30 +16,19 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 def scenes() -> list[str]:
     """Every block of YAML on a page that is a whole scene."""
-    texts = [page.read_text(encoding="utf-8") for page in PAGES]
-    return [
-        block
-        for text in texts
-        for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    ]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def commands() -> list[str]:
     """Every `ddrecon ...` in comments of configs."""
     configs = sorted((ROOT / "configs").rglob("*.yaml"))
-    return [
-        line
-        for config in configs
-        for line in re.findall(
-            r"^#.*?(ddrecon .*)$", config.read_text(encoding="utf-8"), re.MULTILINE
-        )
-    ]
+    text = "\n".join(config.read_text(encoding="utf-8") for config in configs)
+    return re.findall(r"^#.*?(ddrecon .*)$", text, re.MULTILINE)
 
 
 def parsed(line: str) -> click.Context:
-    """The command line parsed, not run; raises click.UsageError for a command or an option that
-    does not exist.
-    """
+    """The command line parsed, not run; raises click.UsageError for what does not exist."""
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = main.get_command(click.Context(main), name)
     if command is None:

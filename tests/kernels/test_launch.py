@@ -57,10 +57,7 @@ def test_quick_launches_have_the_same_shares(done, monkeypatch):
 
 @pytest.mark.parametrize(("threads", "shared"), [(2, 2), (None, 1), (1, 0)])
 def test_a_quick_launch_is_shared_where_threads_are_given(done, monkeypatch, threads, shared):
-    """Those of a solve that finds all exact take no time, and the next ones do.
-
-    By time goes only the second launch, which the first one told to be quick.
-    """
+    """By time goes only the second launch, which the first one told to be quick."""
     shares: list[int] = []
     share = launching._share
     monkeypatch.setattr(launching, "thread_count", lambda like: 2)

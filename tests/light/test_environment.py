@@ -76,45 +76,35 @@ def test_turning_the_map_is_turning_the_viewer(up: str):
     radiance, ways = random_values(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0, up=up)
     found = environment_radiance(light, array_order(rotate_directions(ways, light)))
-    torch.testing.assert_close(
-        found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12
-    )
+    known = environment_radiance(light_of(radiance), array_order(ways))
+    torch.testing.assert_close(found, known, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("rotation", [0.0, 37.0, 90.0, -200.0])
 def test_maps_look_as_they_do_in_mitsuba(rotation: float, up: str):
-    mitsuba = pytest.importorskip(
-        "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
-    )
+    mitsuba = pytest.importorskip("mitsuba", reason="needs Mitsuba 3 (the extra `reference`)")
     mitsuba.set_variant("scalar_rgb")
     radiance, ways = random_values(3, 6, 10), directions(300)
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
     turn = mitsuba.ScalarTransform4f().rotate([1, 0, 0], 90.0 * (up == "z"))
     turn = turn @ mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
-    environment = mitsuba.load_dict(
-        {
-            "type": "scene",
-            "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn},
-        }
-    ).environment()
+    sky = {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn}
+    environment = mitsuba.load_dict({"type": "scene", "map": sky}).environment()
     expected = []
     for way in ways.tolist():
         interaction = mitsuba.SurfaceInteraction3f()
         interaction.wi = mitsuba.Vector3f(*(-component for component in way))
         expected.append(list(environment.eval(interaction)))
     found = environment_radiance(light_of(radiance, 1.5, rotation, up), array_order(ways))
-    torch.testing.assert_close(
-        found, torch.tensor(expected, dtype=torch.float64).T, rtol=1e-5, atol=1e-5
-    )
+    torch.testing.assert_close(found, torch.tensor(expected).to(found).T, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES, ids=str)
 def test_solid_angles_sum_to_the_sphere(height: int, width: int):
     area, *vector = pixel_moments(height, width).sum((1, 2))
-    assert area == pytest.approx(4 * math.pi, rel=1e-13) and vector == pytest.approx(
-        [0, 0, 0], abs=1e-13
-    )
+    assert area == pytest.approx(4 * math.pi, rel=1e-13)
+    assert vector == pytest.approx([0, 0, 0], abs=1e-13)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
@@ -126,12 +116,8 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int):
     around = 2 * math.pi * (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
     down, around = (part.flatten() for part in torch.meshgrid(down, around, indexing="ij"))
     ways = torch.stack([down.sin() * around.sin(), down.cos(), -down.sin() * around.cos()], -1)
-    weight = (
-        environment_radiance(light, array_order(ways))[0]
-        * down.sin()
-        * (math.pi / rows)
-        * (2 * math.pi / columns)
-    )
+    solid_angle = down.sin() * (math.pi / rows) * (2 * math.pi / columns)
+    weight = environment_radiance(light, array_order(ways))[0] * solid_angle
     expected = torch.cat([weight.sum()[None], weight @ ways])
     found = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
     torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)
@@ -142,40 +128,26 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
     radiance, ways = random_values(2, 7, 5), array_order(directions(100))
     fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
-    torch.testing.assert_close(
-        environment_radiance(light_of(fine), ways),
-        environment_radiance(light_of(radiance), ways),
-        rtol=1e-11,
-        atol=1e-12,
-    )
+    found, known = (environment_radiance(light_of(one), ways) for one in (fine, radiance))
+    torch.testing.assert_close(found, known, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
 def test_what_is_seen_has_both_derivatives(name: str):
-    values = {
-        "radiance": random_values(2, 4, 5),
-        "scale": random_values(),
-        "rotation": 100 * random_values(seed=1),
-        "direction": array_order(directions(6)),
-    }
+    values = {"radiance": random_values(2, 4, 5), "scale": random_values()}
+    values |= {"rotation": 100 * random_values(seed=1), "direction": array_order(directions(6))}
 
     def look(value: Tensor) -> Tensor:
-        parts = values | {name: value}
-        return environment_radiance(
-            EnvironmentLight(parts["radiance"], parts["scale"], parts["rotation"]),
-            parts["direction"],
-        )
+        *light, direction = (values | {name: value}).values()
+        return environment_radiance(EnvironmentLight(*light), direction)
 
-    assert torch.autograd.gradcheck(
-        look, values[name].clone().requires_grad_(), check_forward_ad=True
-    )
+    leaf = values[name].clone().requires_grad_()
+    assert torch.autograd.gradcheck(look, leaf, check_forward_ad=True)
 
 
 def test_straight_up_has_finite_derivatives():
-    light, way = (
-        light_of(random_values(2, 4, 5)),
-        torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True),
-    )
+    light = light_of(random_values(2, 4, 5))
+    way = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(way.detach(), torch.ones_like(way))

@@ -1,7 +1,4 @@
-"""Light not yet scattered by fused kernels is what PyTorch's operations compute.
-
-Values and derivatives, on grids and along directions where interpolation has kinks.
-"""
+"""Light not yet scattered by fused kernels is torch's, in values and derivatives, also at kinks."""
 
 from collections import Counter
 from pathlib import Path

@@ -41,10 +41,7 @@ def radiance_and_bars(
     g: float,
     dtype: torch.dtype,
 ) -> list[Tensor]:
-    """E2.3, and the cotangents of L0, L1, g and the camera.
-
-    `view`: whether light has a flux, and whether the camera is a point, inside the box.
-    """
+    """E2.3 and its cotangents; `view`: light has a flux, and the camera is inside the box."""
     use_engine(engine)
     has_flux, is_eye = view
     mean, z, y, x = (part.requires_grad_() for part in make_light(shape, colors, dtype))

@@ -42,9 +42,8 @@ def test_radiance_rises_from_zero_without_a_jump_in_value_or_slope(dtype: torch.
     """Towards both ends of the bend, r = m and r = -m with m = MARGIN (1 + |flux|), mean 1."""
     ends = [-(1 - MARGIN) / (1 + MARGIN), -(1 + MARGIN) / (1 - MARGIN)]
     step = 1e-4
-    flux = fluxes(
-        *(end + side * step for end in ends for side in (-1, 1)), dtype=dtype
-    ).requires_grad_()
+    places = [end + side * step for end in ends for side in (-1, 1)]
+    flux = fluxes(*places, dtype=dtype).requires_grad_()
     radiance = along_z(torch.ones_like(flux), flux)
     (slope,) = torch.autograd.grad(radiance.sum(), flux)
     inner, outer, dark, dim = radiance.detach().flatten().tolist()
@@ -60,9 +59,8 @@ def test_values_and_slopes_are_finite_whatever_the_unit(scale: float, dtype: tor
     mean = torch.full_like(flux, scale).detach().requires_grad_()
     radiance = along_z(mean, flux)
     slopes = torch.autograd.grad(radiance.sum(), (mean, flux))
-    assert bool((radiance >= 0).all()) and all(
-        bool(slope.isfinite().all()) for slope in (radiance, *slopes)
-    )
+    assert bool((radiance >= 0).all())
+    assert all(bool(slope.isfinite().all()) for slope in (radiance, *slopes))
 
 
 def test_the_light_switched_on_from_nothing_counts_in_full():
@@ -75,14 +73,12 @@ def test_the_light_switched_on_from_nothing_counts_in_full():
 def test_both_modes_agree_with_differences_within_the_bend():
     flux = fluxes(-0.985, -0.995, -1.0, -1.01).requires_grad_()
     mean = torch.ones_like(flux).detach().requires_grad_()
-    assert torch.autograd.gradcheck(
-        along_z, (mean, flux), eps=1e-7, atol=1e-5, check_forward_ad=True
-    )
+    how = {"eps": 1e-7, "atol": 1e-5, "check_forward_ad": True}
+    assert torch.autograd.gradcheck(along_z, (mean, flux), **how)
 
 
 def test_higher_moments_of_one_color_are_those_of_all():
     """As of a white beam in colored ambient light."""
-    light = Moments(
-        torch.ones(3, 1, 2, 1), (torch.ones(3, 1, 2, 1),) * 3, torch.ones(12, 1, 1, 2, 1)
-    )
+    color = torch.ones(3, 1, 2, 1)
+    light = Moments(color, (color,) * 3, torch.ones(12, 1, 1, 2, 1))
     assert light.harmonics(3)[4:].equal(torch.ones(12, 3, 1, 2, 1))

@@ -1,6 +1,7 @@
 """Beams in pairs: what a light along an axis brings into a column is all found again."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,9 +13,16 @@ from ddrecon.light.pairs import follow_pair
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.remaining import backward_fraction
 from ddrecon.renderer import solve_light
+from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 
 IRRADIANCE = 3.0
+
+
+def in_unit_box(density: torch.Tensor, travel=(0.0, 0.0, 2.0), **changes: Any) -> Scene:
+    grid = Grid(tuple(density.shape), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    medium = {"sigma_a": (0.5,), "sigma_s": (6.0,), "directional": (IRRADIANCE,)}
+    return make_scene(density, grid=grid, travel=travel, **medium, **changes)
 
 
 def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> None:
@@ -22,14 +30,7 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
     torch.manual_seed(1)
     density, g = torch.rand(2, 9, 1, 1, dtype=torch.float64)
     density[4] = 0
-    scene = make_scene(
-        density,
-        grid=Grid((9, 1, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-        sigma_a=(0.5,),
-        sigma_s=(6.0,),
-        directional=(IRRADIANCE,),
-        travel=(0.0, 0.0, 2.0),
-    )
+    scene = in_unit_box(density)
     scene.volume.g = 0.6 - 1.5 * g
     medium = scale_medium(scene.volume, 3)
     pair = follow_pair(medium, scene.lights[0])
@@ -53,21 +54,9 @@ def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> N
 
 @pytest.mark.parametrize("g", [-0.8, -0.4])
 def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
-    """E8.11's beams leave with F at the far end and G at the near one; the rest is the source of
-    E2.4, whose solution is balanced.
-    """
+    """E8.11's beams leave with F and G at the ends; the rest, the source of E2.4, is balanced."""
     density = 0.2 + torch.rand(9, 1, 1, dtype=torch.float64)
-    scene = make_scene(
-        density,
-        grid=Grid((9, 1, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-        sigma_a=(0.5,),
-        sigma_s=(6.0,),
-        g=g,
-        directional=(IRRADIANCE,),
-        travel=(0.0, 0.0, 2.0),
-        transport_rounds=1,
-        degree=3,
-    )
+    scene = in_unit_box(density, g=g, transport_rounds=1, degree=3)
     medium = scale_medium(scene.volume, 3)
     pair = follow_pair(medium, scene.lights[0])
     beams = 4 * math.pi * (pair.along + pair.against)
@@ -92,15 +81,7 @@ def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
     torch.manual_seed(2)
     density, share = torch.rand(2, 5, 4, 3, dtype=torch.float64)
     density[1:3] = 0
-    scene = make_scene(
-        density,
-        grid=Grid((5, 4, 3), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
-        sigma_a=(0.5,),
-        sigma_s=(6.0,),
-        g=-0.7,
-        directional=(IRRADIANCE,),
-        travel=(0.5, -0.3, 2.0),
-    )
+    scene = in_unit_box(density, g=-0.7, travel=(0.5, -0.3, 2.0))
     volume = scene.volume
     if varied == "g":
         volume.g = -0.9 * share

@@ -1,17 +1,16 @@
-"""Point lights: the inverse square law, limits in which they are parallel light, and what happens
-at the light itself.
-"""
+"""Point lights: the inverse square law, limits of parallel light, and the light itself."""
 
 import math
 from dataclasses import replace
 
+import media
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene, tensor
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
-from ddrecon.grid import Grid, array_order
+from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.march.emission import Emission
@@ -23,82 +22,53 @@ SHAPE = (5, 4, 6)
 OUTSIDE, INSIDE = (0.3, 1.7, 1.1), (0.11, 0.13, 0.17)
 
 
-def light_at(
-    position: tuple[float, ...],
-    intensity: tuple[float, ...] = (2.0,),
-    dtype: torch.dtype = torch.float64,
-) -> PointLight:
-    return PointLight(torch.tensor(position, dtype=dtype), torch.tensor(intensity, dtype=dtype))
+def light_at(position: tuple[float, ...]) -> PointLight:
+    return PointLight(tensor(*position), tensor(2.0))
 
 
 def medium_of(grid: Grid, density: Tensor, g: float = 0.4) -> Medium:
-    return scale_medium(
-        Volume(
-            grid,
-            density,
-            density.new_tensor([0.5]),
-            density.new_tensor([3.0]),
-            density.new_tensor(g),
-        )
-    )
+    return scale_medium(Volume(grid, density, tensor(0.5), tensor(3.0), tensor(g)[0]))
 
 
 def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
     """From the light to the cell centers, `[z, y, x, 3]` in array order."""
-    axes = torch.meshgrid(
-        *(axis.flatten() for axis in grid.centers(torch.zeros(1, dtype=torch.float64))),
-        indexing="ij",
-    )
-    return torch.stack(axes, -1) - torch.tensor(position[::-1], dtype=torch.float64)
+    axes = torch.broadcast_tensors(*grid.centers(tensor(0)))
+    return torch.stack(axes, -1) - tensor(*position[::-1])
 
 
-def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float]:
-    """The center (x, y, z) of a cell."""
-    z, y, x = (
-        float(axis.flatten()[index])
-        for axis, index in zip(
-            grid.centers(torch.zeros(1, dtype=torch.float64)), (z, y, x), strict=True
-        )
-    )
-    return x, y, z
+def cell_center(grid: Grid, *cell: int) -> tuple[float, ...]:
+    """The center (x, y, z) of a cell (z, y, x)."""
+    return tuple(offsets(grid, (0.0, 0.0, 0.0))[cell].flip(0).tolist())
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
 def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
     """Everywhere but in the light's own cell."""
     grid = box_grid((10, 12, 9))
-    received = receive_point_light(
-        medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), 1
-    )
-    offset = offsets(grid, position)
+    empty = medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64))
+    received, offset = receive_point_light(empty, light_at(position), 1), offsets(grid, position)
     distance = offset.norm(dim=-1)
     is_apart = distance > max(grid.spacing)
     expected = 2.0 / (4 * math.pi) / distance**2
     torch.testing.assert_close(received.mean[0][is_apart], expected[is_apart], rtol=1e-13, atol=0)
-    flux = torch.stack(received.flux, -1)[0]
-    torch.testing.assert_close(
-        flux[is_apart],
-        3 * (expected / distance)[is_apart][:, None] * offset[is_apart],
-        rtol=1e-12,
-        atol=1e-16,
-    )
+    flux, expected = torch.stack(received.flux, -1)[0], 3 * (expected / distance)[..., None]
+    expected = (expected * offset)[is_apart]
+    torch.testing.assert_close(flux[is_apart], expected, rtol=1e-12, atol=1e-16)
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
 def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
     grid = box_grid((7, 6, 5))
-    beam = follow_point_light(
-        medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position)
-    )
+    even = medium_of(grid, torch.ones(grid.shape, dtype=torch.float64))
+    beam = follow_point_light(even, light_at(position))
     for z, y, x in ((0, 0, 0), (6, 5, 4), (3, 1, 2), (6, 0, 1)):
         end = cell_center(grid, z, y, x)[::-1]
         start, entered = position[::-1], 0.0
         for low, high, a, b in zip(grid.lower, grid.upper, start, end, strict=True):
             if not low <= a <= high:
                 entered = max(entered, ((low if a < low else high) - a) / (b - a))
-        assert beam.mass[0, z, y, x].item() == pytest.approx(
-            (1 - entered) * math.dist(start, end), rel=1e-12
-        )
+        inside = (1 - entered) * math.dist(start, end)
+        assert float(beam.mass[0, z, y, x]) == pytest.approx(inside, rel=1e-12)
 
 
 def test_the_depth_of_a_smooth_blob_converges_at_second_order():
@@ -106,53 +76,36 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order():
     width, errors, counts = 0.15, [], [8, 12, 18, 27]
     for count in counts:
         grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
-        axes = grid.centers(torch.zeros(1, dtype=torch.float64))
-        density = torch.exp(-sum(axis**2 for axis in axes) / (2 * width**2))
+        density = torch.exp(-sum(axis**2 for axis in grid.centers(tensor(0))) / (2 * width**2))
         beam = follow_point_light(medium_of(grid, density), light_at(INSIDE))
-        start, offset = torch.tensor(INSIDE[::-1], dtype=torch.float64), offsets(grid, INSIDE)
+        start, offset, unit = tensor(*INSIDE[::-1]), offsets(grid, INSIDE), width * math.sqrt(2)
         distance = offset.norm(dim=-1)
         along = (start * offset).sum(-1) / distance
-        across = torch.exp(-((start**2).sum() - along**2) / (2 * width**2))
-        erf = torch.erf((along + distance) / width / math.sqrt(2)) - torch.erf(
-            along / width / math.sqrt(2)
-        )
-        errors.append(
-            float(
-                (beam.mass[0] - across * width * math.sqrt(math.pi / 2) * erf)
-                .square()
-                .mean()
-                .sqrt()
-            )
-        )
+        across = torch.exp(-((start**2).sum() - along**2) / unit**2)
+        erf = torch.erf((along + distance) / unit) - torch.erf(along / unit)
+        expected = across * width * math.sqrt(math.pi / 2) * erf
+        errors.append(float((beam.mass[0] - expected).square().mean().sqrt()))
     assert convergence_order([1 / count for count in counts], errors) >= 1.7, errors
 
 
 def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
-    """kappa_s I / (4 pi) times the integral of 1 / r^2 along a ray: I (angle subtended) / (distance
-    of the ray).
-    """
+    """kappa_s I / (4 pi) times int 1 / r^2 along a ray: I (angle subtended) / (its distance)."""
     grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
     medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
     bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
     beams = (follow_point_light(medium, light_at(position)),)
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
-    emission = Emission(
-        grid, medium.extinction, medium.scattering, beams, dark, medium.seen, medium.peak
-    )
-    radiance = march_rays(emission, bundle, RenderSettings())[0][0]
-    light = array_order(torch.tensor(position, dtype=torch.float64))
+    matter = medium.extinction, medium.scattering
+    emission = Emission(grid, *matter, beams, dark, medium.seen, medium.peak)
+    radiance = media.march_rays(emission, bundle, RenderSettings())[0][0]
+    light = tensor(*position[::-1])
     low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
     one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))
     near, far = torch.minimum(one, other).amax(-1), torch.maximum(one, other).amin(-1)
     along = ((light - bundle.origin) * bundle.direction).sum(-1)
     apart = (bundle.origin + along[:, None] * bundle.direction - light).norm(dim=-1)
-    expected = (
-        3e-9
-        * 2.0
-        / (4 * math.pi)
-        * (torch.atan((far - along) / apart) - torch.atan((near - along) / apart))
-        / apart
-    )
+    angle = torch.atan((far - along) / apart) - torch.atan((near - along) / apart)
+    expected = 3e-9 * 2.0 / (4 * math.pi) * angle / apart
     torch.testing.assert_close(radiance, expected, rtol=1e-7, atol=0)
 
 
@@ -161,61 +114,39 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
     errors, counts = [], [8, 16, 32]
     for count in counts:
         grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
-        density = 8 * torch.exp(
-            -sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))) / 0.04
-        )
-        scene, towards = (
-            make_scene(density, grid=grid, model="none"),
-            torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64),
-        )
-        intensity = torch.tensor([3.0], dtype=torch.float64)
-        point, parallel = (
-            PointLight(1e6 * towards, 1e12 * intensity),
-            DirectionalLight(-towards, intensity),
-        )
-        images = [render(replace(scene, lights=[light])) for light in (point, parallel)]
+        density = 8 * torch.exp(-sum(axis**2 for axis in grid.centers(tensor(0))) / 0.04)
+        scene, towards = make_scene(density, grid=grid, model="none"), tensor(0.6, 0.8, 0.0)
+        point, sun = PointLight(1e6 * towards, tensor(3e12)), DirectionalLight(-towards, tensor(3))
+        images = [render(replace(scene, lights=[light])) for light in (point, sun)]
         errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
-    assert (
-        errors[-1] < 1e-2
-        and convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5
-    ), errors
+    assert errors[-1] < 1e-2, errors
+    assert convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5, errors
 
 
 @pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])
 def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
-    scene = make_scene(
-        half_empty(*SHAPE), g=0.4, camera=make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
-    )
+    camera = make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
+    scene = make_scene(half_empty(*SHAPE), g=0.4, camera=camera)
     grid = scene.volume.grid
     (z, y, x), center = grid.spacing, cell_center(grid, 2, 1, 3)
     shifts = {"center": (0, 0, 0), "corner": (x / 2, y / 2, z / 2), "face": (0, y / 2, 0)}
     position = {"face of the box": (0.1, 0.6, 0.1), "eye": (0.05, 0.1, 0.15)}.get(where)
     light = light_at(position or tuple(c + s for c, s in zip(center, shifts[where], strict=True)))
-    numbers = [
-        light.position.requires_grad_(),
-        light.intensity.requires_grad_(),
-        scene.volume.density.requires_grad_(),
-    ]
+    numbers = light.position, light.intensity, scene.volume.density
+    for number in numbers:
+        number.requires_grad_()
     image = render(replace(scene, lights=[light]))
-    slopes = torch.autograd.grad(image.sum(), numbers)
     assert torch.isfinite(image).all() and image.max() < 1e3
-    assert all(
-        bool(torch.isfinite(slope).all()) and float(slope.abs().max()) < 1e5 for slope in slopes
-    )
+    for slope in torch.autograd.grad(image.sum(), numbers):
+        assert bool(torch.isfinite(slope).all()) and float(slope.abs().max()) < 1e5
 
 
 def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
-    """3 / R^2, the mean of 1 / r^2 over a sphere of one cell's volume around the light, and no
-    flux: light leaves on all sides.
-    """
+    """3 / R^2, the mean of 1 / r^2 over a sphere of a cell's volume around the light; no flux."""
     grid = box_grid((5, 4, 6))
-    received = receive_point_light(
-        medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)),
-        light_at(cell_center(grid, 2, 1, 3)),
-        1,
-    )
+    empty = medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64))
+    received = receive_point_light(empty, light_at(cell_center(grid, 2, 1, 3)), 1)
     radius = (0.75 / math.pi * math.prod(grid.spacing)) ** (1 / 3)
-    assert received.mean[0, 2, 1, 3].item() == pytest.approx(
-        2.0 / (4 * math.pi) * 3 / radius**2, rel=1e-12
-    )
+    mean = 2.0 / (4 * math.pi) * 3 / radius**2
+    assert float(received.mean[0, 2, 1, 3]) == pytest.approx(mean, rel=1e-12)
     assert max(abs(component[0, 2, 1, 3].item()) for component in received.flux) < 1e-12

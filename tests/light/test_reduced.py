@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from media import box_grid, random_values
+from media import box_grid, random_values, tensor
 from torch import Tensor
 
 from ddrecon.grid import Grid
@@ -13,11 +13,6 @@ from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
-
-
-def unit(direction: tuple[float, ...]) -> Tensor:
-    vector = torch.tensor(direction, dtype=torch.float64)
-    return vector / vector.norm()
 
 
 def medium_in(
@@ -37,15 +32,10 @@ def received(grid: Grid, density: Tensor, lights: list, **medium) -> Moments:
 
 @pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])
 def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float):
-    """What a column of any thickness absorbs and scatters is what the beam loses: E (1 -
-    exp(-depth)).
-    """
+    """What a column of any thickness absorbs and scatters the beam loses: E (1 - exp(-depth))."""
     grid = Grid((6, 1, 2), (0, 0, 0), (1.5, 1, 1))
     density = depth_per_cell / grid.spacing[0] * random_values(*grid.shape)
-    light = DirectionalLight(
-        torch.tensor([0, 0, -2.0], dtype=torch.float64),
-        torch.tensor([2.0, 2.0], dtype=torch.float64),
-    )
+    light = DirectionalLight(tensor(0, 0, -2), tensor(2, 2))
     source = received(grid, density, [light], g=0.0, sigma=([0.5, 0.2], [0.5, 1.8]))
     kappa = torch.tensor([1.0, 2.0], dtype=torch.float64).view(2, 1, 1, 1) * density
     lost = (4 * math.pi * kappa * source.mean).sum(1) * grid.spacing[0]
@@ -54,24 +44,19 @@ def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float
 
 
 def test_the_flux_of_a_beam_is_its_mean_times_its_direction():
-    light = DirectionalLight(
-        torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64),
-        torch.tensor([2.0, 1.0], dtype=torch.float64),
-    )
+    light = DirectionalLight(tensor(1, -2, 0.5), tensor(2, 1))
     source = received(box_grid((3, 4, 2)), random_values(3, 4, 2), [light], g=-0.4)
-    expected = 3 * -0.4 * source.mean * unit((0.5, -2.0, 1.0)).view(3, 1, 1, 1, 1)
+    way = torch.nn.functional.normalize(tensor(0.5, -2, 1), dim=0)
+    expected = 3 * -0.4 * source.mean * way.view(3, 1, 1, 1, 1)
     torch.testing.assert_close(torch.stack(source.flux), expected, rtol=1e-14, atol=0)
 
 
 def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
-    """Each attenuated by kappa z / |cosine|, averaged over the cell; none arrives from the sides,
-    which are too far away.
-    """
+    """Each attenuated by kappa z / |cosine|, averaged over the cell; the sides are too far away."""
     cells, thickness = 6, 0.8
     grid = Grid((cells, 9, 9), (0, -1e3, -1e3), (thickness, 1e3, 1e3))
-    medium = medium_in(
-        grid, torch.ones(grid.shape, dtype=torch.float64), g=0.0, sigma=([0.3], [1.7])
-    )
+    density = torch.ones(grid.shape, dtype=torch.float64)
+    medium = medium_in(grid, density, g=0.0, sigma=([0.3], [1.7]))
     light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
     directions, weights = sphere_quadrature(light.mean)
     for cell in range(cells):

@@ -1,7 +1,4 @@
-"""The fused kernels of the view-ray integral compute what PyTorch's operations compute.
-
-Values, derivatives in reverse and in forward mode, for all that an emission can hold.
-"""
+"""The view-ray integral by fused kernels is torch's, in values, adjoints and tangents."""
 
 from pathlib import Path
 
@@ -25,14 +22,9 @@ from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused import kernels
 from ddrecon.march.fused.cells import Cells, mark_kernel
-from ddrecon.march.fused.kernels import (
-    Case,
-    Layout,
-    adjoint_kernel,
-    integral_kernel,
-    tangent_kernel,
-)
+from ddrecon.march.fused.kernels import Case, Layout
 
 pytestmark = pytest.mark.slow
 
@@ -191,10 +183,7 @@ def test_lattices_of_rays_are_marched_as_well():
 def test_packets_read_and_write_whole_rows(
     eye: tuple[float, float, float], dtype: torch.dtype, half_width: float
 ):
-    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it.
-
-    In a narrow view neighbors lie right of the same column, and at its ends beside the volume.
-    """
+    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it."""
     camera = make_camera(size=(24, 33), dtype=dtype, half_width=half_width, eye=eye)
     density = half_empty(18, 21, 19, dtype=dtype)
     scene = make_scene(density, g=0.5, camera=camera)
@@ -233,8 +222,11 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     one = Layout(1, 1, 1, 0, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
     steep = Layout(1, 1, 1, 0, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
-    packets = [mark_kernel(32), integral_kernel(steep, False)]
-    packets += [tangent_kernel(one, Case(False, True, True)), adjoint_kernel(several, Case(False))]
+    packets = [mark_kernel(32), kernels.integral_kernel(steep, False)]
+    packets += [
+        kernels.tangent_kernel(one, Case(False, True, True)),
+        kernels.adjoint_kernel(several, Case(False)),
+    ]
     assert_compiles(packets, tmp_path)
 
 

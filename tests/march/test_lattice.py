@@ -36,15 +36,12 @@ def blob(grid: Grid) -> Tensor:
 
 @pytest.fixture
 def scene_of():
-    """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell
-    apart.
-    """
+    """A blob in a small grid before light from behind, in many more pixels than rays tell apart."""
 
     def scene(view: dict, **changes) -> Scene:
         camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
-        return make_scene(
-            blob(box_grid((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes)
-        )
+        density, changes = blob(box_grid((6, 8, 7))), {"g": 0.3} | changes
+        return make_scene(density, ambient=(0.4,), camera=camera, **changes)
 
     return scene
 
@@ -81,9 +78,7 @@ def test_pixels_are_placed_among_the_rays_of_the_lattice(view: dict, scene_of):
 
 @each_camera
 def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
-    """The pixels of the lattice's own rays need no interpolation: they are what marching those rays
-    gives.
-    """
+    """Pixels of the lattice's own rays are what marching those rays gives."""
     scene = scene_of(view)
     lattice = lattice_of(scene)[0]
     emission = _emission(solve_light(scene, SolveMemory()), lattice.rays)
@@ -91,19 +86,15 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
     own_places = replace(lattice, places=places)
     monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated, own = (
-        march_rays(emission, lattice.rays, INTERPOLATED),
-        march_rays(emission, lattice.rays, OWN),
-    )
+    interpolated = march_rays(emission, lattice.rays, INTERPOLATED)
+    own = march_rays(emission, lattice.rays, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 
 
 @each_camera
 def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
-    """Fewer pixels are interpolated as the tolerance falls; what interpolation costs stays below
-    it, in the image's root mean square.
-    """
+    """Fewer pixels are interpolated as the tolerance falls; the RMS error stays below it."""
     scene = scene_of(view)
     own, errors = render(replace(scene, render=OWN)), []
     for tolerance in (1.0, 0.03, 0.003):
@@ -124,15 +115,10 @@ def test_subpixels_share_a_lattice(scene_of):
     assert float((image - own).norm() / own.norm()) < settings.tolerance
 
 
-@pytest.mark.parametrize(
-    "view",
-    [
-        {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
-        {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
-        {"size": (4, 5)},
-    ],
-    ids=str,
-)
+INSIDE, GRAZING = {"eye": (0.1, 0.2, 0.15)}, {"eye": (0.9, 0.0, 0.1), "half_width": 4.0}
+
+
+@pytest.mark.parametrize("view", [INSIDE | {"half_width": 1.0}, GRAZING, {"size": (4, 5)}], ids=str)
 def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
     view: dict, scene_of
 ):
@@ -154,19 +140,18 @@ def test_derivatives_are_those_of_the_interpolated_image(view: str, name: str, s
     value = value_of(scene, variable)
     change = torch.ones_like(value)
     if variable != name:
-        change = torch.eye(6, dtype=value.dtype)[{"rotation_x": 0, "y": 4}[name.rpartition(".")[2]]]
+        change = torch.eye(6).to(value)[0 if name.endswith("rotation_x") else 4]
     tangent = render_tangent(scene, name, lambda world: {"view": render(world)})["view"][1]
     step = 1e-6
     plus, minus = (
-        render(with_values(scene, {variable: value + sign * step * change})) for sign in (1, -1)
+        render(with_values(scene, {variable: value + way * change})) for way in (step, -step)
     )
     difference = (plus - minus) / (2 * step)
     assert float((tangent - difference).norm()) < 1e-6 * float(difference.norm())
     leaf = value.clone().requires_grad_()
     weight = random_values(*tangent.shape)
-    (bar,) = torch.autograd.grad(
-        (render(with_values(scene, {variable: leaf})) * weight).sum(), leaf
-    )
+    image = render(with_values(scene, {variable: leaf}))
+    (bar,) = torch.autograd.grad((image * weight).sum(), leaf)
     torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-11, atol=0)
 
 

@@ -57,14 +57,10 @@ def test_a_camera_that_changed_sees_what_a_new_one_sees(change):
     assert torch.equal(render(scene_of(camera)), render(scene_of(replace(camera))))
 
 
-@pytest.mark.parametrize(
-    ("grid", "settings"),
-    [
-        (box_grid((7, 6, 5)), SETTINGS),
-        (GRID, replace(SETTINGS, samples_per_pixel=4)),
-        (GRID, replace(SETTINGS, tolerance=0.0)),
-    ],
-)
+OTHERS = [(GRID, replace(SETTINGS, samples_per_pixel=4)), (GRID, replace(SETTINGS, tolerance=0.0))]
+
+
+@pytest.mark.parametrize(("grid", "settings"), [(box_grid((7, 6, 5)), SETTINGS), *OTHERS])
 def test_another_grid_or_other_settings_are_another_sight(grid, settings):
     camera = camera_of()
     first = look_through(camera, GRID, SETTINGS)

@@ -1,19 +1,12 @@
 """View rays: what the box lets through and scatters towards the camera, by closed forms."""
 
+import itertools
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from media import (
-    box_grid,
-    convergence_order,
-    half_empty,
-    make_camera,
-    make_scene,
-    march_rays,
-    random_values,
-)
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -23,7 +16,6 @@ from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Volume, scale_medium
-from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -38,34 +30,14 @@ CAMERAS = {
 each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
 
 
-def emission_of(
-    grid: Grid,
-    density: Tensor,
-    sigma_a: float = 0.5,
-    sigma_s: tuple[float, ...] = (2.0, 3.0),
-    g: float = 0.3,
-) -> Emission:
+def emission_of(grid: Grid, density: Tensor) -> Emission:
     """A medium under one oblique beam and some smooth diffuse light that grows along x."""
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
-    medium = scale_medium(
-        Volume(
-            grid,
-            density,
-            density.new_tensor([sigma_a]),
-            density.new_tensor(sigma_s),
-            density.new_tensor(g),
-        )
-    )
-    diffuse = (1 + grid.centers(density)[2]).expand(len(sigma_s), *grid.shape)
-    return Emission(
-        grid,
-        medium.extinction,
-        medium.scattering,
-        follow_lights(medium, [light]),
-        diffuse,
-        medium.seen,
-        medium.peak,
-    )
+    numbers = map(density.new_tensor, ([0.5], [2.0, 3.0], 0.3))
+    medium = scale_medium(Volume(grid, density, *numbers))
+    diffuse = (1 + grid.centers(density)[2]).expand(2, *grid.shape)
+    matter, beams = (medium.extinction, medium.scattering), follow_lights(medium, [light])
+    return Emission(grid, *matter, beams, diffuse, medium.seen, medium.peak)
 
 
 def every_ray(steps: int) -> RenderSettings:
@@ -80,18 +52,14 @@ def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
         if d == 0 and not low < o < high:
             return 0.0
         if d != 0:
-            near, far = (
-                max(near, min((low - o) / d, (high - o) / d)),
-                min(far, max((low - o) / d, (high - o) / d)),
-            )
+            near = max(near, min((low - o) / d, (high - o) / d))
+            far = min(far, max((low - o) / d, (high - o) / d))
     return max(far - near, 0.0)
 
 
 def chords(grid: Grid, bundle: Rays) -> Tensor:
     pairs = zip(bundle.origin.tolist(), bundle.direction.tolist(), strict=True)
-    return torch.tensor(
-        [chord(grid, origin, direction) for origin, direction in pairs], dtype=torch.float64
-    )
+    return bundle.origin.new_tensor([chord(grid, *pair) for pair in pairs])
 
 
 @each_camera
@@ -102,19 +70,16 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
     transmittance = march_rays(emission, bundle, every_ray(steps))[1]
     lengths = chords(grid, bundle)
     assert bool((lengths > 0).any())
-    extinction = emission.extinction.value[:, 0, 0, 0]
-    torch.testing.assert_close(
-        transmittance, torch.exp(-extinction[:, None] * lengths), rtol=1e-12, atol=0
-    )
+    expected = torch.exp(-emission.extinction.value[:, 0, 0, :1] * lengths)
+    torch.testing.assert_close(transmittance, expected, rtol=1e-12, atol=0)
 
 
 @each_camera
 def test_rays_that_miss_the_box_see_nothing(view: dict):
     grid = box_grid((3, 5, 4))
     bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
-    scattered, transmittance = march_rays(
-        emission_of(grid, random_values(*grid.shape)), bundle, every_ray(1)
-    )
+    emission = emission_of(grid, 0.1 + half_empty(*grid.shape))
+    scattered, transmittance = march_rays(emission, bundle, every_ray(1))
     is_miss = chords(grid, bundle) == 0
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
@@ -124,16 +89,15 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
 def test_a_box_behind_the_camera_is_not_seen():
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera())
     away = Rays(bundle.origin, -bundle.direction, bundle.eye)
-    scattered, transmittance = march_rays(
-        emission_of(grid, random_values(*grid.shape)), away, every_ray(1)
-    )
+    emission = emission_of(grid, 0.1 + half_empty(*grid.shape))
+    scattered, transmittance = march_rays(emission, away, every_ray(1))
     assert not scattered.any() and bool((transmittance == 1).all())
 
 
 @each_camera
 def test_chunks_do_not_matter(view: dict, monkeypatch):
     """Neither to what is seen nor to its derivative."""
-    density = random_values(9, 11, 10).requires_grad_()
+    density = (0.1 + half_empty(9, 11, 10)).requires_grad_()
     bundle = cast_rays(make_camera(size=(7, 6), **view))
 
     def marched() -> list[Tensor]:
@@ -151,12 +115,11 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 def test_radiance_and_transmittance_have_both_derivatives(view: dict):
     grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda d: march_rays(emission_of(grid, d), bundle, every_ray(1)),
-        density,
-        atol=1e-8,
-        check_forward_ad=True,
-    )
+
+    def marched(density: Tensor) -> tuple[Tensor, Tensor]:
+        return march_rays(emission_of(grid, density), bundle, every_ray(1))
+
+    assert torch.autograd.gradcheck(marched, density, atol=1e-8, check_forward_ad=True)
 
 
 THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
@@ -167,37 +130,23 @@ def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
     grid = Grid((cells, 2, 2), (-THICKNESS / 2, -9.0, -9.0), (THICKNESS / 2, 9.0, 9.0))
     camera = make_camera(eye=(0.0, 0.0, 5.0), size=(1, 1), half_width=0.1, is_perspective=False)
     density = torch.ones(grid.shape, dtype=torch.float64)
-    return make_scene(
-        density,
-        grid=grid,
-        sigma_a=(SIGMA_A,),
-        sigma_s=(SIGMA_S,),
-        g=g,
-        directional=(3.0,),
-        travel=travel,
-        camera=camera,
-        model="none",
-    )
+    medium = {"sigma_a": (SIGMA_A,), "sigma_s": (SIGMA_S,), "g": g, "model": "none"}
+    return make_scene(density, grid=grid, travel=travel, camera=camera, **medium)
 
 
 @pytest.mark.parametrize(("g", "is_behind"), [(0.0, False), (-0.6, True)])
 @pytest.mark.parametrize("steps", [1, 3])
 def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool, steps: int):
     """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L)."""
-    kappa = SIGMA_A + SIGMA_S
-    phase = henyey_greenstein(
-        torch.tensor(-1.0 if is_behind else 1.0), torch.tensor(g, dtype=torch.float64)
-    ).item()
-    decayed = (
-        -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
-        if is_behind
-        else THICKNESS * math.exp(-kappa * THICKNESS)
-    )
+    kappa, cosine = SIGMA_A + SIGMA_S, -1.0 if is_behind else 1.0
+    phase = (1 - g**2) / (1 + g**2 - 2 * g * cosine) ** 1.5
+    decayed = THICKNESS * math.exp(-kappa * THICKNESS)
+    if is_behind:
+        decayed = -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
     expected = SIGMA_S * phase * 3.0 / (4 * math.pi) * decayed
     settings = RenderSettings(steps_per_voxel=steps)
     for cells in (2, 8):
-        scene = slab(cells, g, (0.0, 0.0, -1.0 if is_behind else 1.0))
-        image = render(replace(scene, render=settings))
+        image = render(replace(slab(cells, g, (0.0, 0.0, cosine)), render=settings))
         assert float(image.mean()) == pytest.approx(expected, rel=1e-12)
 
 
@@ -206,25 +155,19 @@ WIDTH, DENSITY = 0.1, 12.0
 
 def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
     """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
-    scene = make_scene(
-        torch.ones(3, 5, 4, dtype=torch.float64), sigma_s=(0.0,), directional=None, ambient=(1.0,)
-    )
+    absorbing = {"sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
+    scene = make_scene(torch.ones(3, 5, 4, dtype=torch.float64), **absorbing)
     image = render(replace(scene, render=RenderSettings(samples_per_pixel=4, steps_per_voxel=2)))[0]
-    bundles = [
-        cast_rays(scene.views[0].camera, offset)
-        for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]
-    ]
+    offsets = itertools.product((0.25, 0.75), repeat=2)
+    bundles = [cast_rays(scene.views[0].camera, offset) for offset in offsets]
+    lengths = torch.stack([chords(scene.volume.grid, bundle) for bundle in bundles])
     for color, sigma in enumerate(scene.volume.sigma_a):
-        expected = (
-            sum(torch.exp(-sigma * chords(box_grid((3, 5, 4)), bundle)) for bundle in bundles) / 4
-        )
+        expected = torch.exp(-sigma * lengths).mean(0)
         torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
 
 
 def test_the_transmittance_of_a_blob_converges_at_second_order():
-    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
-    distance b from its middle.
-    """
+    """A Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) at distance b."""
     camera = make_camera(eye=(0.3, 0.4, 2.5), size=(6, 6), half_width=0.1)
     counts, errors = [10, 20, 40], []
     bundle = cast_rays(camera)
@@ -233,9 +176,8 @@ def test_the_transmittance_of_a_blob_converges_at_second_order():
     expected = torch.exp(-SIGMA_A * mass).view(camera.size)
     for n in counts:
         grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
-        density = DENSITY * torch.exp(
-            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
-        )
+        square = sum(axis**2 for axis in grid.centers(expected))
+        density = DENSITY * torch.exp(-square / (2 * WIDTH**2))
         absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "ambient": (1.0,)}
         scene = make_scene(density, grid=grid, camera=camera, directional=None, **absorbing)
         errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))

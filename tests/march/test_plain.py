@@ -1,7 +1,4 @@
-"""View rays against plain sums of E2.1 to E2.3: the same integral, on other nodes, by other sums.
-
-Both are of second order in the length of a step, so what they differ by is too.
-"""
+"""View rays against plain sums of E2.1 to E2.3 on other nodes: they differ at second order."""
 
 import math
 from collections.abc import Callable
@@ -44,17 +41,12 @@ SHAPE = (5, 4, 6)
 STEPS = (1, 8, 64)
 
 
+BEAM, OTHER = (tensor(-2, -2, -1), tensor(3, 2, 1)), (tensor(1, 0.3, -0.5), tensor(1))
 LIGHTS: dict[str, list[Light]] = {
-    "two beams": [
-        DirectionalLight(tensor(-2, -2, -1), tensor(3, 2, 1)),
-        DirectionalLight(tensor(1, 0.3, -0.5), tensor(1)),
-    ],
+    "two beams": [DirectionalLight(*BEAM), DirectionalLight(*OTHER)],
     "a point outside": [PointLight(tensor(0.9, 0.8, -0.7), tensor(2))],
     "a point inside": [PointLight(tensor(0.1, 0.2, -0.1), tensor(2, 1, 3))],
-    "a beam and ambient light": [
-        DirectionalLight(tensor(-2, -2, -1), tensor(3)),
-        AmbientLight(tensor(0.5, 0.4, 0.3)),
-    ],
+    "a beam and ambient light": [DirectionalLight(*BEAM), AmbientLight(tensor(0.5, 0.4, 0.3))],
     "a sky": [EnvironmentLight(random_values(3, 8, 16), tensor(20)[0], tensor(1)[0], 8)],
 }
 VIEWS: dict[str, dict[str, Any]] = {
@@ -92,12 +84,8 @@ def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scen
     """A random medium; under a sky alone nothing scatters twice: it is lit by all directions."""
     model = "none" if isinstance(lights[0], EnvironmentLight) else "p1"
     cross_sections = {"sigma_a": (0.5, 1.0, 0.2), "sigma_s": (3.0, 2.0, 1.0)}
-    scene = make_scene(
-        random_values(*SHAPE),
-        directional=None,
-        camera=make_camera(**view),
-        **({"g": 0.6, "model": model} | cross_sections | changes),
-    )
+    settings = {"g": 0.6, "model": model, "directional": None} | cross_sections | changes
+    scene = make_scene(random_values(*SHAPE), camera=make_camera(**view), **settings)
     return replace(scene, lights=lights)
 
 
@@ -149,10 +137,8 @@ def interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
     low, extent = points.new_tensor(grid.lower), points.new_tensor(grid.extent)
     longer = points.new_tensor(field.shape[1:]) / points.new_tensor(grid.shape)
     places = ((2 * (points - low) / extent - 1) / longer).flip(-1)
-    sampled = grid_sample(
-        field[None], places[None, None], padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0]
+    ways = {"padding_mode": "border", "align_corners": False}
+    return grid_sample(field[None], places[None, None], **ways)[0, :, 0]
 
 
 def unattenuated(
@@ -180,10 +166,7 @@ def march_twin(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tens
 
 
 def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
-    """How far apart the two marches are, relative to the norm, at STEPS.
-
-    Of each of the quantities `of(marcher, steps)`.
-    """
+    """How far apart the two marches' `of(marcher, steps)` are, relative to the norm, at STEPS."""
     apart = []
     for steps in STEPS:
         pairs = zip(of(march_fast, steps), of(march_twin, steps), strict=True)
@@ -232,38 +215,25 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
         z, y, x = torch.meshgrid(*axes, indexing="ij")
         density = 2 * torch.exp(-2 * (x**2 + y**2 + z**2)).double()
         grid = replace(scene.volume.grid, shape=density.shape)
-        emission, rays = emit(
-            replace(scene, volume=replace(scene.volume, density=density, grid=grid))
-        )
+        volume = replace(scene.volume, density=density, grid=grid)
+        emission, rays = emit(replace(scene, volume=volume))
         fast, plain = march_fast(emission, rays, 4)[0], march_twin(emission, rays, 16)[0]
         errors.append(float((fast - plain).norm() / plain.norm()))
     assert errors[-1] < 2e-3 and convergence_order([1 / 8, 1 / 16, 1 / 32], errors) > 1.5, errors
 
 
-@pytest.mark.parametrize(
-    ("name", "view"),
-    [
-        ("two beams", "inside"),
-        ("a point outside", "oblique"),
-        ("a point inside", "inside"),
-        ("a beam and ambient light", "oblique"),
-        ("a sky", "oblique"),
-    ],
-)
+VIEW_OF = dict.fromkeys(LIGHTS, "oblique") | {"two beams": "inside", "a point inside": "inside"}
+
+
+@pytest.mark.parametrize(("name", "view"), VIEW_OF.items())
 @pytest.mark.usefixtures("same_fields")
 def test_derivatives_agree_in_the_limit(name: str, view: str):
-    """By the medium, the lights and the camera.
-
-    The camera's is of first order: a density linear between cells has kinks, which nodes step over.
-    """
+    """By medium, lights and camera; its derivative is of first order: density has kinks."""
     lights = LIGHTS[name]
     scene = lit_scene(lights, VIEWS[view])
-    of_lights = [
-        f"lights.{index}.{number}"
-        for index, light in enumerate(lights)
-        for number in NUMBERS[type(light)]
-    ]
-    names = ["density", "g", "sigma_s", *of_lights, "views.view.camera"]
+    names = ["density", "g", "sigma_s", "views.view.camera"]
+    for index, light in enumerate(lights):
+        names += [f"lights.{index}.{number}" for number in NUMBERS[type(light)]]
     leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
     emission, rays = emit(with_values(scene, leaves))
     weights = random_values(2, 3, len(rays.direction), seed=5)

@@ -32,10 +32,7 @@ def two_blobs() -> Tensor:
 
 
 def scene_with(support: Tensor | None, settings: dict, is_gray: bool = False, **view: Any) -> Scene:
-    """A scene of which density lies in `two_blobs`, whether it is told so or not.
-
-    Media and views are of kinds that `test_fused` has kernels for.
-    """
+    """A scene of which density lies in `two_blobs`, whether it is told so or not."""
     camera = make_camera(**({"size": (9, 10), "half_width": 0.4} | view))
     density = half_empty(*SHAPE) * two_blobs()
     medium = {"sigma_a": (1.0,), "sigma_s": (6.0,)} if is_gray else {"g": 0.5}

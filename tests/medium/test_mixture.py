@@ -36,12 +36,8 @@ def test_sections_and_mean_cosine_are_those_of_both_weighed_by_how_much_each_sca
     scattered = [one.sigma_s.view(-1, 1, 1, 1) * one.density for one in (SMOKE, DUST)]
     torch.testing.assert_close(medium.scattering.value, sum(scattered))
     torch.testing.assert_close(medium.absorption.value, 0.1 * sum(scattered))
-    torch.testing.assert_close(
-        medium.g * medium.scattering.value,
-        0.6 * scattered[0] - 0.3 * scattered[1],
-        atol=1e-5,
-        rtol=0,
-    )
+    found, expected = medium.g * medium.scattering.value, 0.6 * scattered[0] - 0.3 * scattered[1]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("one, other", [(SMOKE, DUST), (DUST, SMOKE)])

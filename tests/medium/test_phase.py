@@ -57,15 +57,15 @@ def test_moments_are_those_of_the_values(phase: PhaseFunction):
     assert torch.equal(phase.moments(1), torch.ones_like(phase.moments(1)))
 
 
+LOBES = TwoLobe(tensor(0.6, -0.3), scalar(0.4))
+
+
 @pytest.mark.parametrize(
     "one, other",
     [
         (TwoLobe(tensor(0.6, -0.9), scalar(1.0)), HenyeyGreenstein(scalar(0.6))),
         (TwoLobe(tensor(0.6, -0.9), scalar(0.0)), HenyeyGreenstein(scalar(-0.9))),
-        (
-            Blend(*TwoLobe(tensor(0.6, -0.3), scalar(0.0)).parts, scalar(0.4)),
-            TwoLobe(tensor(0.6, -0.3), scalar(0.4)),
-        ),
+        (Blend(*LOBES.parts, scalar(0.4)), LOBES),
         (Tabulated(1 + even_angles(STEPS).cos()[None] ** 2), Rayleigh(scalar(0.0))),
     ],
 )
@@ -74,9 +74,8 @@ def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
     torch.testing.assert_close(one.value(cosine), other.value(cosine), rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(one.moments(30), other.moments(30), rtol=0, atol=1e-10)
     for degree in (1, 3):
-        torch.testing.assert_close(
-            one.forward_fraction(degree), other.forward_fraction(degree), rtol=0, atol=1e-10
-        )
+        parts = (phase.forward_fraction(degree) for phase in (one, other))
+        torch.testing.assert_close(*parts, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("phase", [*PHASES.values()][:-1], ids=[*PHASES][:-1])
@@ -95,10 +94,9 @@ def test_values_and_moments_have_both_derivatives(phase: PhaseFunction):
 
 
 def peak_moment(g: float, depth: float, degree: int, kept: int) -> float:
-    """The moment of light that the forward peak alone has scattered, once at a given place on its
-    way of `depth` scatterings.
+    """The moment of light that the forward peak alone has scattered, on a way of `depth`.
 
-    n of them fall on the way with Poisson's probability, each is the one in question with 1 / n,
+    n scatterings fall on it with Poisson's probability, each is the one in question with 1 / n,
     and n in a row have the moments of one to the power of n: 1 up to `kept`, then g, g^2, ...
     """
     counts = range(1, 80)
@@ -130,9 +128,8 @@ def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(
 ):
     cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
     seen, exact = SeenPhase(phase, degree), phase.value(cosine)
-    torch.testing.assert_close(
-        summed_series(seen, tensor(0.0)[None], cosine), exact, rtol=1e-6, atol=1e-6
-    )
+    summed = summed_series(seen, tensor(0.0)[None], cosine)
+    torch.testing.assert_close(summed, exact, rtol=1e-6, atol=1e-6)
     along = seen.along(torch.zeros(1, len(exact), 101, dtype=torch.float64), cosine)
     torch.testing.assert_close(along[0], exact, rtol=1e-6, atol=1e-6)
 
@@ -154,10 +151,8 @@ def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
     cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
     depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double().view(-1, 1, 1)
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
-    along, exact = (
-        seen.along(depth.expand(-1, 1, 41), cosine)[:, 0],
-        summed_series(seen, depth.movedim(1, 0), cosine)[0],
-    )
+    along = seen.along(depth.expand(-1, 1, 41), cosine)[:, 0]
+    exact = summed_series(seen, depth.movedim(1, 0), cosine)[0]
     torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
     assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
 
@@ -172,15 +167,11 @@ def test_along_rays_all_derivatives_agree_with_differences(name: str):
     def found(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
         seen = SeenPhase(kind(*numbers), 1)
         angles = cosine.acos().expand(3, 4)
-        return (
-            seen.along(depth, cosine),
-            seen.at_angles(depth, angles),
-            seen.at_angles(None, angles),
-        )
+        looked_up = (seen.at_angles(each, angles) for each in (depth, None))
+        return seen.along(depth, cosine), *looked_up
 
-    assert torch.autograd.gradcheck(
-        found, (depth, cosine, *numbers), check_forward_ad=True, fast_mode=True
-    )
+    inputs, modes = (depth, cosine, *numbers), {"check_forward_ad": True, "fast_mode": True}
+    assert torch.autograd.gradcheck(found, inputs, **modes)
 
 
 # --- the scaled medium ---------------------------------------------------------------------------
@@ -207,32 +198,24 @@ def test_scaling_leaves_the_transport_extinction_alone(g: float):
         torch.testing.assert_close(medium.transport_extinction, exact, rtol=1e-14, atol=0)
         by_parts = medium.absorption.value + (1 - medium.mean_cosine) * medium.remaining_scattering
         torch.testing.assert_close(by_parts, exact, rtol=1e-13, atol=0)
-        torch.testing.assert_close(
-            medium.extinction.value,
-            medium.absorption.value + medium.remaining_scattering,
-            rtol=1e-14,
-            atol=0,
-        )
+        both = medium.absorption.value + medium.remaining_scattering
+        torch.testing.assert_close(medium.extinction.value, both, rtol=1e-14, atol=0)
     removed = keep_medium(volume).extinction.value - scale_medium(volume).extinction.value
-    torch.testing.assert_close(
-        removed, max(g, 0) ** 2 * sigma_s.view(3, 1, 1, 1) * density, rtol=1e-12, atol=1e-15
-    )
+    expected = max(g, 0) ** 2 * sigma_s.view(3, 1, 1, 1) * density
+    torch.testing.assert_close(removed, expected, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("medium_of", [scale_medium, keep_medium])
 def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of):
-    sigma_a, sigma_s, density, grid = (
-        random_values(3, seed=1),
-        random_values(3, seed=2),
-        random_values(2, 3, 4),
-        box_grid((2, 3, 4)),
-    )
+    sigma_a = random_values(3, seed=1)
+    sigma_s = random_values(3, seed=2)
+    density = random_values(2, 3, 4)
+    grid = box_grid((2, 3, 4))
     fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]
     constant, varying = (
         medium_of(Volume(grid, density, *sigmas, scalar(0.3)))
         for sigmas in ((sigma_a, sigma_s), fields)
     )
     for name in ("extinction", "scattering", "absorption"):
-        torch.testing.assert_close(
-            getattr(constant, name).value, getattr(varying, name).value, rtol=1e-15, atol=0
-        )
+        one, other = (getattr(medium, name).value for medium in (constant, varying))
+        torch.testing.assert_close(one, other, rtol=1e-15, atol=0)

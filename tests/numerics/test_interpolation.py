@@ -17,10 +17,8 @@ from ddrecon.numerics.third_order import ThirdOrder, subdivide
 def interpolated(values: Tensor, point: Tensor) -> Tensor:
     """Multilinear interpolation of `values` [K, ...] at one point, corner by corner."""
     sizes = values.shape[1:]
-    place = [
-        ((point[len(sizes) - 1 - axis].item() + 1) * size - 1) / 2
-        for axis, size in enumerate(sizes)
-    ]
+    backward = point.flip(0).tolist()
+    place = [((p + 1) * size - 1) / 2 for p, size in zip(backward, sizes, strict=True)]
     place = [min(max(p, 0), size - 1) for p, size in zip(place, sizes, strict=True)]
     total = torch.zeros_like(values[(slice(None), *[0] * len(sizes))])
     for corner in itertools.product((0, 1), repeat=len(sizes)):
@@ -47,16 +45,13 @@ each_size = pytest.mark.parametrize("sizes", SIZES, ids=str)
 @pytest.mark.parametrize("is_forward", [False, True])
 def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward: bool):
     """Also where forward mode is on, and cells are gathered."""
-    values, points = (
-        random_values(2, 3, *sizes),
-        2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3,
-    )
+    values = random_values(2, 3, *sizes)
+    points = 2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3
     with forward_ad.dual_level() if is_forward else nullcontext():
         sampled = sample(values, points)
     for n, p in itertools.product(range(2), range(9)):
-        torch.testing.assert_close(
-            sampled[n, :, p], interpolated(values[n], points[n, p]), rtol=1e-13, atol=1e-14
-        )
+        expected = interpolated(values[n], points[n, p])
+        torch.testing.assert_close(sampled[n, :, p], expected, rtol=1e-13, atol=1e-14)
 
 
 @each_size
@@ -65,17 +60,11 @@ def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward
 def test_both_modes_have_derivatives(
     sizes: tuple[int, ...], smooth: ThirdOrder | None, wanted: tuple[bool, bool]
 ):
-    values, points = (
-        random_values(2, 3, *sizes),
-        2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2,
-    )
-    inputs = [
-        tensor.requires_grad_(is_wanted)
-        for tensor, is_wanted in zip((values, points), wanted, strict=True)
-    ]
-    assert torch.autograd.gradcheck(
-        lambda v, p: sample(v, p, smooth), inputs, check_forward_ad=True, fast_mode=True
-    )
+    values = random_values(2, 3, *sizes)
+    points = 2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2
+    inputs = [values.requires_grad_(wanted[0]), points.requires_grad_(wanted[1])]
+    modes = {"check_forward_ad": True, "fast_mode": True}
+    assert torch.autograd.gradcheck(lambda v, p: sample(v, p, smooth), inputs, **modes)
 
 
 # --- kinks ---------------------------------------------------------------------------------------
@@ -86,27 +75,20 @@ def test_the_slope_at_a_kink_is_the_mean_of_both_sides(dtype: torch.dtype):
     """At cell centers along one axis, between them along the other."""
     slices = random_values(1, 1, 5, 7, dtype=dtype)
     columns, row = torch.arange(1, 6, dtype=dtype), torch.tensor(1.3, dtype=dtype)
-    points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)[
-        None
-    ].requires_grad_()
+    points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)
+    points = points[None].requires_grad_()
     (bars,) = torch.autograd.grad(sample_slices(slices, points).sum(), points)
     line = 0.7 * slices[0, 0, 1] + 0.3 * slices[0, 0, 2]
-    torch.testing.assert_close(
-        bars[0, :, 0], 7 / 2 * (line[2:] - line[:-2]) / 2, rtol=1e-3, atol=1e-4
-    )
+    along = 7 / 2 * (line[2:] - line[:-2]) / 2
+    torch.testing.assert_close(bars[0, :, 0], along, rtol=1e-3, atol=1e-4)
     across = slices[0, 0, 2, 1:6] - slices[0, 0, 1, 1:6]
     torch.testing.assert_close(bars[0, :, 1], 5 / 2 * across, rtol=1e-3, atol=1e-3)
 
 
 def test_both_modes_agree_at_kinks():
     slices, change = random_values(2, 3, 4, 5), random_values(2, 6, 2, seed=1)
-    points = torch.stack(
-        torch.broadcast_tensors(
-            torch.tensor([-0.4, 0.0]).double(), torch.tensor([[-0.25], [0.25], [0.1]]).double()
-        ),
-        -1,
-    )
-    points = points.reshape(1, 6, 2).expand(2, -1, -1).contiguous()
+    points = torch.cartesian_prod(torch.tensor([-0.4, 0.0]), torch.tensor([-0.25, 0.25, 0.1]))
+    points = points.double().expand(2, 6, 2).contiguous()
     _, tangent = torch.func.jvp(lambda moved: sample_slices(slices, moved), (points,), (change,))
     weight = random_values(*tangent.shape, seed=2)
     leaf = points.clone().requires_grad_()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import product
 
 import pytest
 import torch
@@ -18,33 +19,23 @@ def double_factorial(n: int) -> int:
 
 
 def sphere_mean(powers: tuple[int, int, int]) -> float:
-    """The mean of x^a y^b z^c over the unit sphere: 0 for an odd power, else (a-1)!! (b-1)!!
-    (c-1)!! / (a+b+c+1)!!.
-    """
+    """x^a y^b z^c over the sphere: (a-1)!! (b-1)!! (c-1)!! / (a+b+c+1)!!, or 0 for an odd power."""
     if any(power % 2 for power in powers):
         return 0.0
-    return math.prod(double_factorial(power - 1) for power in powers) / double_factorial(
-        sum(powers) + 1
-    )
+    above = math.prod(double_factorial(power - 1) for power in powers)
+    return above / double_factorial(sum(powers) + 1)
 
 
 def error(count: int, powers: tuple[int, int, int]) -> float:
     directions, weights = RULES[count]
-    mean = weights @ torch.stack(
-        [directions[:, axis] ** power for axis, power in enumerate(powers)]
-    ).prod(0)
-    return abs(mean.item() - sphere_mean(powers))
+    mean = weights @ (directions ** torch.tensor(powers)).prod(1)
+    return abs(float(mean) - sphere_mean(powers))
 
 
 @each_rule
 def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count: int):
     top = DEGREES[count] + 1
-    monomials = [
-        (a, b, c)
-        for a in range(top + 1)
-        for b in range(top + 1 - a)
-        for c in range(top + 1 - a - b)
-    ]
+    monomials = [each for each in product(range(top + 1), repeat=3) if sum(each) <= top]
     assert max(error(count, powers) for powers in monomials if sum(powers) < top) < 1e-15
     assert max(error(count, powers) for powers in monomials if sum(powers) == top) > 1e-5
 

@@ -71,12 +71,8 @@ def test_a_flat_picture_has_the_slope_of_its_scale(step: float) -> None:
     flat = torch.full((3, 7, 8), level, dtype=torch.float64)
     places = torch.tensor([level - change, level + change, 1.0], dtype=torch.float64)
     low, high, _ = scale.values(places)
-    torch.testing.assert_close(
-        scale.slope(flat),
-        torch.full_like(flat, float(high - low) / (2 * change)),
-        rtol=1e-2,
-        atol=0,
-    )
+    expected = torch.full_like(flat, float(high - low) / (2 * change))
+    torch.testing.assert_close(scale.slope(flat), expected, rtol=1e-2, atol=0)
 
 
 PEAK = torch.tensor(1.0, dtype=torch.float64)

@@ -1,7 +1,4 @@
-"""A run shared by several processes is the run of one, and loses nothing where one is killed.
-
-So are runs in slabs, and samples of a run that several share.
-"""
+"""A run, or samples, shared by processes is that of one, and loses nothing where one is killed."""
 
 import csv
 import json
@@ -121,10 +118,7 @@ class Runs:
         return (self.folder / f"{self.names.index(name)}.{rank}.{end}").read_text()
 
     def log(self, output: str) -> np.ndarray:
-        """The log in the folder `output`, without the times.
-
-        And without the steps of solves: one that was cut off has begun nearer to its end.
-        """
+        """The log in the folder `output`, without times and steps of solves, which may be cut."""
         with (self.folder / output / "loss.csv").open() as stream:
             rows = [
                 row | {"seconds": "0", "forward_iterations": "0"} for row in csv.DictReader(stream)

@@ -15,14 +15,8 @@ from ddrecon.settings import ParameterSettings
 from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import value_of
 
-NAMES = (
-    "lights.0.irradiance",
-    "density",
-    "g",
-    "views.one.camera",
-    "views.two.exposure",
-    "views.two.offset",
-)
+NAMES = "lights.0.irradiance", "density", "g", "views.one.camera"
+NAMES += "views.two.exposure", "views.two.offset"
 
 
 @pytest.fixture(scope="module")

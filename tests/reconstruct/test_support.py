@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from media import box_grid, make_camera
+from media import box_grid, make_camera, tensor
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
@@ -22,17 +22,11 @@ CAMERAS = {
     "pinhole": make_camera(size=(30, 36)),
     "oblong": replace(make_camera(size=(30, 36)), principal_point=(0.4, 0.55), pixel_aspect=1.2),
     "parallel": make_camera(size=(30, 36), half_width=0.7, is_perspective=False),
-    "opencv": replace(
-        make_camera(size=(30, 36)),
-        lens="opencv",
-        distortion=torch.tensor([-0.2, 0.05, 0, 0, 0.002, -0.001], dtype=torch.float64),
-    ),
-    "fisheye": replace(
-        make_camera(eye=(0.1, 0.2, 0.9), size=(30, 36), half_width=1.2),
-        lens="fisheye",
-        distortion=torch.tensor([0.02, -0.01, 0, 0], dtype=torch.float64),
-    ),
 }
+LENSES = {"opencv": tensor(-0.2, 0.05, 0, 0, 0.002, -0.001), "fisheye": tensor(0.02, -0.01, 0, 0)}
+WIDE = make_camera(eye=(0.1, 0.2, 0.9), size=(30, 36), half_width=1.2)
+CAMERAS["opencv"] = replace(CAMERAS["pinhole"], lens="opencv", distortion=LENSES["opencv"])
+CAMERAS["fisheye"] = replace(WIDE, lens="fisheye", distortion=LENSES["fisheye"])
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -62,9 +56,7 @@ def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> None:
-    """Every ray of a pixel that shows something passes only through cells of the hull; with nothing
-    shown none stays, with everything all do.
-    """
+    """Rays of pixels that show something cross only the hull; with nothing shown none stays."""
     camera, grid = CAMERAS[name], box_grid((7, 6, 8))
     shown = torch.rand(camera.size, generator=torch.Generator().manual_seed(1)) > 0.995
     held, seen = hull_of(camera, shown, grid, 0.0)

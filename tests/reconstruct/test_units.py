@@ -25,11 +25,8 @@ GAINS = {"one": 1.2, "two": 1 / 1.2}
 CAMERAS = {
     "density": ParameterSettings(tv=1e-3, support=MASKS, support_margin=0.0),
     "lights.0.irradiance": ParameterSettings(),
-    **{
-        f"views.{view}.{key}": ParameterSettings()
-        for key in ("exposure", "camera")
-        for view in EYES
-    },
+    **{f"views.{view}.exposure": ParameterSettings() for view in EYES},
+    **{f"views.{view}.camera": ParameterSettings() for view in EYES},
 }
 SMOOTH = ParameterSettings(tv=1e-3)
 SECTIONS = {
@@ -63,13 +60,8 @@ def scene_of(kind: str) -> Scene:
         )
         for seed, (view, image) in enumerate(zip(views, images, strict=True))
     ]
-    settings = OptimizeSettings(
-        SOUGHT[kind],
-        iterations=3,
-        noise=NoiseSettings(read=0.05),
-        refine_at=(),
-        views_per_iteration=0,
-    )
+    how = {"iterations": 3, "refine_at": (), "views_per_iteration": 0}
+    settings = OptimizeSettings(SOUGHT[kind], noise=NoiseSettings(read=0.05), **how)
     world = replace(world, views=shown, optimize=settings)
     volume, starts = world.volume, {"density": torch.zeros_like(density)}
     if kind == "cameras":
@@ -132,10 +124,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
 
 
 def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
-    """What a run finds, and how far a sample about it is from it, in units of `scene_of`.
-
-    And how many iterations it took.
-    """
+    """What a run finds, how far a sample is from it, in units of `scene_of`, and its iterations."""
     torch.manual_seed(0)
     run = Reconstruction(in_units(scene_of(kind), density, length))
     while not run.is_done:

@@ -43,15 +43,12 @@ np.save(path + ".npy", np.array(image, np.float64))
 
 
 def opened(path: Path, **options: Any) -> np.ndarray:
-    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes
-    its EXR reader has hung.
+    """The scene as a user's Mitsuba shows it: after other scenes its EXR reader has hung.
 
-    On two threads, as the tracer: the random numbers of the variant `scalar_rgb` depend on
-    how many there are.
+    On two threads, as the tracer: random numbers of `scalar_rgb` depend on how many there are.
     """
-    subprocess.run(
-        [sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120
-    )
+    command = [sys.executable, "-c", OPEN, str(path), json.dumps(options)]
+    subprocess.run(command, check=True, timeout=120)
     return np.load(f"{path}.npy")
 
 
@@ -99,10 +96,8 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) ->
     scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = open_tracer(scene, scene.views, threads=2)
-    theirs, ours = (
-        Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)]),
-        Traced.of([tracer.trace(0, seed, 256) for seed in range(3)]),
-    )
+    theirs = Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)])
+    ours = Traced.of([tracer.trace(0, seed, 256) for seed in range(3)])
     assert max(theirs.noise, ours.noise) < 0.15
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
 

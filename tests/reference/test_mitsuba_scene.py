@@ -43,16 +43,11 @@ def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
     sigma_a, scattering = random_values(*absorbing, seed=1), random_values(3, *SHAPE, seed=2)
     constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
     scene = make_scene(random_values(*SHAPE), sigma_a=constant, sigma_s=scattering)
-    medium = described(scene)["medium"]
-    np.testing.assert_allclose(
-        extinction(medium),
-        ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0),
-        rtol=1e-6,
-    )
+    medium, density = described(scene)["medium"], scene.volume.density
+    whole = ((sigma_a + scattering) * density).permute(1, 2, 3, 0)
+    np.testing.assert_allclose(extinction(medium), whole, rtol=1e-6)
     found = extinction(medium) * medium["albedo"]["grid"][(slice(FINER // 2, None, FINER),) * 3]
-    np.testing.assert_allclose(
-        found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5
-    )
+    np.testing.assert_allclose(found, (scattering * density).permute(1, 2, 3, 0), rtol=1e-5)
 
 
 def test_nothing_scatters_where_nothing_is() -> None:
@@ -91,13 +86,8 @@ def every_light(like: Tensor) -> list[Any]:
     values = like.new_tensor
     color = values([1.0, 2.0, 3.0])
     sky = EnvironmentLight(color.view(3, 1, 1).expand(3, 2, 3), values(2.0), values(30.0))
-    return [
-        DirectionalLight(color, color),
-        AmbientLight(values([0.5])),
-        AmbientLight(color),
-        sky,
-        PointLight(color, color),
-    ]
+    lights = [DirectionalLight(color, color), AmbientLight(values([0.5])), AmbientLight(color)]
+    return [*lights, sky, PointLight(color, color)]
 
 
 def test_one_color_of_a_scene_is_that_color() -> None:
@@ -105,9 +95,8 @@ def test_one_color_of_a_scene_is_that_color() -> None:
     whole = described(scene)
     for color in range(3):
         one = described(pick_color(scene, color))
-        np.testing.assert_allclose(
-            extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6
-        )
+        found, known = extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color]
+        np.testing.assert_allclose(found, known, rtol=1e-6)
         assert one["medium"]["albedo"] == pytest.approx(whole["medium"]["albedo"][color])
         assert one["light_0"]["irradiance"] == (whole["light_0"]["irradiance"][color],) * 3
         assert one["light_4"]["intensity"] == (whole["light_4"]["intensity"][color],) * 3

@@ -28,10 +28,8 @@ pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra 
 LOWER, UPPER = (-0.2, -0.8, -0.3), (0.8, 0.4, 0.5)
 """A box around (0.3, -0.2, 0.1), whose sides differ."""
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-ONES, COLORS = (
-    torch.ones(3, dtype=torch.float64),
-    torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64),
-)
+ONES = torch.ones(3, dtype=torch.float64)
+COLORS = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 SIDES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -41,17 +39,15 @@ def passes(scene: Scene, count: int, samples: int, depth: int = -1) -> list[np.n
 
 
 def seen_from(
-    side: tuple[float, float, float],
-    half_width: float,
-    size: int,
-    is_perspective: bool = False,
-    away: float = 2.0,
+    side: tuple[float, float, float], half_width: float, size: int, is_perspective: bool = False
 ) -> Camera:
     towards = CENTER.new_tensor(side)
     up = towards.roll(1) if 1.0 in side else CENTER.new_tensor((0.0, 1.0, 0.0))
-    return Camera(
-        look_at(CENTER + away * towards, CENTER, up), (size, size), half_width, is_perspective
-    )
+    pose = look_at(CENTER + 2 * towards, CENTER, up)
+    return Camera(pose, (size, size), half_width, is_perspective)
+
+
+BLACK = {"sigma_s": (0.0,), "directional": None}
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -59,15 +55,8 @@ def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str
     density, sigma = torch.full((2, 3, 2), 1.5, dtype=torch.float64), np.array([0.5, 1.0, 2.0])
     grid = Grid.from_xyz((2, 3, 2), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.2, 4)
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=tuple(sigma),
-        sigma_s=(0.0,),
-        directional=None,
-        ambient=(1.0, 0.5, 0.2),
-        camera=camera,
-    )
+    medium = {"sigma_a": tuple(sigma), "ambient": (1.0, 0.5, 0.2), **BLACK}
+    scene = make_scene(density, grid=grid, camera=camera, **medium)
     length = dict(zip("xyz", np.subtract(UPPER, LOWER), strict=True))[side]
     means = np.array([image.mean((0, 1)) for image in passes(scene, 8, 256)])
     error = np.abs(means.mean(0) - [1.0, 0.5, 0.2] * np.exp(-1.5 * sigma * length))
@@ -83,19 +72,10 @@ def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int
     density[corner] = 8.0
     grid = Grid.from_xyz((5, 4, 3), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.65, 26)
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=(1.0,),
-        sigma_s=(0.0,),
-        directional=None,
-        ambient=(1.0,),
-        camera=camera,
-    )
-    z, y, x = (
-        axis.flatten()[index] for axis, index in zip(grid.centers(density), corner, strict=True)
-    )
-    right, up, _ = camera.pose[:, :3].T @ (torch.stack([x, y, z]) - camera.pose[:, 3])
+    medium = {"sigma_a": (1.0,), "ambient": (1.0,), **BLACK}
+    scene = make_scene(density, grid=grid, camera=camera, **medium)
+    place = torch.stack(torch.broadcast_tensors(*grid.centers(density)))[:, *corner].flip(0)
+    right, up, _ = camera.pose[:, :3].T @ (place - camera.pose[:, 3])
     darkness = 1 - passes(scene, 1, 64)[0].mean(-1)
     line = (np.arange(26) + 0.5 - 13) / 13 * 0.65
     place = (darkness.sum(0) @ line / darkness.sum(), -darkness.sum(1) @ line / darkness.sum())
@@ -112,13 +92,13 @@ def soft_ball(cells: int) -> tuple[Grid, Tensor]:
 
 def sky() -> Tensor:
     """A map [3, 8, 16] without symmetry, one pixel of it bright."""
-    radiance = COLORS.view(3, 1, 1) * torch.linspace(1, 0.1, 8, dtype=torch.float64).view(
-        1, 8, 1
-    ).repeat(1, 1, 16)
+    down = torch.linspace(1, 0.1, 8, dtype=torch.float64)
+    radiance = (COLORS.view(3, 1, 1) * down.view(8, 1)).repeat(1, 1, 16)
     radiance[:, 2, 5] += 40
     return radiance
 
 
+FINE = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
 LIGHTS: dict[str, Callable[[], list[Light]]] = {
     "directional": lambda: [DirectionalLight(-torch.tensor([2.0, 2.0, 1.0]).double(), COLORS)],
     "ambient": lambda: [AmbientLight(COLORS)],
@@ -138,17 +118,9 @@ def test_light_scattered_once_is_ours_to_4_percent(light: str) -> None:
     half_width = 0.25 if is_perspective else 0.5
     camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
     camera = replace(camera, pixel_aspect=1.0 if is_perspective else 1.3)
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=(0.5, 1.0, 2.0),
-        sigma_s=(3.0, 2.0, 1.0),
-        g=0.3,
-        camera=camera,
-        model="none",
-    )
-    settings = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
-    scene = replace(scene, lights=LIGHTS[light](), render=settings)
+    medium = {"sigma_a": (0.5, 1.0, 2.0), "sigma_s": (3.0, 2.0, 1.0), "g": 0.3}
+    scene = make_scene(density, grid=grid, camera=camera, model="none", **medium)
+    scene = replace(scene, lights=LIGHTS[light](), render=FINE)
     traced = Traced.of(passes(scene, 8, 128, depth=2))
     ours = render(scene)[0].permute(1, 2, 0).numpy()
     assert traced.noise < 0.05
@@ -172,12 +144,10 @@ def test_every_phase_function_is_theirs(phase: PhaseFunction) -> None:
     """As `blendphase`, `rayleigh` and `tabphase`, and color by color."""
     grid, density = soft_ball(12)
     camera = seen_from((0.5, 0.3, 0.8), 0.2, 8, True)
-    scene = make_scene(
-        density, grid=grid, sigma_a=(0.5,), sigma_s=(3.0,), camera=camera, model="none"
-    )
-    settings = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
+    medium = {"sigma_a": (0.5,), "sigma_s": (3.0,), "model": "none"}
+    scene = make_scene(density, grid=grid, camera=camera, **medium)
     lights = [*LIGHTS["directional"](), *LIGHTS["point"]()]
-    scene = replace(scene, lights=lights, render=settings)
+    scene = replace(scene, lights=lights, render=FINE)
     scene.volume.phase = phase
     traced = Traced.of(passes(scene, 8, 128, depth=2))
     ours = render(scene)[0].permute(1, 2, 0).numpy()
@@ -188,12 +158,9 @@ def test_every_phase_function_is_theirs(phase: PhaseFunction) -> None:
 def test_the_background_is_seen_where_we_see_it() -> None:
     grid, density = soft_ball(8)
     camera = seen_from((0.5, 0.3, 0.8), 1.2, 16, True)
-    scene = make_scene(
-        density, grid=grid, sigma_a=(20.0,), sigma_s=(0.0,), camera=camera, model="none"
-    )
-    scene = replace(
-        scene, lights=LIGHTS["environment"](), render=RenderSettings(samples_per_pixel=64)
-    )
+    scene = make_scene(density, grid=grid, sigma_a=(20.0,), camera=camera, model="none", **BLACK)
+    settings = RenderSettings(samples_per_pixel=64)
+    scene = replace(scene, lights=LIGHTS["environment"](), render=settings)
     traced = Traced.of(passes(scene, 8, 64))
     assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.02
 
@@ -219,9 +186,7 @@ def test_an_off_center_camera_is_theirs() -> None:
     sensor["to_world"] = mitsuba.ScalarTransform4f(sensor["to_world"])
     theirs = mitsuba.load_dict(sensor)
     for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
-        ray, _ = theirs.sample_ray(
-            0.0, 0.5, mitsuba.ScalarPoint2f(*corner), mitsuba.ScalarPoint2f(0.5)
-        )
-        np.testing.assert_allclose(
-            np.array(ray.d).ravel(), cast_rays(camera, corner).direction[index].flip(-1), atol=1e-6
-        )
+        point = mitsuba.ScalarPoint2f
+        ray, _ = theirs.sample_ray(0.0, 0.5, point(*corner), point(0.5))
+        ours = cast_rays(camera, corner).direction[index].flip(-1)
+        np.testing.assert_allclose(np.array(ray.d).ravel(), ours, atol=1e-6)

@@ -1,6 +1,4 @@
-"""A page needs nothing beside it, and text in it is text; curves lie where their numbers are, and
-volumes are shown cell for cell, in notebooks too.
-"""
+"""A page needs nothing beside it; curves lie where their numbers are, volumes are shown by cell."""
 
 import base64
 import gzip
@@ -65,14 +63,8 @@ class Balance(HTMLParser):
 
 
 def test_a_page_is_whole_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    parts = [
-        paragraph(NASTY),
-        items([NASTY]),
-        table([NASTY], [[NASTY]]),
-        fold(NASTY, NASTY),
-        picture(b"PNG", NASTY),
-        draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY),
-    ]
+    parts = [paragraph(NASTY), items([NASTY]), table([NASTY], [[NASTY]]), fold(NASTY, NASTY)]
+    parts += [picture(b"PNG", NASTY), draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
     write_page(tmp_path / "report.html", NASTY, NASTY, [section(NASTY, side_by_side(*parts))])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     reader = Balance()
@@ -85,9 +77,8 @@ def test_a_page_names_no_other_file(tmp_path: Path) -> None:
     write_page(tmp_path / "report.html", "a", "b", [picture(b"\x89PNG...", "c")])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', text)
-    assert [
-        base64.b64decode(source.removeprefix("data:image/png;base64,")) for source in sources
-    ] == [b"\x89PNG..."]
+    (data,) = (source.removeprefix("data:image/png;base64,") for source in sources)
+    assert base64.b64decode(data) == b"\x89PNG..."
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
@@ -97,10 +88,7 @@ FINITE = st.floats(-1e3, 1e3)
 def places(svg: str) -> list[list[tuple[float, float]]]:
     """The points of every line."""
     lines = re.findall(r'<polyline points="([^"]*)"', svg)
-    return [
-        [(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())]
-        for line in lines
-    ]
+    return [[tuple(map(float, pair.split(","))) for pair in line.split()] for line in lines]
 
 
 @given(FINITE, st.floats(1e-2, 1e6))
@@ -123,25 +111,16 @@ def test_logarithmic_ticks_lie_within_and_ascend(low: float, span: float) -> Non
 
 def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
     linear = places(draw_curve("a", {"": [(float(x), 3 * x - 1.0) for x in range(9)]}, "x"))
-    power = places(
-        draw_curve("a", {"": [(float(x), 10.0**-x) for x in range(9)]}, "x", is_logarithmic=True)
-    )
+    powers = [(float(x), 10.0**-x) for x in range(9)]
+    power = places(draw_curve("a", {"": powers}, "x", is_logarithmic=True))
     for (line,), sign in ((linear, -1), (power, 1)):
         slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(line)]
-        assert all(
-            slope * sign > 0 and slope == pytest.approx(slopes[0], abs=0.01) for slope in slopes
-        )
+        assert slopes == pytest.approx([slopes[0]] * 8, abs=0.01) and slopes[0] * sign > 0
 
 
 def test_what_cannot_be_drawn_is_left_out() -> None:
-    (line,) = places(
-        draw_curve(
-            "a",
-            {"": [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]},
-            "x",
-            is_logarithmic=True,
-        )
-    )
+    points = [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]
+    (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
     assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
 
@@ -226,9 +205,8 @@ def test_scene_volume_and_result_show_their_fields() -> None:
         fields = [json.loads(content) for content in data]
         assert [field["name"] for field in fields] == ["density", "sigma_s"]
         assert fields[0]["size"] == [5, 4, 3] and "5 x 4 x 3 cells, density up to" in page
-    assert "31.25 dB of views trained on, 28.50 dB of views held out" in (
-        Result(scene, [row])._repr_html_()
-    )
+    told = "31.25 dB of views trained on, 28.50 dB of views held out"
+    assert told in Result(scene, [row])._repr_html_()
 
 
 def test_what_is_printed_is_as_short_for_a_large_scene() -> None:

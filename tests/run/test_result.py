@@ -1,6 +1,4 @@
-"""The result of a run is a scene file that renders as what was found does, whichever numbers were
-varied.
-"""
+"""The result of a run is a scene file that renders as what was found does."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,11 +46,8 @@ VARIED = [
     ("sigma_a: {init: [0.5, 1, 2], field: true}, sigma_s: {}", ["sigma_a"]),
     ("albedo: {init: 0.8, field: true}, density: {}", ["density", "albedo"]),
     ("sigma_t: {}, g: {}", []),
-    (
-        "lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, "
-        "lights.2.position: {}, lights.2.intensity: {}",
-        [],
-    ),
+    ("lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}", []),
+    ("lights.2.position: {}, lights.2.intensity: {}", []),
     ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),
     ("g: {init: 0.5, field: true}", ["g"]),
     ("views.front.camera: {}", []),
@@ -110,16 +105,11 @@ def test_a_result_renders_as_what_was_found(
     assert {"density", *fields} <= {path.stem for path in (folder / "volumes").iterdir()}
 
 
-@pytest.mark.parametrize(
-    ("phase", "parameters"),
-    [
-        ("{type: henyey_greenstein, g: 0.3}", "g: {}"),
-        (
-            "{type: two_lobe, g: [0.6, -0.2], weight: [0.7, 0.5, 0.3]}",
-            "phase.g: {}, phase.weight: {}",
-        ),
-    ],
-)
+LOBES = "{type: two_lobe, g: [0.6, -0.2], weight: [0.7, 0.5, 0.3]}"
+PHASES = {"{type: henyey_greenstein, g: 0.3}": "g: {}", LOBES: "phase.g: {}, phase.weight: {}"}
+
+
+@pytest.mark.parametrize(("phase", "parameters"), PHASES.items())
 def test_a_result_has_the_phase_function_that_was_found(
     tmp_path: Path, phase: str, parameters: str
 ) -> None:
@@ -132,20 +122,12 @@ def test_a_result_has_the_phase_function_that_was_found(
 
 
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
-    write_field(
-        tmp_path / "start.npz",
-        "density",
-        np.full((4, 5, 6), 0.3),
-        np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]]),
-    )
+    box = np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]])
+    write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), box)
     text = CROSS_SECTIONS["sigma_t, albedo"]
     found = finished(tmp_path, text, "density: {}")
-    scene = (
-        (tmp_path / "scene.yaml")
-        .read_text()
-        .replace("density: 0.4", "density: {file: start.npz}")
-        .replace("  resolution: [6, 5, 4]\n", "")
-    )
+    text = (tmp_path / "scene.yaml").read_text().replace("  resolution: [6, 5, 4]\n", "")
+    scene = text.replace("density: 0.4", "density: {file: start.npz}")
     (tmp_path / "scene.yaml").write_text(scene)
     assert (
         load_scene(tmp_path / "scene.yaml").volume.grid

@@ -29,10 +29,7 @@ def read(write: Callable[[str], Path]) -> Callable[..., SceneFile]:
 
 @pytest.fixture
 def refusal(write: Callable[[str], Path], tmp_path: Path) -> Callable[..., list[str]]:
-    """The problem lines of text refused as a scene, without the folder they begin with.
-
-    `kind` is whose fault it is: the scene's, or that of a data file.
-    """
+    """The problem lines of text refused as a scene, without the folder, by `kind` of fault."""
 
     def problems(text: str, *overrides: str, kind: type[DdreconError] = SceneError) -> list[str]:
         with pytest.raises(kind) as caught:

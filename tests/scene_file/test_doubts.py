@@ -65,12 +65,8 @@ def test_a_thick_face_is_told_by_what_it_costs() -> None:
         (0.5, 0.9, "say g: 0 and sigma_s times 0.1"),
         (0.99, 0.9, None),
     ):
-        found = doubts(
-            *cells,
-            f"volume.sigma_a={(1 - albedo) * 1.5 / size}",
-            f"volume.sigma_s={albedo * 1.5 / size}",
-            f"volume.g={g}",
-        )
+        medium = f"volume.sigma_a={(1 - albedo) * 1.5 / size}", f"volume.g={g}"
+        found = doubts(*cells, *medium, f"volume.sigma_s={albedo * 1.5 / size}")
         assert words in found[0] if words else found == []
 
 

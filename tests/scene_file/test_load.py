@@ -56,18 +56,11 @@ optimize:
 
 def test_the_example_of_the_contract(read: Read, tmp_path: Path):
     tree = read(CONTRACT).tree
-    assert tree.volume == VolumeSection(
-        FieldFile(tmp_path / "plume.npz"),
-        sigma_a=0.6,
-        sigma_s=(11.4, 10.8, 9.6),
-        g=0.3,
-        bounds=Bounds((-0.5, -0.75, -0.5), (0.5, 0.75, 0.5)),
-        resolution=(64, 96, 64),
-    )
-    assert tree.lights == (
-        DirectionalSection((-2, -2, -1), 3.14159),
-        AmbientSection((0.2, 0.3, 0.5)),
-    )
+    box, density = Bounds((-0.5, -0.75, -0.5), (0.5, 0.75, 0.5)), FieldFile(tmp_path / "plume.npz")
+    medium = {"sigma_a": 0.6, "sigma_s": (11.4, 10.8, 9.6), "g": 0.3}
+    assert tree.volume == VolumeSection(density, bounds=box, resolution=(64, 96, 64), **medium)
+    sun = DirectionalSection((-2, -2, -1), 3.14159)
+    assert tree.lights == (sun, AmbientSection((0.2, 0.3, 0.5)))
     assert tree.views[0].image == tmp_path / "targets/front.exr" and tree.views[0].split == "train"
     assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings(steps_per_voxel=1)
     density = ParameterSettings(init=0.0, lr=0.05, min=0.0, tv=1e-4)
@@ -75,9 +68,8 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
 
 
 def test_every_error_is_told_at_once_with_its_place(refusal: Refusal):
-    text = (
-        SCENE.replace("g: 0.3", "g: 1").replace("density:", "densty:").replace("fov: 28", "fov: 0")
-    )
+    text = SCENE.replace("g: 0.3", "g: 1").replace("density:", "densty:")
+    text = text.replace("fov: 28", "fov: 0")
     lines = refusal(text, "render.steps_per_voxel=1.5", "lights.5.radiance=1")
     assert lines == [
         "-D lights.5.radiance=1: lights.5: no such entry: lights is a list of 2, counted from 0",
@@ -93,20 +85,13 @@ def test_left_out_names_count_from_zero_and_all_are_unique(read: Read, refusal: 
     views = f"views:\n  - {{name: view_01, camera: {CAMERA}}}\n  - {{camera: {CAMERA}}}\n"
     text = SCENE[: SCENE.index("views:")] + views
     assert refusal(text) == ["scene.yaml:13:5: views.1: 'view_01' is already the name of view 0"]
-    assert [view.name for view in read(text, "views.0.name=view_02").tree.views] == [
-        "view_02",
-        "view_01",
-    ]
+    views = read(text, "views.0.name=view_02").tree.views
+    assert [view.name for view in views] == ["view_02", "view_01"]
 
 
 def test_overrides_replace_add_and_reach_into_lists(read: Read):
-    overrides = [
-        "volume.g=0.5",
-        "lights.1.radiance=[1, 2, 3]",
-        "optimize.parameters.density.lr=1e-2",
-        "volume.g=0.6",
-        "render={}",
-    ]
+    overrides = ["volume.g=0.5", "lights.1.radiance=[1, 2, 3]", "volume.g=0.6", "render={}"]
+    overrides += ["optimize.parameters.density.lr=1e-2"]
     tree = read(SCENE, *overrides).tree
     assert tree.volume.g == 0.6 and tree.lights[1] == AmbientSection((1, 2, 3))
     assert tree.optimize is not None and tree.optimize.parameters["density"].lr == 0.01
@@ -117,10 +102,8 @@ def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
     text = SCENE + "optimize: {parameters: {density: {}}}\n"
     optimize = read(text, f"optimize.parameters.{name}.lr=2").tree.optimize
     assert optimize is not None and optimize.parameters[name].lr == 2
-    assert read(text, f"optimize.parameters.{name}={{}}").tree.optimize.parameters.keys() == {
-        "density",
-        name,
-    }
+    optimize = read(text, f"optimize.parameters.{name}={{}}").tree.optimize
+    assert optimize.parameters.keys() == {"density", name}
 
 
 def test_json_is_a_scene_too(tmp_path: Path, read: Read):
@@ -130,20 +113,16 @@ def test_json_is_a_scene_too(tmp_path: Path, read: Read):
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(tree, indent=1))
     loaded = read_scene(path).tree
-    assert loaded.diffusion.tolerance == 1e-05 and loaded.lights[0] == DirectionalSection(
-        (-2, -2, -1), 3.141592653589793
-    )
+    assert loaded.diffusion.tolerance == 1e-05
+    assert loaded.lights[0] == DirectionalSection((-2, -2, -1), 3.141592653589793)
     assert loaded.volume == read(SCENE).tree.volume
 
 
 def test_marks_lead_later_errors_to_the_line(read: Read):
     scene_file = read(SCENE, "volume.g=0.1")
-    assert str(scene_file.refused("lights.1.radiance", "odd")).endswith(
-        "scene.yaml:10:31: lights.1.radiance: odd"
-    )
-    assert str(scene_file.refused("views.0.image.never.written", "odd")).endswith(
-        "scene.yaml:12:5: views.0.image.never.written: odd"
-    )
+    for key, place in {"lights.1.radiance": "10:31", "views.0.image.never.written": "12:5"}.items():
+        told = str(scene_file.refused(key, "odd"))
+        assert told.endswith(f"scene.yaml:{place}: {key}: odd")
     assert str(scene_file.refused("volume.g", "odd")) == "-D volume.g=0.1: volume.g: odd"
 
 
@@ -153,11 +132,8 @@ FLAT = {"type": "orthographic", "width": 2, "matrix": MATRIX, "resolution": [4, 
 
 @pytest.mark.parametrize("text", [SCENE, CONTRACT, changed(views=[{"camera": FLAT}])])
 def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_path: Path):
-    overrides = [
-        "views.0.name='1e5'",
-        "optimize.parameters.density={init: {file: a b.npz}, max: 7}",
-        "diffusion.tolerance=1e-5",
-    ]
+    overrides = ["views.0.name='1e5'", "diffusion.tolerance=1e-5"]
+    overrides += ["optimize.parameters.density={init: {file: a b.npz}, max: 7}"]
     scene_file = read(text, *overrides)
     (tmp_path / "elsewhere").mkdir()
     dump_scene(describe(scene_file), tmp_path / "elsewhere" / "scene.yaml")

@@ -43,11 +43,9 @@ def value_of(text: str) -> object:
 
 
 def test_quoted_scalars_are_text():
-    assert (
-        value_of('"1e3"') == "1e3"
-        and value_of("'true'") == "true"
-        and value_of('{\n\t"a": "\\u0041"\n}')["a"].value == "A"
-    )
+    assert value_of('"1e3"') == "1e3"
+    assert value_of("'true'") == "true"
+    assert value_of('{\n\t"a": "\\u0041"\n}')["a"].value == "A"
 
 
 def plain(node: Node) -> object:
@@ -57,9 +55,8 @@ def plain(node: Node) -> object:
             assert child.key == node.child_key(name)
         return {name: plain(child) for name, child in node.value.items()}
     if isinstance(node.value, list):
-        assert [child.key for child in node.value] == [
-            node.child_key(i) for i in range(len(node.value))
-        ]
+        for index, child in enumerate(node.value):
+            assert child.key == node.child_key(index)
         return [plain(child) for child in node.value]
     return node.value
 
@@ -86,15 +83,8 @@ def test_aliases_mean_what_yaml_says():
     [
         ("a: 1\nb: [*x]\n", "scene.yaml:2:5: b.0: *x stands for nothing: no &x before"),
         ("a: &x [*x]\n", "scene.yaml:1:8: a.0: *x stands for nothing: no &x before"),
-        (
-            "a: &x [" + "0, " * 5000 + "0]\nb: [*x, *x]\n",
-            "aliases stand for more than 10,000 values, or are nested more than 32 deep",
-        ),
-        (
-            "a: !!python/name:os.system x\n",
-            "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are"
-            " not supported",
-        ),
+        ("a: &x [" + "0, " * 5000 + "0]\nb: [*x, *x]\n", "aliases stand for more than 10,000"),
+        ("a: !!python/name:os.system x\n", "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:py"),
         ("a: 1\n---\nb: 2\n", "scene.yaml:2:1: a second document begins; only one is allowed"),
         ("? [a]\n: 1\n", "scene.yaml:1:3: ?: a key must be plain text"),
         ("a: [1,\n", "scene.yaml:2:1: not YAML: while parsing a flow node, "),
@@ -128,9 +118,8 @@ def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
             read_scene(path)
         return str(caught.value)
 
-    assert problem(tmp_path / "a.yaml").endswith(
-        "a.yaml: cannot be read: No such file or directory"
-    )
+    told = "a.yaml: cannot be read: No such file or directory"
+    assert problem(tmp_path / "a.yaml").endswith(told)
     assert "cannot be read" in problem(tmp_path)
     (tmp_path / "b.yaml").write_bytes(b"a: b\n" + b"\n" * MAX_BYTES)
     start = time.perf_counter()

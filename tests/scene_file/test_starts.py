@@ -1,6 +1,4 @@
-"""Where parameters start: from the scene, a number, a color, a list or a file, as fields or single
-values; and what is refused.
-"""
+"""Where parameters start: from the scene, a number, a color, a list or a file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +16,7 @@ from ddrecon.scene_file.build import load_scene
 Write = Callable[[str], Path]
 BOUNDS = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
 SHAPE = (4, 3, 2)
+COLORED = torch.tensor([1.0, 2, 3]).view(3, 1, 1, 1).expand(3, *SHAPE)
 
 
 @pytest.fixture
@@ -28,9 +27,8 @@ def load(write: Write) -> Callable[[str], Scene]:
 
 
 def expect(value: Tensor, wanted: object) -> None:
-    torch.testing.assert_close(
-        value, torch.as_tensor(wanted, dtype=torch.float64), rtol=1e-6, atol=0
-    )
+    wanted = torch.as_tensor(wanted, dtype=torch.float64)
+    torch.testing.assert_close(value, wanted, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -42,11 +40,7 @@ def expect(value: Tensor, wanted: object) -> None:
         ("{density: {init: 0.3, field: false}}", "density", 0.3),
         ("{sigma_s: {}}", "sigma_s", [11.4, 10.8, 9.6]),
         ("{sigma_s: {init: 2}}", "sigma_s", [2, 2, 2]),
-        (
-            "{sigma_s: {init: [1, 2, 3], field: true}}",
-            "sigma_s",
-            torch.tensor([1.0, 2, 3]).view(3, 1, 1, 1).expand(3, *SHAPE),
-        ),
+        ("{sigma_s: {init: [1, 2, 3], field: true}}", "sigma_s", COLORED),
         ("{sigma_t: {}}", "sigma_t", [12.0, 11.4, 10.2]),
         ("{albedo: {init: 0.5}}", "albedo", [0.5, 0.5, 0.5]),
         ("{g: {init: -0.5}}", "g", -0.5),
@@ -68,12 +62,9 @@ def test_a_start(load: Callable[[str], Scene], parameters: str, name: str, wante
 def test_a_start_from_a_file(
     load: Callable[[str], Scene], tmp_path: Path, name: str, colors: int | None
 ) -> None:
-    values = (
-        np.random.default_rng(0).random((*SHAPE, colors) if colors else SHAPE).astype(np.float32)
-    )
+    shape = (*SHAPE, colors) if colors else SHAPE
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
     write_field(tmp_path / "start.npz", name, values, BOUNDS)
     start = load(f"{{{name}: {{init: {{file: start.npz}}}}}}").starts[name]
-    expect(
-        start,
-        values if name == "density" else values.transpose(3, 0, 1, 2) if colors else values[None],
-    )
+    by_color = values.transpose(3, 0, 1, 2) if colors else values[None]
+    expect(start, values if name == "density" else by_color)

@@ -1,7 +1,6 @@
-"""Camera files of NeRF, instant-ngp and nerfstudio: read as they are, written so that they come
-back, and refused by key.
-"""
+"""Camera files of NeRF, instant-ngp and nerfstudio: read, written, refused by key."""
 
+import itertools
 import json
 import math
 from collections.abc import Callable
@@ -31,11 +30,8 @@ NERFSTUDIO = SIZES | OTHERS | {"camera_model": "OPENCV", "k1": 0, "k2": 0.0, "pl
 
 
 def frame(name: str | None = "images/frame_00001.npy", **others: Any) -> dict[str, Any]:
-    return (
-        ({"file_path": name} if name else {})
-        | {"transform_matrix": POSE, "sharpness": 37.5}
-        | others
-    )
+    path = {"file_path": name} if name else {}
+    return path | {"transform_matrix": POSE, "sharpness": 37.5} | others
 
 
 def transforms(path: Path, *frames: dict[str, Any], **shared: Any) -> str:
@@ -54,68 +50,47 @@ def camera_of(view: ViewSection) -> PerspectiveSection:
 
 
 def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
-    """Pixel centers, +y up and looking along -z; what maps the world into other programs' boxes
-    changes nothing.
-    """
+    """Pixel centers, +y up and looking along -z; other programs' boxes change nothing."""
     read(transforms(tmp_path / "transforms.json", frame(None), **NERFSTUDIO))
     (view,) = load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views
     bundle, pose = cast_rays(view.camera), torch.tensor(POSE, dtype=torch.float64)
-    assert view.camera.size == (6, 8)
-    for row in range(6):
-        for column in range(8):
-            toward = pose[:3, :3] @ pose.new_tensor(
-                [(column + 0.5 - 4.3) / 20, -(row + 0.5 - 2.9) / 19, -1]
-            )
-            torch.testing.assert_close(
-                bundle.direction[8 * row + column].flip(0),
-                toward / toward.norm(),
-                rtol=0,
-                atol=1e-14,
-            )
-    torch.testing.assert_close(bundle.eye.flip(0), pose[:3, 3], rtol=0, atol=0)
+    assert view.camera.size == (6, 8) and torch.equal(bundle.eye.flip(0), pose[:3, 3])
+    for index, (row, column) in enumerate(itertools.product(range(6), range(8))):
+        way = pose.new_tensor([(column + 0.5 - 4.3) / 20, -(row + 0.5 - 2.9) / 19, -1])
+        toward = pose[:3, :3] @ way / way.norm()
+        torch.testing.assert_close(bundle.direction[index].flip(0), toward, rtol=0, atol=1e-14)
 
 
 def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
-    """An angle alone, images without a suffix whose size is that of the image, and a file for each
-    split.
-    """
+    """An angle alone, images without a suffix, whose size is theirs, and a file for each split."""
     for split in ("train", "val"):
-        transforms(
-            tmp_path / f"transforms_{split}.json", frame(f"./{split}/r_0"), camera_angle_x=0.6
-        )
-    train, val = views(
-        read(changed(views={"transforms": ["transforms_train.json", "transforms_val.json"]}))
-    )
+        path = tmp_path / f"transforms_{split}.json"
+        transforms(path, frame(f"./{split}/r_0"), camera_angle_x=0.6)
+    files = ["transforms_train.json", "transforms_val.json"]
+    train, val = views(read(changed(views={"transforms": files})))
     assert train.image == tmp_path / "train/r_0.png" and val.image == tmp_path / "val/r_0.png"
-    assert (train.split, val.split) == ("train", "test") and (train.name, val.name) == (
-        "train_r_0",
-        "val_r_0",
-    )
-    assert (
-        camera_of(train).fov == pytest.approx(math.degrees(0.6))
-        and camera_of(train).resolution is None
-    )
+    assert (train.split, val.split) == ("train", "test")
+    assert (train.name, val.name) == ("train_r_0", "val_r_0")
+    assert camera_of(train).fov == pytest.approx(math.degrees(0.6))
+    assert camera_of(train).resolution is None
 
 
 def test_a_frame_takes_precedence_over_its_file(read: Read, tmp_path: Path) -> None:
     special = frame("b.png", w=16.0, h=12, fl_x=40, fl_y=40, cx=8, cy=6, mask_path="masks/b.png")
-    first, second = views(
-        read(transforms(tmp_path / "transforms.json", frame("a.png"), special, **NERFSTUDIO))
-    )
+    text = transforms(tmp_path / "transforms.json", frame("a.png"), special, **NERFSTUDIO)
+    first, second = views(read(text))
     assert camera_of(first).resolution == (8, 6) and first.mask is None
-    expected = PerspectiveSection(
-        matrix=camera_of(second).matrix, fov=2 * math.degrees(math.atan(0.2)), resolution=(16, 12)
-    )
-    assert second.camera == expected and second.mask == tmp_path / "masks/b.png"
+    fov, matrix = 2 * math.degrees(math.atan(0.2)), camera_of(second).matrix
+    assert second.camera == PerspectiveSection(matrix=matrix, fov=fov, resolution=(16, 12))
+    assert second.mask == tmp_path / "masks/b.png"
 
 
 def test_angles_and_focal_lengths_say_the_same(read: Read, tmp_path: Path) -> None:
     angles = {"camera_angle_x": 2 * math.atan(8 / 2 / 20), "w": 8, "h": 6}
     angles["camera_angle_y"] = 2 * math.atan(6 / 2 / 19)
     (one,) = views(read(transforms(tmp_path / "a.json", frame(), **angles)))
-    (other,) = views(
-        read(transforms(tmp_path / "a.json", frame(), **(NERFSTUDIO | {"cx": 4, "cy": 3})))
-    )
+    lengths = NERFSTUDIO | {"cx": 4, "cy": 3}
+    (other,) = views(read(transforms(tmp_path / "a.json", frame(), **lengths)))
     assert camera_of(one).fov == pytest.approx(camera_of(other).fov, rel=1e-14)
     assert camera_of(one).pixel_aspect == pytest.approx(20 / 19, rel=1e-14)
     assert camera_of(one).principal_point == camera_of(other).principal_point == (0.5, 0.5)
@@ -161,14 +136,13 @@ def test_which_views_are_held_out(
 def test_names_are_legal_and_differ(
     read: Read, tmp_path: Path, files: list[str | None], names: list[str]
 ) -> None:
-    assert [
-        view.name
-        for view in views(read(transforms(tmp_path / "t.json", *map(frame, files), **NERFSTUDIO)))
-    ] == names
+    text = transforms(tmp_path / "t.json", *map(frame, files), **NERFSTUDIO)
+    assert [view.name for view in views(read(text))] == names
 
 
 SCALED = [[2 * x for x in row] for row in POSE[:3]] + POSE[3:]
 FISHEYE = {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0, 0, 0, 0, 1e-3, 0]}
+FLAT, TRAIN = frame(transform_matrix=POSE[:3]), {"train_filenames": ["a", "b"]}
 WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
     ([frame()], FISHEYE, "distortion_params.4: p1 = 0.001 is not modeled"),
@@ -179,20 +153,12 @@ WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"w": 10**400}, "w: expected a finite number"),
     ([frame()], {"cx": float("nan")}, "cx: expected a finite number"),
     ([], {}, "frames: expected a list with at least one frame"),
-    (
-        [frame(transform_matrix=POSE[:3])],
-        {},
-        "frames.0.transform_matrix: expected a list of 4 rows",
-    ),
+    ([FLAT], {}, "frames.0.transform_matrix: expected a list of 4 rows"),
     ([frame(transform_matrix=SCALED)], {}, "frames.0.transform_matrix: must be rigid"),
     ([{"file_path": "a.png"}], {}, "frames.0: missing key 'transform_matrix'"),
     ([frame(), 3], {}, "frames.1: expected a mapping, found 3"),
     ([frame(7)], {}, "frames.0.file_path: expected a file, found 7"),
-    (
-        [frame("a")],
-        {"train_filenames": ["a", "b"]},
-        "train_filenames.1: no frame has the file_path",
-    ),
+    ([frame("a")], TRAIN, "train_filenames.1: no frame has the file_path"),
     ([frame("a")], {"val_filenames": ["b"]}, "val_filenames.0: no frame has the file_path 'b'"),
     ([frame("a")], {"train_filenames": []}, "its lists of files name no frame"),
     ([frame("a")], {"train_filenames": [3]}, "train_filenames.0: expected text, found 3"),
@@ -235,16 +201,14 @@ def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
     again = read(changed(views={"transforms": "out/transforms.json"}))
     for one, other in zip(scene_file.tree.views, again.tree.views, strict=True):
         assert other.image is not None and (one.name, one.split) == (other.name, other.split)
-        assert (
-            other.image.resolve() == one.image and (other.mask and other.mask.resolve()) == one.mask
-        )
+        assert other.image.resolve() == one.image
+        assert (other.mask and other.mask.resolve()) == one.mask
     for one, other in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):
         torch.testing.assert_close(
             cast_rays(one.camera).direction, cast_rays(other.camera).direction, rtol=0, atol=1e-14
         )
-        assert (
-            torch.equal(one.camera.pose, other.camera.pose) and one.camera.size == other.camera.size
-        )
+        assert torch.equal(one.camera.pose, other.camera.pose)
+        assert one.camera.size == other.camera.size
 
 
 def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:

@@ -1,10 +1,8 @@
-"""Runs that are killed, interrupted or out of disk space at random moments, until they are done all
-the same.
+"""Runs that are killed, interrupted or out of space at random, until they are done all the same.
 
     python fault_runs.py FOLDER SIGNALS SHORTAGES
 
-One process imports torch and forks a child for every fault, so that each costs a fraction of a
-second. Prints as JSON what happened.
+One process imports torch and forks a child for every fault. Prints as JSON what happened.
 """
 
 import json
@@ -17,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
+from functools import partial
 from io import StringIO
 from pathlib import Path
 
@@ -63,18 +62,8 @@ def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
     is_begun = any(out.glob("checkpoints/[lp]*.pt"))  # not one half written
     going_on = ["--resume"] if is_begun else ["--overwrite"]
-    main(
-        [
-            "optimize",
-            str(folder / "scene.yaml"),
-            "-q",
-            "--preview-every",
-            "4",
-            "-o",
-            str(out),
-            *going_on,
-        ]
-    )
+    scene, how = str(folder / "scene.yaml"), ["-q", "--preview-every", "4"]
+    main(["optimize", scene, *how, "-o", str(out), *going_on])
 
 
 def ended(pid: int) -> int:
@@ -102,9 +91,7 @@ def nothing() -> None:
 
 
 def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from
-    its start.
-    """
+    """Runs that receive `count` signals, each within a quarter of the time a whole run takes."""
     faults, wrong, finished, number = 0, list[str](), 0, 0
     out = folder / "out_0"
     while faults < count or not finished:
@@ -129,25 +116,17 @@ def kill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
 
 
 def fill(folder: Path, count: int, whole: dict[str, object]) -> dict[str, object]:
-    """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints
-    are the largest of them.
-    """
+    """A run whose files cannot grow beyond a random size, `count` times, and then can."""
     out, wrong, faults = folder / "full", list[str](), 0
     largest = (folder / "whole" / "checkpoints" / "last.pt").stat().st_size
     for _ in range(count):
         most = int(random.uniform(0.02, 1.0) * largest)
-        code = ended(
-            start(
-                folder,
-                out,
-                lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
-            )
-        )
+        limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most, most))
+        code = ended(start(folder, out, limit))
         lines = (folder / "stderr").read_text().splitlines()
         faults += code == 3
-        if code != 0 and (
-            code != 3 or "cannot be written: File too large" not in lines[-1] or len(lines) > 2
-        ):
+        is_told = code == 3 and "cannot be written: File too large" in lines[-1]
+        if code != 0 and not (is_told and len(lines) <= 2):
             wrong.append(f"at most {most} bytes: {code}: {lines}")
     if code := ended(start(folder, out, nothing)):
         wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")

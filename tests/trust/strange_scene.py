@@ -1,6 +1,4 @@
-"""A scene with something of everything, as the text of its values, and values that are strange in a
-scene.
-"""
+"""A scene with something of everything, as the text of its values, and strange values."""
 
 # ruff: noqa: RUF001, SIM905
 

@@ -1,6 +1,4 @@
-"""Checkpoints: damage is noticed and costs at most one of them, and only a run of the same inputs
-goes on.
-"""
+"""Checkpoints: damage costs at most one of them, and only a run of the same inputs goes on."""
 
 import random
 import warnings
@@ -175,9 +173,7 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
 
 
 def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """About as often as they are to be, and not so often that they take more than their share of
-    the time.
-    """
+    """As often as they are to be, unless they take more than their share of the time."""
     saved: list[int] = []
     original = drive.RunFolder.save
 

@@ -1,12 +1,11 @@
-"""What a result does not depend on: the run, the number of threads, the order of views, the size of
-chunks; little on precision.
-"""
+"""What a result does not depend on: run, threads, order of views, chunks; little on precision."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from media import random_values
 from tiny_scene import write_scene
 from torch import Tensor
 
@@ -33,30 +32,18 @@ def cloud(
     path: Path, dtype: torch.dtype = torch.float32, cells: str = "[12, 10, 9]", **settings: str
 ) -> Scene:
     """The tiny scene, not so tiny, with a lumpy density."""
-    overrides = [
-        f"volume.resolution={cells}",
-        "diffusion.tolerance=1e-6",
-        "diffusion.transport_rounds=1",
-        "render.tolerance=0",
-        "optimize.refine_at=[]",
-    ]
-    scene = load_scene(
-        path,
-        overrides=[*overrides, *(f"{key}={value}" for key, value in settings.items())],
-        dtype=dtype,
-    )
-    density = torch.rand(
-        scene.volume.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    return replace(scene, volume=replace(scene.volume, density=density.to(dtype)))
+    overrides = [f"volume.resolution={cells}", "render.tolerance=0", "optimize.refine_at=[]"]
+    overrides += ["diffusion.tolerance=1e-6", "diffusion.transport_rounds=1"]
+    overrides += [f"{key}={value}" for key, value in settings.items()]
+    scene = load_scene(path, overrides=overrides, dtype=dtype)
+    density = random_values(*scene.volume.grid.shape, dtype=dtype)
+    return replace(scene, volume=replace(scene.volume, density=density))
 
 
 def found(scene: Scene) -> dict[str, Tensor]:
     """Images of all views by name, and the derivatives of a loss by density, g and sigma_s."""
-    values = {
-        name: getattr(scene.volume, name).clone().requires_grad_()
-        for name in ("density", "g", "sigma_s")
-    }
+    varied = ("density", "g", "sigma_s")
+    values = {name: getattr(scene.volume, name).clone().requires_grad_() for name in varied}
     names = [view.name for view in scene.views]
 
     def loss_of(_: View, image: Tensor) -> Tensor:
@@ -71,10 +58,8 @@ def found(scene: Scene) -> dict[str, Tensor]:
 def distance(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     """The largest relative difference, of norms, between results of the same names."""
     assert one.keys() == other.keys()
-    return max(
-        float((one[name].double() - other[name].double()).norm() / other[name].double().norm())
-        for name in one
-    )
+    pairs = [(one[name].double(), other[name].double()) for name in one]
+    return max(float((a - b).norm() / b.norm()) for a, b in pairs)
 
 
 def test_same_seed_same_bits(path: Path) -> None:
@@ -82,29 +67,19 @@ def test_same_seed_same_bits(path: Path) -> None:
     for seed in (3, 3, 4):
         torch.manual_seed(seed)
         result = optimize(scene)
-        runs.append(
-            [
-                result.scene.volume.density,
-                result.scene.volume.g,
-                torch.tensor([row.loss for row in result.rows]),
-            ]
-        )
+        losses = torch.tensor([row.loss for row in result.rows])
+        runs.append([result.scene.volume.density, result.scene.volume.g, losses])
     assert all(torch.equal(one, other) for one, other in zip(runs[0], runs[1], strict=True))
     assert not torch.equal(runs[0][0], runs[2][0])
 
 
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
-    scene = load_scene(
-        path,
-        overrides=["optimize.iterations=2", "optimize.views_per_iteration=0"],
-        dtype=torch.float64,
-    )
-    one, other = (
-        optimize(each).scene.volume for each in (scene, replace(scene, views=scene.views[::-1]))
-    )
-    assert torch.allclose(one.density, other.density, rtol=EQUAL) and torch.allclose(
-        one.g, other.g, rtol=EQUAL
-    )
+    overrides = ["optimize.iterations=2", "optimize.views_per_iteration=0"]
+    scene = load_scene(path, overrides=overrides, dtype=torch.float64)
+    turned = replace(scene, views=scene.views[::-1])
+    one, other = (optimize(each).scene.volume for each in (scene, turned))
+    assert torch.allclose(one.density, other.density, rtol=EQUAL)
+    assert torch.allclose(one.g, other.g, rtol=EQUAL)
 
 
 @pytest.mark.parametrize("model", ["flux_limited", "p1"])

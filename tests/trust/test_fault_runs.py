@@ -1,6 +1,4 @@
-"""Faults at random moments lose nothing: a run killed, interrupted or out of space ends with the
-bits of one left alone.
-"""
+"""A run killed, interrupted or out of space ends with the bits of one left alone."""
 
 import json
 import os

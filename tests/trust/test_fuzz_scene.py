@@ -1,6 +1,4 @@
-"""Scene files by strangers: whatever they say, `check` takes them or refuses them in lines that
-name the place, at once.
-"""
+"""Strangers' scene files are taken or refused in lines that name the place, at once."""
 
 import copy
 import os
@@ -24,21 +22,14 @@ from ddrecon.scene_file.load import MAX_BYTES
 
 pytestmark = pytest.mark.slow
 
-CASES = settings(
-    derandomize=True,
-    database=None,
-    max_examples=200,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+LEFT_OUT = [HealthCheck.function_scoped_fixture]
+CASES = settings(derandomize=True, database=None, max_examples=200, suppress_health_check=LEFT_OUT)
 PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
-"""How every line begins: with the place in the scene or override, or with the path of a data file.
-"""
+"""How every line begins: the place in the scene or override, or the path of a data file."""
 
 
 def in_a_ring(scene: dict[str, Any]) -> dict[str, Any]:
-    """`scene` with a ring of views, and so without the parameter that is one of its own views'
-    camera.
-    """
+    """`scene` with a ring of views, and so without the parameter of one of its own cameras."""
     scene = copy.deepcopy({**scene, "views": RING})
     del scene["optimize"]["parameters"]["views.front.camera"]
     return scene
@@ -93,31 +84,21 @@ def texts(draw: Callable[..., Any]) -> bytes:
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(data)))
         end = start + draw(st.sampled_from([0, 0, 1, 1, 2, 30, 100000]))
+        words = st.sampled_from(WORDS + NESTED).map(str.encode)
         data[start:end] = draw(
-            st.one_of(
-                st.sampled_from(WORDS + NESTED).map(str.encode),
-                st.binary(max_size=4),
-                st.just(b"\n"),
-                st.just(b": "),
-            )
+            st.one_of(words, st.binary(max_size=4), st.sampled_from([b"\n", b": "]))
         )
     return bytes(data)
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with the files that scenes name: good ones, a pipe, a loop of links, a
-    folder.
-    """
+    """The current folder, with the files that scenes name: good ones, a pipe, a loop, a folder."""
     monkeypatch.chdir(tmp_path)
     np.save("front.npy", np.full((6, 8, 3), 0.5, np.float32))
     np.save("to.npy", np.full((6, 8, 3), 0.5, np.float32))
-    write_field(
-        Path("density.npz"),
-        "density",
-        np.random.default_rng(0).random((4, 5, 6)),
-        np.array([[-0.5] * 3, [0.5] * 3]),
-    )
+    box, values = np.array([[-0.5] * 3, [0.5] * 3]), np.random.default_rng(0).random((4, 5, 6))
+    write_field(Path("density.npz"), "density", values, box)
     os.mkfifo("pipe.npy")
     os.mkfifo("pipe.npz")
     os.symlink("loop.npy", "loop.npy")
@@ -127,9 +108,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
-    """Runs a command that must end at once, with 0, 2 or 3, lines that name the place, and no new
-    file; its exit code.
-    """
+    """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
     before = files_below(folder)
     with deadline():
         result = CliRunner().invoke(main, list(arguments))
@@ -139,12 +118,8 @@ def require_taken_or_refused(folder: Path, *arguments: str) -> int:
     assert files_below(folder) == before
     if result.exit_code:
         assert result.stdout == ""
-        lines = [
-            line for line in result.stderr.split("\n")[:-1] if not line.startswith("warning: ")
-        ]
-        assert lines and all(PLACE.fullmatch(line) and len(line) <= 1100 for line in lines), (
-            result.stderr
-        )
+        lines = [one for one in result.stderr.split("\n")[:-1] if not one.startswith("warning: ")]
+        assert lines and all(PLACE.fullmatch(line) and len(line) <= 1100 for line in lines), lines
     return result.exit_code
 
 

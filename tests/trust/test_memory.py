@@ -1,7 +1,4 @@
-"""Memory is predicted before it is taken.
-
-Too much is refused with what would fit, and a shortage is one line.
-"""
+"""Memory is predicted; too much is refused with what would fit, and a shortage is one line."""
 
 import re
 from collections.abc import Callable
@@ -210,6 +207,5 @@ def test_a_shortage_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> No
 def test_other_errors_are_no_shortage() -> None:
     with pytest.raises(RuntimeError) as caught:
         torch.ones(2) @ torch.ones(3)
-    assert not is_shortage(caught.value) and is_shortage(
-        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
-    )
+    assert not is_shortage(caught.value)
+    assert is_shortage(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"))

@@ -1,6 +1,4 @@
-"""A scene small enough to be reconstructed hundreds of times: two levels, a random view an
-iteration, three kinds of parameters.
-"""
+"""A scene small enough to be reconstructed hundreds of times, with three kinds of parameters."""
 
 from pathlib import Path
 

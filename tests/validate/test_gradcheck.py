@@ -1,6 +1,4 @@
-"""The derivative check passes for every kind of parameter, alone and together, and catches each
-derivative that is wrong.
-"""
+"""The derivative check passes for every kind of parameter, and catches each that is wrong."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +16,9 @@ from ddrecon.variables.values import variable_names
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
-SMALL = [
-    "volume.resolution=[6, 5, 4]",
-    "views.0.camera.resolution=[7, 6]",
-    "views.1.camera.resolution=[6, 5]",
-    "views.2.camera.resolution=[5, 6]",
-    "views.3.camera.resolution=[6, 5]",
-    "lights.2.directions=3",
-]
+SIZES = ([7, 6], [6, 5], [5, 6], [6, 5])
+SMALL = ["volume.resolution=[6, 5, 4]", "lights.2.directions=3"]
+SMALL += [f"views.{index}.camera.resolution={size}" for index, size in enumerate(SIZES)]
 NAMES = tuple(load_scene(CONFIG).starts)
 ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 
@@ -33,9 +26,7 @@ ONE_ROUND = "diffusion.transport_rounds=1", "diffusion.degree=1"
 def check(
     name: str, samples: int = 0, overrides: tuple[str, ...] = ONE_ROUND
 ) -> list[GradientCheck]:
-    """Of one view, above a ground for its own number alone, and under few lights, or the one whose
-    number it is: all are in the check of all.
-    """
+    """Of one view, above a ground for its number alone, under the light whose number it is."""
     scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
     seen = name.split(".")[1] if name.startswith("views.") else "front"
     ground = scene.ground if name.startswith("ground.") else None

@@ -11,17 +11,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render, solve_light
-from ddrecon.validate.hard import (
-    CASES,
-    TOLERANCE,
-    Balance,
-    HardCase,
-    HardResult,
-    balance_of,
-    describe,
-    run_case,
-    table,
-)
+from ddrecon.validate import hard
+from ddrecon.validate.hard import CASES, TOLERANCE, HardCase, HardResult, balance_of, run_case
 
 CPU = torch.device("cpu")
 SMALL = HardCase(torch.ones, shape=(4, 5, 6), g=0.4)
@@ -48,19 +39,13 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
         assert kept.failures() == [] and kept.row().endswith("pass |")
     result = replace(KEPT, **change)
     assert result.failures() == [bound] and result.row().endswith(f"FAIL: {bound} |")
-    assert (
-        table([KEPT, result])[-1] == "2 cases, 1 failed"
-        and describe([KEPT, result])["passed"] is False
-    )
+    assert hard.table([KEPT, result])[-1] == "2 cases, 1 failed"
+    assert hard.describe([KEPT, result])["passed"] is False
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
-    name = "g -0.99, density jumps by 1e6"
-    monkeypatch.setattr(
-        import_module("ddrecon.renderer"),
-        "sharpen",
-        lambda medium, means: means - 1e3 * means.detach().max(),
-    )
+    name, renderer = "g -0.99, density jumps by 1e6", import_module("ddrecon.renderer")
+    monkeypatch.setattr(renderer, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
     assert run_case(name, CASES[name], CPU).failures() == ["radiance"]
 
 
@@ -69,10 +54,10 @@ def test_a_solve_that_gives_up_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(import_module("ddrecon.diffusion.solvers.multigrid"), "MAX_ITERATIONS", 8)
     result = run_case("small", SMALL, CPU)
     assert "did not reach its tolerance" in result.failures()[0]
-    assert describe([result])["passed"] is False and "did not reach" in table([result])[2]
+    assert hard.describe([result])["passed"] is False and "did not reach" in hard.table([result])[2]
 
 
-def solved(case: HardCase) -> Callable[[float], Balance]:
+def solved(case: HardCase) -> Callable[[float], hard.Balance]:
     """The balance of the solution of `case` in float64, times a factor."""
     scene, memory = case.scene(torch.float64, CPU), SolveMemory()
     render(scene, memory=memory)
@@ -81,9 +66,7 @@ def solved(case: HardCase) -> Callable[[float], Balance]:
 
 @pytest.mark.parametrize("ambient", [0.0, 0.5])
 def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
-    """All it has too much of is absorbed or leaks too much; with g not 0, a little of what leaks is
-    none of its own.
-    """
+    """All it has too much of is absorbed or leaks; with g not 0, a little is none of its own."""
     balance = solved(replace(SMALL, ambient=ambient))
     assert balance(1.0).residual < 1e-11 and balance(1.0).energy < 1e-11
     assert balance(1.001).residual == pytest.approx(1e-3, rel=1e-6)
@@ -115,39 +98,29 @@ def checkerboard(shape: tuple[int, int, int]) -> Tensor:
 def test_isotropic_light_is_never_negative_in_the_dark(
     density: Callable[..., Tensor], sigma_a: float, sigma_s: float
 ):
-    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either
-    sign, and L0 may dip below zero.
-    """
+    """An M-matrix with a source >= 0; with g not 0, -div(D kappa_s Q1) may make L0 dip below 0."""
     scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).diffuse.mean
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0
 
 
+FINITE = {
+    "checkerboard": (checkerboard(SHAPE), {}),
+    "hot voxel": (hot_voxel(SHAPE), {}),
+    "one cell": (half_full((1, 1, 1)), {}),
+    # Squares overflow there; so do exponentials of what rounding makes of no depth.
+    "thick": (1e10 * half_full(SHAPE), {}),
+    "opaque": (1e20 * half_full(SHAPE), {}),
+    # There the direction from the cell towards the camera is nothing but rounding.
+    "eye in a center": (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
+    "eye on a face": (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
+}
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(
-    ("density", "view"),
-    [
-        (checkerboard(SHAPE), {}),
-        (hot_voxel(SHAPE), {}),
-        (half_full((1, 1, 1)), {}),
-        # Squares overflow there; so do exponentials of what rounding makes of no depth.
-        (1e10 * half_full(SHAPE), {}),
-        (1e20 * half_full(SHAPE), {}),
-        # There the direction from the cell towards the camera is nothing but rounding.
-        (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
-        (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
-    ],
-    ids=[
-        "checkerboard",
-        "hot voxel",
-        "one cell",
-        "thick",
-        "opaque",
-        "eye at the center of a cell",
-        "eye on a face",
-    ],
-)
-def test_image_and_gradient_are_finite(density: Tensor, view: dict, dtype: torch.dtype):
+@pytest.mark.parametrize("case", FINITE)
+def test_image_and_gradient_are_finite(case: str, dtype: torch.dtype):
+    density, view = FINITE[case]
     density = density.to(dtype).requires_grad_()
     camera = make_camera(dtype=dtype, **view)
     image = render(make_scene(density, camera=camera, g=0.4, ambient=(0.5,)))

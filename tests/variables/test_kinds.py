@@ -15,16 +15,9 @@ from ddrecon.variables.kinds import KINDS, pattern_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
-SMALL = [
-    "volume.resolution=[5, 4, 3]",
-    "volume.density=0.7",
-    "volume.sigma_a=[0.3, 0.4, 0.5]",
-    "lights.0.irradiance=[3, 2, 1]",
-    "lights.2.directions=3",
-    *(f"views.{index}.camera.resolution=[7, 6]" for index in range(4)),
-]
-
-
+SMALL = ["volume.resolution=[5, 4, 3]", "volume.density=0.7", "volume.sigma_a=[0.3, 0.4, 0.5]"]
+SMALL += ["lights.0.irradiance=[3, 2, 1]", "lights.2.directions=3"]
+SMALL += [f"views.{index}.camera.resolution=[7, 6]" for index in range(4)]
 LOBES = "volume.phase={type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
 MEDIA = (
     "volume={bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}, resolution: [5, 4, 3], media:"

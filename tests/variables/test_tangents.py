@@ -1,6 +1,4 @@
-"""Derivative images: equal to central differences of the image, component by component, and to what
-closed forms say.
-"""
+"""Derivative images equal central differences of the image, and what closed forms say."""
 
 import pytest
 import torch
@@ -26,12 +24,7 @@ def scene() -> Scene:
 
 def images_of(scene: Scene) -> dict[str, Tensor]:
     parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
-    return {
-        "image": render(scene)[0],
-        "reduced": parts.reduced,
-        "single": parts.single,
-        "multiple": parts.multiple,
-    }
+    return {"image": render(scene)[0], **vars(parts)}
 
 
 NAMES = ["density", "albedo.b", "g", "lights.0.direction.x", "views.view.camera.rotation_y"]
@@ -41,15 +34,14 @@ NAMES = ["density", "albedo.b", "g", "lights.0.direction.x", "views.view.camera.
 def test_a_derivative_image_is_the_central_difference_of_the_image(scene: Scene, name: str) -> None:
     variable, change = variation(scene, name)
     found = render_tangent(scene, name, images_of)
+    value = value_of(scene, variable)
     high, low = (
-        images_of(with_values(scene, {variable: value_of(scene, variable) + way * STEP * change}))
-        for way in (1, -1)
+        images_of(with_values(scene, {variable: value + step * change})) for step in (STEP, -STEP)
     )
     for key, (image, derivative) in found.items():
         difference = (high[key] - low[key]) / (2 * STEP)
-        assert (derivative - difference).abs().max() <= 1e-6 * max(
-            1e-2, float(difference.abs().max())
-        ), key
+        size = max(1e-2, float(difference.abs().max()))
+        assert (derivative - difference).abs().max() <= 1e-6 * size, key
         torch.testing.assert_close(image, images_of(scene)[key], rtol=1e-11, atol=0)
 
 

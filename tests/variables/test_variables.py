@@ -20,33 +20,22 @@ def scene() -> Scene:
     return make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "density",
-        "sigma_a",
-        "sigma_s",
-        "g",
-        "lights.0.irradiance",
-        "lights.0.direction",
-        "lights.1.radiance",
-    ],
-)
+NAMES = ["density", "sigma_a", "sigma_s", "g"]
+NAMES += ["lights.0.irradiance", "lights.0.direction", "lights.1.radiance"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_value_that_is_put_in_comes_out_and_the_scene_keeps_its_own(
     scene: Scene, name: str
 ) -> None:
     before = value_of(scene, name).clone()
     changed = with_values(scene, {name: before + 0.1})
-    assert torch.equal(value_of(changed, name), before + 0.1) and torch.equal(
-        value_of(scene, name), before
-    )
+    assert torch.equal(value_of(changed, name), before + 0.1)
+    assert torch.equal(value_of(scene, name), before)
     follows = {"sigma_t", "albedo"} if name.startswith("sigma") else set()
-    moved = {
-        other
-        for other in variable_names(scene)
-        if not torch.equal(value_of(changed, other), value_of(scene, other))
-    }
-    assert moved == {name} | follows
+    for other in variable_names(scene):
+        is_same = torch.equal(value_of(changed, other), value_of(scene, other))
+        assert is_same == (other not in {name} | follows)
 
 
 @pytest.mark.parametrize("is_field", [True, False])
@@ -54,15 +43,11 @@ def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
     scene: Scene, is_field: bool
 ) -> None:
     shape = (3, *SHAPE) if is_field else (3,)
-    changed = with_values(
-        scene, {"sigma_a": random_values(*shape), "sigma_s": 5 * random_values(*shape, seed=1)}
-    )
-    values = {name: value_of(changed, name) for name in ("sigma_t", "albedo")}
-    again = with_values(scene, values)
-    for name in ("sigma_a", "sigma_s"):
-        torch.testing.assert_close(
-            value_of(again, name), value_of(changed, name), rtol=1e-13, atol=1e-15
-        )
+    known = {"sigma_a": random_values(*shape), "sigma_s": 5 * random_values(*shape, seed=1)}
+    changed = with_values(scene, known)
+    again = with_values(scene, {name: value_of(changed, name) for name in ("sigma_t", "albedo")})
+    for name, value in known.items():
+        torch.testing.assert_close(value_of(again, name), value, rtol=1e-13, atol=1e-15)
 
 
 def test_a_field_and_a_constant_mix(scene: Scene) -> None:
@@ -74,9 +59,8 @@ def test_a_field_and_a_constant_mix(scene: Scene) -> None:
 
 def test_the_albedo_of_nothing_is_nothing(scene: Scene) -> None:
     nothing = torch.zeros(3, dtype=torch.float64)
-    assert torch.equal(
-        value_of(with_values(scene, {"sigma_a": nothing, "sigma_s": nothing}), "albedo"), nothing
-    )
+    empty = with_values(scene, {"sigma_a": nothing, "sigma_s": nothing})
+    assert torch.equal(value_of(empty, "albedo"), nothing)
 
 
 def test_one_density_fills_the_grid(scene: Scene) -> None:
@@ -84,17 +68,10 @@ def test_one_density_fills_the_grid(scene: Scene) -> None:
     assert changed.volume.density.shape == SHAPE and bool((changed.volume.density == 0.5).all())
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "depth",
-        "lights.2.radiance",
-        "lights.0.radiance",
-        "lights.x.radiance",
-        "views.none.camera",
-        "views.view",
-    ],
-)
+ABSENT = ["depth", "lights.2.radiance", "lights.0.radiance", "lights.x.radiance"]
+
+
+@pytest.mark.parametrize("name", [*ABSENT, "views.none.camera", "views.view"])
 def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
     with pytest.raises(UsageError):
         value_of(scene, name)
@@ -122,9 +99,7 @@ def test_a_star_is_every_training_view_with_an_image() -> None:
 
 
 def test_the_settings_of_a_view_itself_win() -> None:
-    views = [view("a"), view("b")]
-    for parameters in (
-        {"views.*.camera": 1, "views.b.camera": 2},
-        {"views.b.camera": 2, "views.*.camera": 1},
-    ):
-        assert name_each(parameters, views) == {"views.a.camera": 1, "views.b.camera": 2}
+    views, given = [view("a"), view("b")], [("views.*.camera", 1), ("views.b.camera", 2)]
+    for parameters in (given, given[::-1]):
+        named = name_each(dict(parameters), views)
+        assert named == {"views.a.camera": 1, "views.b.camera": 2}

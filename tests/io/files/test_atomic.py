@@ -56,8 +56,6 @@ def test_the_file_is_there_all_the_while_it_is_replaced(
 
 
 def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
-    with (
-        pytest.raises(FormatError, match="cannot be written"),
-        replace_file(tmp_path / "absent" / "a.txt") as temporary,
-    ):
+    path = tmp_path / "absent" / "a.txt"
+    with pytest.raises(FormatError, match="cannot be written"), replace_file(path) as temporary:
         temporary.write_text("x")

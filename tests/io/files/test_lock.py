@@ -1,6 +1,4 @@
-"""A lock keeps others out of a folder while its process lives, and no longer; files are written
-where nothing is, unless it may be replaced, and only into existing folders.
-"""
+"""A lock keeps others out of a folder while its process lives; files replace none unasked."""
 
 import errno
 import os

@@ -65,9 +65,8 @@ def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, wha
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2, 1] = pixels[3, 0] = value
     np.save(tmp_path / "a.npy", pixels)
-    with pytest.raises(
-        FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
-    ):
+    told = rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
+    with pytest.raises(FormatError, match=told):
         read_image(tmp_path / "a.npy")
 
 
@@ -91,9 +90,8 @@ def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
     pytest.importorskip("OpenImageIO")
     pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
     paths = write_linear(tmp_path / "front.single", pixels)
-    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"] and set(
-        tmp_path.iterdir()
-    ) == set(paths)
+    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"]
+    assert set(tmp_path.iterdir()) == set(paths)
     assert np.load(paths[1]).dtype == np.float32
     assert all(np.array_equal(read_image(path).pixels, pixels.astype(np.float32)) for path in paths)
 
@@ -126,9 +124,8 @@ def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
     stored[0, :, 3] = 0, 51, 255
     iio.imwrite(tmp_path / "a.png", stored)
     image = read_image(tmp_path / "a.png")
-    assert (
-        image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1]) and image.coverage is not None
-    )
+    assert image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1])
+    assert image.coverage is not None
     assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
 
 
@@ -164,10 +161,8 @@ def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
 
 
 def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
-    stored = np.array(
-        [[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8
-    )
-    iio.imwrite(tmp_path / "m.png", stored)
+    stored = [[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]
+    iio.imwrite(tmp_path / "m.png", np.array([stored], np.uint8))
     mask = read_mask(tmp_path / "m.png").pixels[..., 0]
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
 

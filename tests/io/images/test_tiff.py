@@ -13,15 +13,11 @@ tifffile = pytest.importorskip("tifffile")
 pytest.importorskip("OpenImageIO")
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": "zlib"},
-        {"tile": (16, 32), "compression": "zlib", "byteorder": ">"},
-        {"planarconfig": "separate"},
-    ],
-    ids=lambda options: ", ".join(options),
-)
+TILES = {"tile": (16, 32), "compression": "zlib", "byteorder": ">"}
+LAYOUTS = [{"compression": "zlib"}, TILES, {"planarconfig": "separate"}]
+
+
+@pytest.mark.parametrize("options", LAYOUTS, ids=", ".join)
 @pytest.mark.parametrize("dtype", [np.float16, np.float64])
 def test_every_layout_is_read_right_or_refused(
     tmp_path: Path, dtype: type, options: dict[str, object]

@@ -1,6 +1,4 @@
-"""TIFF stacks: what Fiji and napari are told of ours, what theirs become, and stacks told from
-images.
-"""
+"""TIFF stacks: what Fiji and napari are told, what theirs become, and stacks told from images."""
 
 from pathlib import Path
 

@@ -1,6 +1,4 @@
-"""Archives of numpy, .vol and .vti, and what every volume must be: what is not is refused with
-advice.
-"""
+"""Archives of numpy, .vol and .vti, and what every volume must be."""
 
 import struct
 from pathlib import Path
@@ -32,26 +30,18 @@ def flawed(value: float) -> np.ndarray:
 
 
 PLACE = "at cell (x, y, z) = (3, 2, 1) (1 such values)"
-LEGAL_BOX = "bounds must be [[xmin"
+SHAPES = (), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2)
+BOXES = BOUNDS[::-1], BOUNDS[:1], np.full((2, 3), np.nan), BOUNDS.T
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"lwc": CUBE, "reff": CUBE, "bounds": BOUNDS}, "has no field 'density'; it has 'lwc', 'reff'"),
-    (
-        {"arr_0": CUBE, "bounds": BOUNDS},
-        "has no field 'density'; it has 'arr_0'; say name: arr_0 beside file",
-    ),
-    *(
-        ({"density": np.ones(shape)}, "expected [z, y, x]")
-        for shape in ((), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2))
-    ),
+    ({"arr_0": CUBE}, "has no field 'density'; it has 'arr_0'; say name: arr_0 beside file"),
+    *(({"density": np.ones(shape)}, "expected [z, y, x]") for shape in SHAPES),
     ({"density": np.ones((1, 1, 1), complex)}, "complex"),
     ({"density": np.array([[["a"]]])}, "values of type"),
     ({"density": flawed(np.nan)}, f"density is NaN or infinite {PLACE}"),
     ({"density": flawed(1e300)}, f"density is NaN or infinite {PLACE}"),
     ({"density": flawed(-0.5)}, f"density is negative {PLACE}"),
-    *(
-        ({"density": CUBE, "bounds": bounds}, LEGAL_BOX)
-        for bounds in (BOUNDS[::-1], BOUNDS[:1], np.full((2, 3), np.nan), BOUNDS.T)
-    ),
+    *(({"density": CUBE, "bounds": bounds}, "bounds must be [[xmin") for bounds in BOXES),
 ]
 
 
@@ -74,11 +64,8 @@ def test_cells_lie_where_vtk_has_them(tmp_path: Path) -> None:
     write_fields(path, fields, BOUNDS)
     head, _, data = path.read_bytes().partition(b"\n_")
     image = ElementTree.fromstring(head + b"</AppendedData></VTKFile>")[0]
-    assert image.attrib == {
-        "WholeExtent": "0 2 0 3 0 4",
-        "Origin": "-1.0 -2.0 -3.0",
-        "Spacing": "1.0 1.5 1.5",
-    }
+    assert image.attrib["WholeExtent"] == "0 2 0 3 0 4"
+    assert (image.attrib["Origin"], image.attrib["Spacing"]) == ("-1.0 -2.0 -3.0", "1.0 1.5 1.5")
     arrays = image.findall("Piece/CellData/DataArray")
     assert [array.get("Name") for array in arrays] == list(fields)
     for array, values in zip(arrays, fields.values(), strict=True):
@@ -99,13 +86,10 @@ def test_reading_one_says_what_is_read(tmp_path: Path) -> None:
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 
 
-@pytest.mark.parametrize(
-    "values", [VALUES, np.stack([VALUES, 2 * VALUES, 3 * VALUES], -1)], ids=["gray", "colors"]
-)
-def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, values: np.ndarray) -> None:
-    mitsuba = pytest.importorskip(
-        "mitsuba", reason="the comparison needs Mitsuba 3 (the extra `reference`)"
-    )
+@pytest.mark.parametrize("has_colors", [False, True])
+def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, has_colors: bool) -> None:
+    mitsuba = pytest.importorskip("mitsuba", reason="needs Mitsuba 3 (the extra `reference`)")
+    values = np.stack([VALUES, 2 * VALUES, 3 * VALUES], -1) if has_colors else VALUES
     mitsuba.set_variant("scalar_rgb")
     ours, theirs = tmp_path / "ours.vol", tmp_path / "theirs.vol"
     write_field(ours, "density", values, BOUNDS)
@@ -115,17 +99,12 @@ def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, values: np.ndar
     assert np.array_equal(read_field(theirs, "density").values, values)
 
 
-@pytest.mark.parametrize(
-    ("offset", "layout", "value", "reason"),
-    [
-        (0, "3s", b"VOX", "not a Mitsuba volume"),
-        (3, "B", 2, "version 2"),
-        (4, "<i", 3, "type 3"),
-        (8, "<i", 5, "5 x 3 x 2 cells"),
-        (8, "<i", -4, "is damaged"),
-        (20, "<i", 2, "is damaged"),
-    ],
-)
+DAMAGES = [(0, "3s", b"VOX", "not a Mitsuba volume"), (3, "B", 2, "version 2")]
+DAMAGES += [(4, "<i", 3, "type 3"), (8, "<i", 5, "5 x 3 x 2 cells")]
+DAMAGES += [(8, "<i", -4, "is damaged"), (20, "<i", 2, "is damaged")]
+
+
+@pytest.mark.parametrize(("offset", "layout", "value", "reason"), DAMAGES)
 def test_a_damaged_vol_is_refused(
     tmp_path: Path, offset: int, layout: str, value: int | bytes, reason: str
 ) -> None:
