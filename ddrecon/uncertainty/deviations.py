@@ -93,13 +93,17 @@ class Field:
         return (1 - self.deviation.square() / self.power).clamp(0, 1)
 
     def describe(self) -> dict[str, Any]:
-        """Root mean squares over the smoke, what share pictures explain, and classes."""
+        """Root mean squares over the smoke, what share pictures explain, and classes.
+
+        Without experiments it is not known what pictures explain.
+        """
         smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
         deviation = float(self.deviation[smoke].square().mean())
+        explained = min(max(1 - deviation / self.power, 0.0), 1.0) if self.errors else None
         return {
             "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
             "deviation": deviation**0.5,
-            "explained": min(max(1 - deviation / self.power, 0.0), 1.0),
+            "explained": explained,
             "classes": {
                 name: {"share": float(own[smoke].double().mean())}
                 | self._coverage(name, own & smoke)
@@ -110,8 +114,8 @@ class Field:
 
     def _coverage(self, name: str, where: Tensor) -> dict[str, float]:
         """How often errors of experiments were within deviations that the others say of them."""
-        if not self.errors:
-            return {}
+        if len(self.errors) < 2:
+            return {"factor": SHORT * self.factors[name]} if self.errors else {}
         sizes = torch.stack(
             [(e.abs() / self.deviation_but(at))[where] for at, e in enumerate(self.errors)]
         )

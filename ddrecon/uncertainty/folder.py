@@ -45,7 +45,9 @@ def write_found(
     """
     found, fields = deviations.found, deviations.fields
     for name, field in fields.items():
-        stated = {"std": field.deviation, "mean": field.value, "explained": field.explained}
+        stated = {"std": field.deviation, "mean": field.value}
+        if found.count:
+            stated["explained"] = field.explained
         for kind, values in stated.items():
             _write(field, path / "volumes" / f"{name}_{kind}", name, values)
     for number in range(samples):
@@ -107,10 +109,11 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
 
 
 def _about(field: Mapping[str, Any]) -> str:
-    return (
-        f"deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g} (root mean squares"
-        f" over the smoke); pictures explain {100 * field['explained']:.0f} % of the variance"
-    )
+    deviation, of, part = (field[n] for n in ("deviation", "root_mean_square", "explained"))
+    size = f"deviation {deviation:.3g} of {of:.3g} (root mean squares over the smoke)"
+    if part is None:
+        return f"{size} by noise alone, which is several times too small"
+    return f"{size}; pictures explain {100 * part:.0f} % of the variance"
 
 
 def _classes(field: Mapping[str, Any]) -> list[str]:
@@ -171,11 +174,11 @@ def write_uncertainty_report(
 def _field(name: str, field: Field, described: Mapping[str, Any]) -> list[str]:
     value, deviation = field.value, field.deviation
     strongest = find_white_value(deviation)
-    pictures = [
-        (slices(deviation, strongest), f"deviation: white is {strongest:.3g}"),
-        (slices(field.explained, 1.0), "explained by pictures: black is nothing, white is all"),
-    ]
-    if field.parameter.is_field:
+    pictures = [(slices(deviation, strongest), f"deviation: white is {strongest:.3g}")]
+    if field.errors:
+        caption = "explained by pictures: black is nothing, white is all"
+        pictures.append((slices(field.explained, 1.0), caption))
+    if field.parameter.is_field and field.errors:
         size, off = (
             each.reshape(-1, *each.shape[-3:]).abs().mean(0) for each in (value, deviation)
         )
