@@ -191,7 +191,7 @@ def try_next(name: str, path: Path, kept: int) -> dict[str, Any]:
     pictures += noise * torch.randn(pictures.shape, generator=torch.Generator().manual_seed(0))
     views = [replace(v, image=p) for v, p in zip(known.views, pictures, strict=True)]
     scene = replace(scene, views=views[:kept])
-    ranked = rank_views(scene, "ring")
+    ranked = rank_views(scene)
     errors = {}
     for view in views[kept:]:
         found = finish(replace(scene, views=[*views[:kept], view])).current_scene().volume

@@ -140,8 +140,7 @@ def _number(number: Mapping[str, float | None]) -> str:
 def _describe_angle(view: Mapping[str, Any], place: int) -> str:
     """How far off the picture at this `place` in the ranking is."""
     tied = ", not to be distinguished from the first" if place and view["is_tied"] else ""
-    nearest = "light" if view["light_directions"] else "picture"
-    return f"{view['angle']:.0f} degrees from the nearest {nearest}{tied}"
+    return f"{view['angle']:.0f} degrees from the nearest picture{tied}"
 
 
 def write_uncertainty_report(
