@@ -148,7 +148,8 @@ def experiment(run: Reconstruction, experiments: int) -> Deviations:
 def judge(known: Known, experiments: int) -> dict[str, Any]:
     """How often the truth is within one and two deviations, of cells that hold smoke in truth.
 
-    And how far ranks of errors and deviations agree, and could by errors in the cells around.
+    And how far ranks of errors and deviations agree, there and in the whole box, and could there by
+    errors in the cells around.
     """
     scene, truth = known
     run = finish(scene)
@@ -160,9 +161,10 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
         sizes = (error / field.deviation)[own & smoke]
         within = [f"{100 * float((sizes < k).double().mean()):.0f}" for k in (1, 2)]
         row[f"{name}: within 1, 2 [%]"] = ", ".join(within) if len(sizes) >= FEWEST else "-"
-    best = mean_around(error.square(), 5).sqrt()
-    for name, said in {"rank correlation": field.deviation, "with errors around": best}.items():
-        row[name] = f"{correlate_ranks(error[smoke], said[smoke]):.2f}"
+    best, said = mean_around(error.square(), 5).sqrt(), field.deviation
+    row["rank correlation"] = f"{correlate_ranks(error[smoke], said[smoke]):.2f}"
+    row["with errors around"] = f"{correlate_ranks(error[smoke], best[smoke]):.2f}"
+    row["over all cells"] = f"{correlate_ranks(error, said):.2f}"
     number = deviations.numbers()["mass of density"]
     mass, deviation = number["value"] or 0.0, number["deviation"] or 1.0
     true = mass * float(truth.double().sum() / field.value.sum())
@@ -170,9 +172,12 @@ def judge(known: Known, experiments: int) -> dict[str, Any]:
 
 
 def correlate_ranks(one: Tensor, other: Tensor) -> float:
-    """Spearman's coefficient."""
-    ranks = torch.stack([each.flatten().argsort().argsort().double() for each in (one, other)])
-    return float(torch.corrcoef(ranks)[0, 1])
+    """Spearman's coefficient; what is equal has the mean of its ranks."""
+    ranks = []
+    for each in (one, other):
+        _, place, count = each.unique(return_inverse=True, return_counts=True)
+        ranks.append((count.cumsum(0) - count / 2)[place].flatten().double())
+    return float(torch.corrcoef(torch.stack(ranks))[0, 1])
 
 
 def try_next(name: str, path: Path, kept: int) -> dict[str, Any]:
