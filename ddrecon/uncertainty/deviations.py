@@ -51,8 +51,10 @@ class Field:
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
         # What pictures leave of that by noise alone, of cells that change with those around.
         around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
-        explained = self.power * around
-        self.left, is_unseen = self.power / (1 + explained), explained < 1
+        # Where nothing may be, that is known.
+        allowed = 1.0 if parameter.support is None else parameter.support.cpu().double()
+        self.left = allowed * self.power / (1 + self.power * around)
+        is_unseen = 2 * self.left > self.power
         is_edge = mean_around(is_empty.double(), WIDTH) > 0
         self.classes = {
             "edge": is_edge & ~is_unseen,

@@ -122,6 +122,13 @@ def test_where_pictures_tell_nothing_a_cell_may_be_anything() -> None:
     assert bool(field.classes["unseen"].all()) and not bool(field.explained.any())
     power = float(value.square().mean())
     torch.testing.assert_close(field.deviation.square(), torch.full(SHAPE, power).double())
+    # But where nothing may be, nothing is: there, experiments have no errors.
+    support = torch.arange(SHAPE[0])[:, None, None].expand(SHAPE) > 5
+    found.parameters[0].support = support.double()
+    found.errors = [{"density": support * error["density"]} for error in found.errors]
+    field = Field(found, found.parameters[0])
+    torch.testing.assert_close(field.classes["unseen"], support)
+    assert float(field.deviation[:5].max()) < 1e-6 * power < power / 2 < field.deviation[6:].min()
 
 
 def test_samples_deviate_as_they_should_and_are_the_same_again() -> None:
