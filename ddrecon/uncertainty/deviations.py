@@ -114,15 +114,16 @@ class Field:
             },
         }
 
-    def _coverage(self, name: str, where: Tensor) -> dict[str, float]:
-        """How often errors of experiments were within deviations that the others say of them."""
-        if len(self.errors) < 2:
-            return {"factor": SHORT * self.factors[name]} if self.errors else {}
-        sizes = torch.stack(
-            [(e.abs() / self.deviation_but(at))[where] for at, e in enumerate(self.errors)]
-        )
+    def _coverage(self, name: str, where: Tensor) -> dict[str, Any]:
+        """How often errors of experiments were within deviations by the others, and factors."""
+        if not self.errors:
+            return {}
+        errors = [(at, error.abs()[where]) for at, error in enumerate(self.errors)]
+        factors = [SHORT * _find_within(error / self.spread(at)[where]) for at, error in errors]
+        sizes = torch.cat([error / self.deviation_but(at)[where] for at, error in errors])
         within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
-        return {"factor": SHORT * self.factors[name]} | within
+        found = {"factor": SHORT * self.factors[name], "factors": factors}
+        return found | (within if len(errors) > 1 else {})
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """A change as likely as any: the experiments' errors, each times a smooth random field."""

@@ -123,10 +123,9 @@ def _classes(field: Mapping[str, Any]) -> list[str]:
         what = ", where pictures tell nothing" if name == "unseen" else ""
         line = f"{name}{what}: {100 * of['share']:.0f} % of the smoke"
         if "within_1" in of:
-            line += (
-                f"; in experiments {100 * of['within_1']:.0f} % lay within one deviation,"
-                f" {100 * of['within_2']:.0f} % within two"
-            )
+            each, (one, two) = of["factors"], (100 * of[f"within_{k}"] for k in (1, 2))
+            line += f"; errors around times {of['factor']:.2f} ({min(each):.2f} to {max(each):.2f})"
+            line += f"; in experiments {one:.0f} % lay within one deviation, {two:.0f} % within two"
         lines.append(line)
     return lines
 

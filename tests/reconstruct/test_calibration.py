@@ -96,6 +96,9 @@ def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack(
         assert share == pytest.approx(0.68, abs=0.01)
     described = field.describe()["classes"]
     assert sum(each["share"] for each in described.values()) == pytest.approx(1)
+    for each in described.values():
+        assert len(each["factors"]) == 3
+        assert each["factors"] == pytest.approx([each["factor"]] * 3, rel=0.3)
     # By the other experiments alone it is nearly as often so.
     assert described["inside"]["within_1"] == pytest.approx(0.86, abs=0.05)
     assert described["inside"]["within_2"] > 0.98
