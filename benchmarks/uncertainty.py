@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -99,8 +100,14 @@ def trace_cloud(path: Path, folder: Path) -> Known:
     high = [side * cells for side, cells in zip(step, density.shape[::-1], strict=True)]
     scale = float(np.quantile(density[density > 0], 0.99))
     write_field(folder / "density.npz", "density", density / scale, np.array([[0, 0, 0], high]))
-    views = {"ring": {"count": 9, "radius": 2.4 * max(high), "height": 1.2 * max(high)}}
-    views["ring"] |= {"target": [side / 2 for side in high], "up": [0, 0, 1], "fov": 30}
+    # Around the upright axis, which is z: all from above.
+    camera = {"type": "perspective", "target": [side / 2 for side in high], "up": [0, 0, 1]}
+    camera |= {"fov": 30, "resolution": [48, 48]}
+    ways = [(math.sin(turn), math.cos(turn), 0.5) for turn in np.arange(9) * 2 * math.pi / 9]
+    origins = [
+        [side / 2 + 2.4 * max(high) * w for side, w in zip(high, way, strict=True)] for way in ways
+    ]
+    views = [{"camera": camera | {"origin": origin}} for origin in origins]
     volume = {"bounds": {"min": [0, 0, 0], "max": high}, "density": {"file": "density.npz"}}
     scene = {
         "volume": volume | {"sigma_t": min(scale, 60.0), "albedo": 1, "g": 0.85},
@@ -109,7 +116,7 @@ def trace_cloud(path: Path, folder: Path) -> Known:
             {"type": "ambient", "radiance": 0.01},
         ],
         "render": {"background": False},
-        "views": {"ring": views["ring"] | {"resolution": [48, 48]}},
+        "views": views,
     }
     (folder / "truth.yaml").write_text(json.dumps(scene))
     scene["optimize"] = {"iterations": 120, "parameters": {"density": {"init": 0, "min": 0}}}
