@@ -302,9 +302,9 @@ def optimize(
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
 @click.option(
     "--next-view",
-    type=click.Choice(["ring", "lights"]),
-    help="Which picture next? Rank twelve by how far off those taken they are. By the first "
-    "camera: it is turned around the volume (ring), or directional lights are (lights).",
+    type=click.Choice(["ring"]),
+    help="Which picture next? Rank twelve by how far off those taken they are: by the first "
+    "camera, turned around the volume.",
 )
 @click.option("--tolerance", type=float, hidden=True)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
@@ -345,7 +345,7 @@ def uncertainty(
         )
     noise = None if read is None else Noise(read, 0.0)
     kept = samples if has_samples else 0
-    request = Request(session.seed, experiments, kept, noise, next_view)
+    request = Request(session.seed, experiments, kept, noise, bool(next_view))
     if not is_first():
         follow_uncertainty(taken, request)
         return

@@ -51,8 +51,10 @@ class Field:
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
         # What pictures leave of that by noise alone, of cells that change with those around.
         around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
-        explained = self.power * around
-        self.left, is_unseen = self.power / (1 + explained), explained < 1
+        # Where nothing may be, that is known.
+        allowed = 1.0 if parameter.support is None else parameter.support.cpu().double()
+        self.left = allowed * self.power / (1 + self.power * around)
+        is_unseen = 2 * self.left > self.power
         is_edge = mean_around(is_empty.double(), WIDTH) > 0
         self.classes = {
             "edge": is_edge & ~is_unseen,
@@ -93,13 +95,17 @@ class Field:
         return (1 - self.deviation.square() / self.power).clamp(0, 1)
 
     def describe(self) -> dict[str, Any]:
-        """Root mean squares over the smoke, what share pictures explain, and classes."""
+        """Root mean squares over the smoke, what share pictures explain, and classes.
+
+        Without experiments it is not known what pictures explain.
+        """
         smoke = self.is_smoke if bool(self.is_smoke.any()) else torch.ones_like(self.is_smoke)
         deviation = float(self.deviation[smoke].square().mean())
+        explained = min(max(1 - deviation / self.power, 0.0), 1.0) if self.errors else None
         return {
             "root_mean_square": float(self.value[smoke].square().mean()) ** 0.5,
             "deviation": deviation**0.5,
-            "explained": min(max(1 - deviation / self.power, 0.0), 1.0),
+            "explained": explained,
             "classes": {
                 name: {"share": float(own[smoke].double().mean())}
                 | self._coverage(name, own & smoke)
@@ -108,15 +114,16 @@ class Field:
             },
         }
 
-    def _coverage(self, name: str, where: Tensor) -> dict[str, float]:
-        """How often errors of experiments were within deviations that the others say of them."""
+    def _coverage(self, name: str, where: Tensor) -> dict[str, Any]:
+        """How often errors of experiments were within deviations by the others, and factors."""
         if not self.errors:
             return {}
-        sizes = torch.stack(
-            [(e.abs() / self.deviation_but(at))[where] for at, e in enumerate(self.errors)]
-        )
+        errors = [(at, error.abs()[where]) for at, error in enumerate(self.errors)]
+        factors = [SHORT * _find_within(error / self.spread(at)[where]) for at, error in errors]
+        sizes = torch.cat([error / self.deviation_but(at)[where] for at, error in errors])
         within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
-        return {"factor": SHORT * self.factors[name]} | within
+        found = {"factor": SHORT * self.factors[name], "factors": factors}
+        return found | (within if len(errors) > 1 else {})
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """A change as likely as any: the experiments' errors, each times a smooth random field."""

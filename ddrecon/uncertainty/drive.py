@@ -28,14 +28,15 @@ from ddrecon.uncertainty.next_view import rank_views
 class Request:
     """What is asked for: so many `experiments`, and `samples` written of what is left open.
 
-    `noise` is that of all pictures, if their scene is not to say; `next_view` what to rank.
+    `noise` is that of all pictures, if their scene is not to say. With `has_next_view` those that
+    may be taken next are ranked.
     """
 
     seed: int
     experiments: int
     samples: int
     noise: Noise | None = None
-    next_view: str | None = None
+    has_next_view: bool = False
 
 
 def drive_uncertainty(
@@ -45,8 +46,7 @@ def drive_uncertainty(
 
     An interrupt takes effect after an iteration of an experiment; `resume` goes on from there.
     """
-    # Before anything is removed: there may be nothing to rank.
-    views = rank_views(run.level.train, request.next_view) if request.next_view else []
+    views = rank_views(run.level.train) if request.has_next_view else []
     described, checkpoints = _describe(run, request), path / CHECKPOINTS
     state, began = None, perf_counter()
     if resume:

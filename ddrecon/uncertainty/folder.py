@@ -45,7 +45,9 @@ def write_found(
     """
     found, fields = deviations.found, deviations.fields
     for name, field in fields.items():
-        stated = {"std": field.deviation, "mean": field.value, "explained": field.explained}
+        stated = {"std": field.deviation, "mean": field.value}
+        if found.count:
+            stated["explained"] = field.explained
         for kind, values in stated.items():
             _write(field, path / "volumes" / f"{name}_{kind}", name, values)
     for number in range(samples):
@@ -107,10 +109,11 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
 
 
 def _about(field: Mapping[str, Any]) -> str:
-    return (
-        f"deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g} (root mean squares"
-        f" over the smoke); pictures explain {100 * field['explained']:.0f} % of the variance"
-    )
+    deviation, of, part = (field[n] for n in ("deviation", "root_mean_square", "explained"))
+    size = f"deviation {deviation:.3g} of {of:.3g} (root mean squares over the smoke)"
+    if part is None:
+        return f"{size} by noise alone, which is several times too small"
+    return f"{size}; pictures explain {100 * part:.0f} % of the variance"
 
 
 def _classes(field: Mapping[str, Any]) -> list[str]:
@@ -120,10 +123,9 @@ def _classes(field: Mapping[str, Any]) -> list[str]:
         what = ", where pictures tell nothing" if name == "unseen" else ""
         line = f"{name}{what}: {100 * of['share']:.0f} % of the smoke"
         if "within_1" in of:
-            line += (
-                f"; in experiments {100 * of['within_1']:.0f} % lay within one deviation,"
-                f" {100 * of['within_2']:.0f} % within two"
-            )
+            each, (one, two) = of["factors"], (100 * of[f"within_{k}"] for k in (1, 2))
+            line += f"; errors around times {of['factor']:.2f} ({min(each):.2f} to {max(each):.2f})"
+            line += f"; in experiments {one:.0f} % lay within one deviation, {two:.0f} % within two"
         lines.append(line)
     return lines
 
@@ -137,8 +139,7 @@ def _number(number: Mapping[str, float | None]) -> str:
 def _describe_angle(view: Mapping[str, Any], place: int) -> str:
     """How far off the picture at this `place` in the ranking is."""
     tied = ", not to be distinguished from the first" if place and view["is_tied"] else ""
-    nearest = "light" if view["light_directions"] else "picture"
-    return f"{view['angle']:.0f} degrees from the nearest {nearest}{tied}"
+    return f"{view['angle']:.0f} degrees from the nearest picture{tied}"
 
 
 def write_uncertainty_report(
@@ -171,11 +172,11 @@ def write_uncertainty_report(
 def _field(name: str, field: Field, described: Mapping[str, Any]) -> list[str]:
     value, deviation = field.value, field.deviation
     strongest = find_white_value(deviation)
-    pictures = [
-        (slices(deviation, strongest), f"deviation: white is {strongest:.3g}"),
-        (slices(field.explained, 1.0), "explained by pictures: black is nothing, white is all"),
-    ]
-    if field.parameter.is_field:
+    pictures = [(slices(deviation, strongest), f"deviation: white is {strongest:.3g}")]
+    if field.errors:
+        caption = "explained by pictures: black is nothing, white is all"
+        pictures.append((slices(field.explained, 1.0), caption))
+    if field.parameter.is_field and field.errors:
         size, off = (
             each.reshape(-1, *each.shape[-3:]).abs().mean(0) for each in (value, deviation)
         )

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera
-from ddrecon.errors import UsageError
-from ddrecon.light.lights import DirectionalLight
 from ddrecon.scene import Scene
 from ddrecon.turntable import place_turntable
 
@@ -25,30 +23,18 @@ TIED = 2 / 3
 """So far off as a part of the best, a picture was as good where it was tried."""
 
 
-def rank_views(scene: Scene, kind: str) -> list[dict[str, Any]]:
+def rank_views(scene: Scene) -> list[dict[str, Any]]:
     """What `uncertainty.json` says of pictures that `scene` may get, best first.
 
-    All are by its first camera: `ring`: it is turned around the volume; `lights`: the directional
-    lights are. Of each: `name`; `angle` [degrees], how far off the nearest picture it looks from,
-    or the nearest light shines; `matrix` [4, 4], camera to world; `light_directions` [n, 3]; and
-    whether it `is_tied` with the best. Raises UsageError for lights where there are none.
+    All are by its first camera, turned around the volume. Of each: `name`; `angle` [degrees], how
+    far off the nearest picture it looks from; `matrix` [4, 4], camera to world; and whether it
+    `is_tied` with the best.
     """
-    first, ranked = scene.views[0], list[dict[str, Any]]()
-    suns = [light.direction for light in scene.lights if isinstance(light, DirectionalLight)]
-    if kind == "lights" and not suns:
-        raise UsageError("--next-view lights turns directional lights; the scene has none")
-    taken = [_way_to(view.camera, scene) for view in scene.views]
-    for index, view in enumerate(place_turntable(scene, first, CANDIDATES)):
-        if kind == "ring":
-            name, camera, ways = view.name, view.camera, list[Tensor]()
-            angle = _nearest(_way_to(camera, scene), taken)
-        else:
-            turn = view.camera.pose[:, :3] @ first.camera.pose[:, :3].T
-            name, camera, ways = f"light_{index:03d}", first.camera, [turn @ way for way in suns]
-            angle = min(_nearest(way, suns) for way in ways)
-        matrix = [*camera.pose.tolist(), [0, 0, 0, 1]]
-        found = {"name": name, "angle": angle, "matrix": matrix}
-        ranked.append(found | {"light_directions": [way.tolist() for way in ways]})
+    taken, ranked = [_way_to(view.camera, scene) for view in scene.views], list[dict[str, Any]]()
+    for view in place_turntable(scene, scene.views[0], CANDIDATES):
+        angle = _nearest(_way_to(view.camera, scene), taken)
+        matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
+        ranked.append({"name": view.name, "angle": angle, "matrix": matrix})
     ranked.sort(key=lambda each: -each["angle"])
     for each in ranked:
         each["is_tied"] = each["angle"] >= TIED * ranked[0]["angle"]

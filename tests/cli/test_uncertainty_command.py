@@ -74,9 +74,15 @@ def test_without_experiments_every_figure_has_its_caveat(finished: Path, succeed
     for text in (found.stdout, Path("sure/report.html").read_text()):
         assert record["assumed"] in text and "g: 0" in text.replace("<td>g</td><td>", "g: ")
         assert "unknown without experiments" in text and "in experiments" not in text
-    # Experiments may follow.
+        assert "by noise alone, which is several times too small" in text and "explain" not in text
+    assert record["fields"]["density"]["explained"] is None
+    assert not Path("sure/volumes/density_explained.npz").exists()
+    # Experiments may follow. One has no other to tell how often it holds.
     succeed("uncertainty", "run", "-o", "sure", "--calibrate", "1", "--resume", *KNOWN)
-    assert json.loads(Path("sure/uncertainty.json").read_text())["experiments"] == 1
+    record = json.loads(Path("sure/uncertainty.json").read_text())
+    assert record["experiments"] == 1 and 0 < record["fields"]["density"]["explained"] <= 1
+    classes = record["fields"]["density"]["classes"].values()
+    assert all("factor" in each and "within_1" not in each for each in classes)
 
 
 @pytest.mark.slow

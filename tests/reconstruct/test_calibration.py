@@ -96,6 +96,9 @@ def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack(
         assert share == pytest.approx(0.68, abs=0.01)
     described = field.describe()["classes"]
     assert sum(each["share"] for each in described.values()) == pytest.approx(1)
+    for each in described.values():
+        assert len(each["factors"]) == 3
+        assert each["factors"] == pytest.approx([each["factor"]] * 3, rel=0.3)
     # By the other experiments alone it is nearly as often so.
     assert described["inside"]["within_1"] == pytest.approx(0.86, abs=0.05)
     assert described["inside"]["within_2"] > 0.98
@@ -122,6 +125,13 @@ def test_where_pictures_tell_nothing_a_cell_may_be_anything() -> None:
     assert bool(field.classes["unseen"].all()) and not bool(field.explained.any())
     power = float(value.square().mean())
     torch.testing.assert_close(field.deviation.square(), torch.full(SHAPE, power).double())
+    # But where nothing may be, nothing is: there, experiments have no errors.
+    support = torch.arange(SHAPE[0])[:, None, None].expand(SHAPE) > 5
+    found.parameters[0].support = support.double()
+    found.errors = [{"density": support * error["density"]} for error in found.errors]
+    field = Field(found, found.parameters[0])
+    torch.testing.assert_close(field.classes["unseen"], support)
+    assert float(field.deviation[:5].max()) < 1e-6 * power < power / 2 < field.deviation[6:].min()
 
 
 def test_samples_deviate_as_they_should_and_are_the_same_again() -> None:
