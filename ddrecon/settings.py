@@ -216,7 +216,8 @@ class OptimizeSettings:
     `iterations`: in all; with `auto` a run ends when it is done, see `reconstruct.schedule`.
     `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `begin_at`: the fraction that counts as made already, as for a frame of a film that begins with
-    another: what is left begins at the resolution and rates of then. `final_rate`: the part of
+    another: what is left begins at the resolution and rates of then. `keep_start`: the part of what
+    fields began with that is mixed into them in the end. `final_rate`: the part of
     their value to which learning rates fall over a run. A twentieth takes fewer iterations at full
     resolution where pictures agree (the plume); a fifth is better where they do not (the capture).
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
@@ -234,6 +235,7 @@ class OptimizeSettings:
     derivatives: str = one_of("all", ("all", "single", "diffusion"), expert=True)
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
     begin_at: float = bounded(0.0, minimum=0, below=1, expert=True)
+    keep_start: float = bounded(0.0, minimum=0, below=1, expert=True)
     final_rate: float = bounded(0.2, above=0, maximum=1, expert=True)
 
     def violations(self) -> Iterator[Violation]:

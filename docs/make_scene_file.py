@@ -482,6 +482,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "The fraction of the run that counts as made: what is left begins at its "
                 "resolution and learning rates, as a frame of a film that begins with another does."
             ),
+            "keep_start": (
+                "The part of what fields began with that is mixed into them in the end: of a "
+                "frame of a film, what is told by the frames before it."
+            ),
             "final_rate": (
                 "The part of their value to which learning rates fall over a run. 0.05 takes fewer "
                 "iterations at full resolution where pictures agree well with each other."

@@ -239,21 +239,26 @@ def optimize(
     if iterations is not None:
         session = session.with_override(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
+    from ddrecon.ranks import alone, from_first, is_first
+
     if scene_file.tree.frames is not None:
-        from ddrecon.film.drive import drive_film
+        from ddrecon.film.drive import drive_film, share_out
         from ddrecon.film.folder import Film, open_film
         from ddrecon.film.report import film_lines
 
         film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
         chosen, film.environment = film.choose(part), session.environment()
-        open_film(film, may_exist=overwrite, resume=resume, shared=shared)
-        record = drive_film(film, chosen, exported)
+        if is_first():
+            open_film(film, may_exist=overwrite, resume=resume, shared=shared)
+        from_first(None)  # others find the folder as it is to be
+        own = share_out(chosen)
+        with alone():
+            record = drive_film(film, own, exported)
         session.show(record, film_lines(record, output))
         return
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
-    from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 

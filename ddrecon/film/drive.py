@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 
 from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, SolveError
 from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
@@ -23,6 +22,7 @@ from ddrecon.film.report import write_film_report
 from ddrecon.film.shared import SHARED, read_shared, write_shared
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
+from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import (
@@ -78,10 +78,10 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
         for number in drive_frames(film, numbers):
             if number not in before and monotonic() >= due:
                 start = monotonic()
-                write_film_report(film)
+                _report(film)
                 due = monotonic() + (monotonic() - start) / REPORT_SHARE
     finally:
-        record = write_film_report(film)
+        record = _report(film)
     if exported is not None:
         (film.path / SEQUENCE).mkdir(exist_ok=True)
         for number in film.done():
@@ -92,14 +92,24 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
     return record
 
 
+def share_out(numbers: Sequence[int]) -> Sequence[int]:
+    """Those of the frames `numbers` that are this rank's, one after another; the first has some."""
+    begin, end = (-(-len(numbers) * (own_rank() + more) // rank_count()) for more in (0, 1))
+    return numbers[begin:end]
+
+
+def _report(film: Film) -> dict[str, Any]:
+    with film.lock:  # the last of several parts to come knows of all that are done
+        return write_film_report(film)
+
+
 def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
     """Those of the frames `numbers` of `film` that are done, each when it is.
 
     A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
     again, its error is raised when all others are done.
     """
-    # Parts that begin together wait for the one that calibrates.
-    with FileLock(film.path / f"{SHARED}.lock", fallback_to_soft=False):
+    with film.lock:
         calibrate(film)
     failed = dict[int, DdreconError]()
     for is_second in (False, True):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from torch import Tensor
 
 from ddrecon.errors import SceneError, UsageError
@@ -18,7 +19,6 @@ from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import refusals, write_json
 from ddrecon.io.volumes.table import read_field
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.ranks import rank_count
 from ddrecon.run.checkpoint import differences
 from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file, write_volume
 from ddrecon.scene import Scene
@@ -32,6 +32,8 @@ SHARE = 6
 """A frame that begins with another makes so many times fewer iterations: the last of its run."""
 FINAL_RATE = 0.05
 """To what part of their value its learning rates fall; with larger ones films flicker more."""
+KEPT = 0.2
+"""It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
 FARTHEST = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
@@ -85,6 +87,11 @@ class Film:
         media = build_media(self.scene_file, torch.float32, torch.device("cpu"))
         return next(iter(media.values())).grid
 
+    @cached_property
+    def lock(self) -> FileLock:
+        """Held by the one of several parts that calibrates, or reports."""
+        return FileLock(self.path / f"{SHARED}.lock", fallback_to_soft=False)
+
     def of(self, number: int) -> Path:
         """The folder of the run of the frame `number`."""
         return self.path / "frames" / f"{number:04d}"
@@ -112,7 +119,7 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            optimize |= {"begin_at": 1 - 1 / SHARE, "final_rate": FINAL_RATE}
+            optimize |= {"begin_at": 1 - 1 / SHARE, "final_rate": FINAL_RATE, "keep_start": KEPT}
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
@@ -209,9 +216,6 @@ def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None)
     UsageError for a folder that is not empty, unless it may be, or that holds another film;
     SceneError where pictures are missing, or nothing is optimized.
     """
-    if rank_count() > 1:
-        what = "torchrun does not share out a film: start jobs for parts of it, --frames A:B"
-        raise UsageError(f"{what}, with --resume and the same -o")
     scene_file, path = film.scene_file, film.path
     if not any(kind_of(name).is_cellwise for name in film.optimized):
         what = "optimize.parameters: none changes from frame to frame; name one, such as density"

@@ -131,6 +131,11 @@ class Reconstruction:
         self._step(values, gradients, compared)
         # Judge: is there more to be done, here or at all?
         self.schedule.note(self.iteration, total)
+        # Keep: in the end, a part of what fields began with.
+        if (part := self.problem.settings.keep_start) and self.schedule.is_over(self.iteration + 1):
+            for p in self.parameters:
+                if p.is_field:
+                    p.keep_start(part)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim = None, None

@@ -48,7 +48,7 @@ class Parameter:
         weight = kind.tv if settings.tv is None else settings.tv
         self.tv = weight if self.is_field else 0.0
         self.unit, self.knee = unit, KNEE if kind.is_compressed else None
-        self.value = value.clone().requires_grad_()
+        self.start, self.value = value.detach(), value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
@@ -112,6 +112,11 @@ class Parameter:
         if self.is_direction:
             value = value * (before.norm() / value.norm())
         self.value = value.clamp(self.low, self.high).requires_grad_()
+
+    def keep_start(self, part: float) -> None:
+        """Takes a field back by a `part` of its way from what it began with."""
+        value = self.value.detach().lerp(resample(self.start, self.grid), part)
+        self.value = (value if self.support is None else value * self.support).requires_grad_()
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import chdir
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from click.testing import CliRunner, Result
 import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
-from ddrecon.film.drive import spread_out
+from ddrecon.film.drive import share_out, spread_out
+from ddrecon.film.folder import KEPT
 from ddrecon.io.volumes.table import field_names, read_field, write_field
 from ddrecon.reconstruct.divergence import NotFiniteError
 from ddrecon.reconstruct.loop import Reconstruction
@@ -159,6 +161,19 @@ def test_a_still_film_without_calibration_is_the_single_run(film: Path, succeed:
     assert start["start/volumes/density.npz"] == first["volumes/density.npz"]
 
 
+@pytest.mark.slow
+def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
+    frame = Path(whole) / "frames/0002"
+    given = "-q", "--dtype", "float64", "-D", "optimize.keep_start=0"
+    succeed("optimize", str(frame / "scene.yaml"), "-o", "bare", *given)
+    bare, start, kept = (
+        read_field(place / "volumes/density.npz", "density").values
+        for place in (Path("bare"), frame / "start", frame)
+    )
+    assert np.abs(bare - start).max() > 1e-3
+    np.testing.assert_allclose(kept, (1 - KEPT) * bare + KEPT * start, atol=1e-6)
+
+
 def test_frames_end_by_themselves_as_runs_do(
     film: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,16 +262,26 @@ def test_a_calibration_that_diverges_goes_on_before_its_last_step(
 
 
 @pytest.mark.slow
-def test_parts_that_begin_together_calibrate_once(film: Path) -> None:
-    """The second waits, and takes what the first has found."""
-    parts = [
-        [sys.executable, "-m", "ddrecon", *optimize("-o", "out", "--resume", *FEW)]
-        for _ in range(2)
-    ]
-    running = [subprocess.Popen([*p, "--frames", f"{3 * i}:{3 * i}"]) for i, p in enumerate(parts)]
-    assert [one.wait(timeout=100) for one in running] == [0, 0]
-    found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 3)]
+def test_ranks_share_out_the_frames_and_calibrate_once(film: Path) -> None:
+    """The second waits, and takes what the first has found; the last to end knows of all."""
+    ranks = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    run = [*ranks, "-m", "ddrecon", *optimize("-o", "out", *FEW)]
+    subprocess.run(run, check=True, timeout=200)
+    frames = json.loads(Path("out/film.json").read_text())["frames"]
+    assert [row["frame"] for row in frames] == [*range(FRAMES)]
+    found = [json.loads(Path(f"out/frames/000{n}/parameters.json").read_text()) for n in (0, 2)]
     assert found[0]["lights.0.irradiance"] == found[1]["lights.0.irradiance"]
+
+
+def test_ranks_share_out_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    for frames, count in product(range(1, 6), range(1, 8)):
+        monkeypatch.setattr("ddrecon.film.drive.rank_count", lambda count=count: count)
+        shares = []
+        for rank in range(count):
+            monkeypatch.setattr("ddrecon.film.drive.own_rank", lambda rank=rank: rank)
+            shares.append(share_out(range(frames)))
+        assert [*chain(*shares)] == [*range(frames)] and shares[0]
+        assert max(map(len, shares)) == -(-frames // count)
 
 
 def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> None:
