@@ -27,7 +27,7 @@ POINTS = 4
 """Cells at most that light comes from."""
 MOST = 24
 """Directions at most in a chunk: more read moments less often, fewer need less of a cache."""
-BLOCK = 4
+BLOCK = 2
 """Units that `moments.h` does at once: a chunk has so many, or a multiple; some may be empty."""
 SLABS, LARGE = (4, 8), 2**20
 """Slices at most of which all lines are kept for the adjoint; the second in LARGE volumes.

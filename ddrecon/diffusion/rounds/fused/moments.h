@@ -9,15 +9,22 @@ namespace ddrecon {
 // Radiance at cells of a row, by its units: places of the four among directions, of which `ups` go
 // up in y and have lines of their own; -1 for none.
 template <class F> struct Units {
-    static constexpr int BLOCK = 4;
     const int* places;
     int count, ups;
     F *lines[2], *copies;
     long long stride, pitch;
     INLINE F* copied(int k) const { return copies + k * pitch; }
-    INLINE F* line(int u, int i) const {
-        const int j = places[4 * u + i];
-        return j < 0 ? nullptr : lines[j >= ups] + j * stride;
+};
+// The lines of some units from one on, null for none.
+template <class F> struct Block {
+    static constexpr int SIZE = 2;
+    F* lines[SIZE][4];
+
+    INLINE Block(const Units<F>& units, int first) {
+        for (int n = 0; n < 4 * SIZE; ++n) {
+            const int j = units.places[4 * first + n];
+            lines[n / 4][n % 4] = j < 0 ? nullptr : units.lines[j >= units.ups] + j * units.stride;
+        }
     }
 };
 
@@ -60,7 +67,7 @@ template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_dire
     const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Units<F>& units,
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
-    constexpr int R = Units<F>::BLOCK;
+    constexpr int R = Block<F>::SIZE;
     for (int k = 0; k < Own::COUNT; ++k)
         in_steps<F>(from, to, [&](auto none, int c) HERE {
             typedef decltype(none) T;
@@ -72,9 +79,10 @@ template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_dire
             }
             write(units.copied(k) + c, sum);
         });
-    in_steps<F>(from, to, [&](auto none, int c) HERE {
-        typedef decltype(none) T;
-        for (int u = 0; u < units.count; u += R) {
+    for (int u = 0; u < units.count; u += R) {
+        const Block<F> block(units, u);
+        in_steps<F>(from, to, [&](auto none, int c) HERE {
+            typedef decltype(none) T;
             T found[R][4];
             UNROLLED
             for (int p = 0; p < 4; ++p) {
@@ -94,10 +102,10 @@ template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_dire
                 mirror(found[a]);
                 UNROLLED
                 for (int i = 0; i < 4; ++i)
-                    if (F* line = units.line(u + a, i)) write(line + c, found[a][i]);
+                    if (F* line = block.lines[a][i]) write(line + c, found[a][i]);
             }
-        }
-    });
+        });
+    }
 }
 
 // The transpose: moments that `found` rows get, or what is added to them. Those that nothing is in
@@ -106,16 +114,17 @@ template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
     const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
     const Units<F>& units, long long ahead, int width) {
     typedef Order<DEGREE> Own;
-    constexpr int R = Units<F>::BLOCK;
-    in_steps<F>(0, width, [&](auto none, int c) HERE {
-        typedef decltype(none) T;
-        for (int u = 0; u < units.count; u += R) {
+    constexpr int R = Block<F>::SIZE;
+    for (int u = 0; u < units.count; u += R) {
+        const Block<F> block(units, u);
+        in_steps<F>(0, width, [&](auto none, int c) HERE {
+            typedef decltype(none) T;
             T given[R][4];
             UNROLLED
             for (int a = 0; a < R; ++a) {
                 UNROLLED
                 for (int i = 0; i < 4; ++i) {
-                    const F* line = units.line(u + a, i);
+                    const F* line = block.lines[a][i];
                     given[a][i] = line ? read<T>(line + c) : none;
                 }
                 mirror(given[a]);
@@ -129,8 +138,8 @@ template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
                         sum += matrix[k * units.count + u + a] * given[a][p];
                     write(units.copied(k) + c, sum);
                 }
-        }
-    });
+        });
+    }
     for (int k = 0; k < Own::COUNT; ++k)
         in_steps<F>(0, width, [&](auto none, int c) HERE {
             typedef decltype(none) T;

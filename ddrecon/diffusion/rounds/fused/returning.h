@@ -72,7 +72,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             sums.rows[i][0] = light.row_of(part_of(of.bars, of.order[i], light.all), at);
             sums.by[i][0] = F(1);
         }
-        to_directions<DEGREE>(light.matrix(1), sums, units_at(here), width, 0, width);
+        to_directions<DEGREE>(light.matrix(1), sums, units_at(here), -width, 0, width);
     }
     INLINE void add_moments(const Here& here) const {
         F* found[COUNT];
@@ -201,10 +201,14 @@ INLINE void return_rows(int lane, const Sweep<F>& of) {
         from = light.slab_of(to - 1);
         light.follow(from, to);
         for (int s = to - 1; s >= from; --s) {
-            for (int t = 0; t < of.height; ++t) back.find_bars(light.place(s, t));
-            for (int y_way = 1; y_way >= -1; y_way -= 2)
-                for (int t = of.height - 1; t >= 0; --t) back.return_row(light.place(s, t, y_way));
-            for (int t = 0; t < of.height; ++t) back.add_moments(light.place(s, t));
+            for (int t = of.height - 1; t >= 0; --t) {
+                back.find_bars(light.place(s, t));
+                back.return_row(light.place(s, t));
+            }
+            for (int t = of.height - 1; t >= 0; --t) {
+                back.return_row(light.place(s, t, -1));
+                back.add_moments(light.place(s, of.height - 1 - t));
+            }
         }
     }
 }

@@ -214,10 +214,12 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             for (int t = 0; t < of.height; ++t) {
                 const Here here = place(s, t);
                 find_scattering(here, KEEPS ? 0 : here.from, KEEPS ? of.width : here.to);
+                follow_row(here);
             }
-            for (int y_way = 1; y_way >= -1; y_way -= 2)
-                for (int t = 0; t < of.height; ++t) follow_row(place(s, t, y_way));
-            for (int t = 0; !KEEPS && t < of.height; ++t) add_moments(place(s, t));
+            for (int t = 0; t < of.height; ++t) {
+                follow_row(place(s, t, -1));
+                if constexpr (!KEEPS) add_moments(place(s, of.height - 1 - t));
+            }
         }
     }
     INLINE void follow_row(const Here& here) const {
@@ -320,7 +322,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         }
         to_moments<DEGREE>(
             matrix(1), found, taken, job.piece > 0 ? F(0) : first, of.adds,
-            units_at(here, IS_CHANGED), of.width, of.width);
+            units_at(here, IS_CHANGED), -of.width, of.width);
     }
     INLINE F* found_row(const Here& here) const {
         return of.found + job.piece * COUNT * all + job.color * cells + here.at;
