@@ -124,6 +124,22 @@ class Moments:
             higher = own + others
         return Moments(self.mean + other.mean, add_vectors(self.flux, other.flux), higher)
 
+    def toward(self, other: Moments, part: Tensor) -> Moments:
+        """That `part` of the way to `other`, which has all this has; what this lacks is zero there.
+
+        One pass over all moments, which are many.
+        """
+
+        def go(one: Tensor | None, other: Tensor) -> Tensor:
+            return part * other if one is None else torch.lerp(one, other, part)
+
+        own, flux, higher = self.flux or (None,) * 3, other.flux, other.higher
+        return Moments(
+            go(self.mean, other.mean),
+            None if flux is None else _vector(map(go, own, flux)),
+            None if higher is None else go(self.higher, higher),
+        )
+
     def along(self, direction: Vector) -> Tensor:
         """Radiance along `direction`, whose components broadcast to `[C, z, y, x]`."""
         radiance = self.mean

@@ -163,7 +163,7 @@ class _Outside(torch.autograd.Function):
 def _add_up(values: Tensor, taken: Tensor, put: Tensor, parts: Tensor, count: int) -> Tensor:
     """`parts` [E] of the `values` [C, ...] that are `taken` [E], summed where they are `put`."""
     total = values.new_zeros(len(values), count)
-    return total.scatter_add_(1, put.expand(len(values), -1), values[:, taken] * parts)
+    return total.scatter_add_(1, put.expand(len(values), -1), values.index_select(1, taken) * parts)
 
 
 class _WithOutside(torch.autograd.Function):
@@ -176,7 +176,8 @@ class _WithOutside(torch.autograd.Function):
     def forward(axis: int | None, lines: Sequence[bool], cells: Tensor, outside: Tensor) -> Tensor:
         longer = cells.new_empty(len(cells), *(count + 2 for count in cells.shape[1:]))
         longer[:, 1:-1, 1:-1, 1:-1] = cells
-        longer.view(len(cells), -1)[:, _places(tuple(cells.shape[1:]), cells.device)] = outside
+        places = _places(tuple(cells.shape[1:]), cells.device).expand(len(cells), -1)
+        longer.view(len(cells), -1).scatter_(1, places, outside.expand(len(cells), -1))
         for face, is_line in zip(FACES, lines, strict=True):
             if is_line and face[0] != axis:
                 outer, last = _layers(longer, face)
@@ -196,7 +197,7 @@ class _WithOutside(torch.autograd.Function):
                 last -= outer
                 outer *= 2
         outside = _places(tuple(ctx.shape[1:]), bar.device)
-        return None, None, longer[:, 1:-1, 1:-1, 1:-1], longer.flatten(1)[:, outside]
+        return None, None, longer[:, 1:-1, 1:-1, 1:-1], longer.flatten(1).index_select(1, outside)
 
     @staticmethod
     def jvp(

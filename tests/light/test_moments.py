@@ -82,3 +82,17 @@ def test_higher_moments_of_one_color_are_those_of_all():
     color = torch.ones(3, 1, 2, 1)
     light = Moments(color, (color,) * 3, torch.ones(12, 1, 1, 2, 1))
     assert light.harmonics(3)[4:].equal(torch.ones(12, 3, 1, 2, 1))
+
+
+def test_a_part_of_the_way_to_other_light_is_linear_in_that_part():
+    """By all moments; higher ones that light lacks are zero."""
+    fields = torch.arange(72, dtype=torch.float64).view(2, 9, 1, 1, 2, 2).sin()
+    one, other = (Moments.of_harmonics(each) for each in fields)
+    part = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
+    for start in (one, Moments(one.mean, one.flux)):
+        begin = start.harmonics(2)
+        way = other.harmonics(2) - begin
+        found = start.toward(other, part).harmonics(2)
+        torch.testing.assert_close(found, begin + 1.7 * way, rtol=1e-14, atol=1e-14)
+        (slope,) = torch.autograd.grad(found.sum(), part)
+        torch.testing.assert_close(slope, way.sum(), rtol=1e-13, atol=1e-13)

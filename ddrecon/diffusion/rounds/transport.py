@@ -149,10 +149,7 @@ def _round(
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
     new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
-    if factor is None:
-        return new
-    difference = new.plus(light.scaled(-1.0, -1.0, -1.0))
-    return light.plus(difference.scaled(factor, factor, factor))
+    return new if factor is None else light.toward(new, factor)
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:

@@ -128,7 +128,7 @@ CASES = {
     "color": Case(),
     "begun": Case(known=4),
     "beam": Case(known=4, is_beam=True),
-    "cubes": Case(spacing=CUBES),
+    "cubes": Case(spacing=CUBES, directions=50),
     "thin": Case(spacing=THIN),
     "gray": Case(colors=1, moments=1, is_lit=False),
     "gray-begun": Case(colors=1, known=4, spacing=CUBES),

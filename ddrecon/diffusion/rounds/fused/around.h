@@ -8,9 +8,9 @@ namespace ddrecon {
 // A row along x, and the places of its cells along z, y and x, of so many.
 struct Line3 {
     long long step[3];
-    int count[3], first[3];
+    int count[3], first[3], width;
     INLINE Line3(const Row& row, int nz, int ny, int nx)
-        : step{(long long)ny * nx, nx, 1}, count{nz, ny, nx} {
+        : step{(long long)ny * nx, nx, 1}, count{nz, ny, nx}, width(row.width) {
         const long long number = row.start / nx;
         first[0] = (int)(number / ny), first[1] = (int)(number % ny), first[2] = row.start % nx;
     }
@@ -20,37 +20,52 @@ struct Line3 {
         const int to = place(a, i) + side;
         return to < 0 || to >= count[a] ? 0 : side * step[a];
     }
-    // What a difference of both neighbors counts at a cell, or at one beside it.
-    INLINE double half(int a, int beside, int i) const {
-        const int at = place(a, i) + beside;
-        return at <= 0 || at >= count[a] - 1 ? 1.0 : 0.5;
+    // To cells `from` one `to` another along an axis is added `weight` times what is `side` of
+    // them.
+    template <class F>
+    INLINE void add(int a, int from, int to, int side, F weight, const F* q, F* found) const {
+        const int own = first[a], size = a < 2 ? 1 : width;
+        const int begin = from > own ? from - own : 0, end = to < own + size ? to - own : size;
+        if (begin >= end) return;
+        const F* const beside = q + side * step[a];
+        const int last = a < 2 ? width : end;
+        INDEPENDENT
+        for (int i = begin; i < last; ++i) found[i] += weight * beside[i];
+    }
+    // What an `Around` finds along an axis is added; its transpose has the same weights.
+    template <class Around, bool IS_BACK, class F>
+    INLINE void add_all(int a, const F* q, F* found) const {
+        Around::each(count[a], [&](int from, int to, int side, double weight) HERE {
+            const int shift = IS_BACK ? side : 0;
+            add(a, from + shift, to + shift, IS_BACK ? -side : side, F(weight), q, found);
+        });
+    }
+    template <class F> INLINE void clear(F* found) const {
+        for (int i = 0; i < width; ++i) found[i] = F(0);
     }
 };
 
 // Half the difference of both neighbors along an axis; at the faces of the box, that to the one.
 struct Rises {
+    template <class Add> INLINE static void each(int n, Add add) {
+        add(1, n - 1, -1, -0.5), add(1, n - 1, 1, 0.5);
+        if (n > 1) add(0, 1, 0, -1.0), add(0, 1, 1, 1.0);
+        if (n > 1) add(n - 1, n, -1, -1.0), add(n - 1, n, 0, 1.0);
+    }
     template <class F>
     INLINE static void find(const Row& row, const Line3& line, const F* q, F* const* out) {
         for (int a = 0; a < 3; ++a) {
             F* const found = out[0] + (a * row.items * row.width + row.at);
-            INDEPENDENT
-            for (int i = 0; i < row.width; ++i)
-                found[i] = F(line.half(a, 0, i)) *
-                           (q[i + line.next(a, 1, i)] - q[i + line.next(a, -1, i)]);
+            line.clear(found);
+            line.add_all<Rises, false>(a, q, found);
         }
     }
     template <class F> INLINE static void find_back(
         const Row& row, const Line3& line, const F* const* bars, F* found) {
-        for (int i = 0; i < row.width; ++i) found[i] = F(0);
+        line.clear(found);
         for (int a = 0; a < 3; ++a) {
             const F* const bar = bars[0] + (a * row.items * row.width + row.at);
-            INDEPENDENT
-            for (int i = 0; i < row.width; ++i) {
-                const long long low = line.next(a, -1, i), high = line.next(a, 1, i);
-                const F below = F(line.half(a, low ? -1 : 0, i)) * bar[i + low];
-                const F above = F(line.half(a, high ? 1 : 0, i)) * bar[i + high];
-                found[i] += (low ? below : -below) + (high ? -above : above);
-            }
+            line.add_all<Rises, true>(a, bar, found);
         }
     }
 };
@@ -83,33 +98,18 @@ struct Means {
 
 // The sum of the second differences along all axes, without those of cells at the ends of an axis.
 struct Bends {
+    template <class Add> INLINE static void each(int n, Add add) {
+        add(1, n - 1, -1, 1.0), add(1, n - 1, 0, -2.0), add(1, n - 1, 1, 1.0);
+    }
     template <class F>
     INLINE static void find(const Row& row, const Line3& line, const F* f, F* const* out) {
-        for (int i = 0; i < row.width; ++i) {
-            F sum = 0;
-            UNROLLED
-            for (int a = 0; a < 3; ++a) {
-                const long long low = line.next(a, -1, i), high = line.next(a, 1, i);
-                if (low && high) sum += f[i + low] - 2 * f[i] + f[i + high];
-            }
-            out[0][row.at + i] = sum;
-        }
+        line.clear(out[0] + row.at);
+        for (int a = 0; a < 3; ++a) line.add_all<Bends, false>(a, f, out[0] + row.at);
     }
     template <class F> INLINE static void find_back(
         const Row& row, const Line3& line, const F* const* bars, F* found) {
-        const F* const bar = bars[0] + row.at;
-        for (int i = 0; i < row.width; ++i) {
-            F sum = 0;
-            UNROLLED
-            for (int a = 0; a < 3; ++a) {
-                const long long low = line.next(a, -1, i), high = line.next(a, 1, i);
-                // Of the neighbors those count that are not at an end themselves.
-                if (low && line.place(a, i) > 1) sum += bar[i + low];
-                if (low && high) sum -= 2 * bar[i];
-                if (high && line.place(a, i) < line.count[a] - 2) sum += bar[i + high];
-            }
-            found[i] = sum;
-        }
+        line.clear(found);
+        for (int a = 0; a < 3; ++a) line.add_all<Bends, true>(a, bars[0] + row.at, found);
     }
 };
 

@@ -2,17 +2,16 @@
 
 Light that goes up or down in z is a way of its own; of directions within slices each has its
 mirror image in the other. On a way directions go through the cells slice by slice in chunks, some
-with y and others against it: groups. In a group a direction and its mirror image in x are a pair:
-their sums of harmonics of either parity in x differ in signs alone.
+with y and others against it. A direction and its mirror images in x and y are a unit: their sums of
+harmonics of each parity differ in signs alone.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain, groupby, product
+from itertools import chain, product
 from typing import Any
 
 import torch
@@ -26,11 +25,10 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 
 POINTS = 4
 """Cells at most that light comes from."""
-MOST_OF_FEW, MOST, FEW = 9, 16, 4
-"""Directions at most in a chunk: of FEW moments, and of many.
-
-More read many moments less often; fewer leave more of a cache to each.
-"""
+MOST = 24
+"""Directions at most in a chunk: more read moments less often, fewer need less of a cache."""
+BLOCK = 2
+"""Units that `moments.h` does at once: a chunk has so many, or a multiple; some may be empty."""
 SLABS, LARGE = (4, 8), 2**20
 """Slices at most of which all lines are kept for the adjoint; the second in LARGE volumes.
 
@@ -92,25 +90,19 @@ class Step:
 
 
 Unit = list[Step]
-"""A direction, and perhaps its mirror image in x."""
+"""A direction and its mirror images in x and in y, as far as there are any."""
 
 
-def _chunks(steps: list[Step], is_paired: bool, count: int) -> list[list[Unit]]:
-    """The `steps` of a way in about equal chunks, in each those along y first."""
+def _chunks(steps: list[Step], count: int) -> list[list[Unit]]:
+    """The units of the `steps` of a way in so many chunks of about as many directions."""
     units: dict[tuple[float, ...], Unit] = {}
-    for step in sorted(steps, key=_goes_down_y):
+    for step in steps:
         z, y, x = step.direction
-        units.setdefault((z, y, abs(x) if is_paired else x), []).append(step)
+        units.setdefault((z, abs(y), abs(x)), []).append(step)
     chunks: list[list[Unit]] = [[] for _ in range(count)]
-    done = 0
-    for unit in units.values():
-        chunks[done * count // len(steps)].append(unit)
-        done += len(unit)
+    for unit in sorted(units.values(), key=len, reverse=True):
+        min(chunks, key=lambda chunk: sum(map(len, chunk))).append(unit)
     return chunks
-
-
-def _goes_down_y(step: Step) -> bool:
-    return step.moved[1] < 0
 
 
 @functools.cache
@@ -119,58 +111,53 @@ def make_tables(
 ) -> dict[str, Any]:
     """What kernels are given of `count` directions through `grid`, of light with so many `moments`.
 
-    A `Group`, `Course` and `Parts` (`given.h`) of each; `pairs` [P, 2]: places in the group, the
-    second -1 for none; `order` [K]: moments, those even in x first. `chunks`: by way and piece,
-    ranges of groups that go through the cells together, of at most `most` directions.
+    A `Course` and `Parts` (`given.h`) of each. `units` [U, 4]: places in the chunk of a direction
+    and its mirror images in x, in y and in both, -1 for none; `order` [K]: moments by parity, even
+    in y before odd, of each even in x before odd. `chunks`: by way and piece, a `Chunk` for each,
+    of at most `most` directions.
     """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
     given = zip(points.tolist(), weights.tolist(), strict=True)
     steps = [Step.of(grid, (z, y, x), weight) for (z, y, x), weight in given]
-    most = MOST_OF_FEW if moments <= FEW else MOST
-    order, done = _even_first(math.isqrt(moments) - 1), list[Step]()
-    groups, pairs, ranges = list[list[int]](), list[list[int]](), list[list[int]]()
-    matrices, largest = list[Tensor](), 0
+    order, done = _by_parity(math.isqrt(moments) - 1), list[Step]()
+    places, chunks, matrices = list[list[int]](), list[list[int]](), list[Tensor]()
     for is_up in (True, False):
         way = [step for step in steps if (step.moved > (0, 0, 0)) == is_up]
-        number = math.ceil(len(way) / most / pieces) * pieces
-        for chunk in _chunks(way, moments > 1, number):
-            first, begin = len(groups), len(done)
-            for is_down, units in groupby(chunk, key=lambda unit: _goes_down_y(unit[0])):
-                own, place = list(units), len(done)
-                lies = place, sum(map(len, own)), len(pairs), len(own), sum(map(len, matrices))
-                groups.append([-1 if is_down else 1, *lies, place - begin])
-                for unit in own:
-                    pairs.append([len(done) - place, len(done) + 1 - place][: len(unit)])
-                    pairs[-1] += [-1] * (2 - len(unit))
-                    done += unit
-                matrices += _matrices(own, order)
-            ranges.append([first, len(groups)])
-            largest = max(largest, len(done) - begin)
-    whole = {"groups": groups, "courses": [step.course() for step in done], "pairs": pairs}
+        for units in _chunks(way, math.ceil(len(way) / MOST / pieces) * pieces):
+            own = sorted(chain(*units), key=lambda step: step.moved[1] < 0)
+            ups = sum(step.moved[1] >= 0 for step in own)
+            number = BLOCK * max(1, math.ceil(len(units) / BLOCK))
+            chunks.append([len(done), ups, len(own), len(places), number, sum(map(len, matrices))])
+            for unit in units:
+                images = [2 * (step.direction[1] < 0) + (step.direction[2] < 0) for step in unit]
+                at = dict(zip(images, map(own.index, unit), strict=True))
+                places.append([at.get(image, -1) for image in range(4)])
+            places += [[-1] * 4] * (number - len(units))
+            matrices += _matrices(units, order, number)
+            done += own
+    whole = {"courses": [step.course() for step in done], "units": places, "order": order}
     return {name: torch.tensor(rows, dtype=torch.int32) for name, rows in whole.items()} | {
         "parts": torch.tensor([step.parts() for step in done], dtype=dtype),
         "matrices": torch.cat(matrices).to(dtype),
-        "order": torch.tensor(order, dtype=torch.int32),
-        "chunks": torch.tensor(ranges, dtype=torch.int32).view(2, pieces, -1, 2),
-        "most": largest,
+        "chunks": torch.tensor(chunks, dtype=torch.int32).view(2, pieces, -1, 6),
+        "most": max(members for _, _, members, *_ in chunks),
     }
 
 
-def _even_first(degree: int) -> list[int]:
-    """The harmonics up to `degree`, those even in x first.
-
-    A direction and its mirror image tell.
-    """
-    here, there = harmonics(torch.tensor([[0.48, 0.6, 0.64], [0.48, 0.6, -0.64]]), degree).T
-    is_odd = (here * there < 0).tolist()
+def _by_parity(degree: int) -> list[int]:
+    """The harmonics up to `degree` by their parity in y, then in x: as mirror images tell."""
+    images = torch.tensor([[0.48, 0.6, 0.64], [0.48, -0.6, 0.64], [0.48, 0.6, -0.64]])
+    here, *there = harmonics(images, degree).T
+    is_odd = torch.stack([here * image < 0 for image in there], 1).tolist()
     return sorted(range(len(is_odd)), key=is_odd.__getitem__)
 
 
-def _matrices(units: list[Unit], order: list[int]) -> Iterator[Tensor]:
-    """Y_k of pairs as sums over moments, and as sums over pairs; the same with weights."""
-    directions = torch.tensor([unit[0].direction for unit in units], dtype=torch.float64)
+def _matrices(units: list[Unit], order: list[int], number: int) -> list[Tensor]:
+    """Y_k [K, number] of the image of each unit that goes up along x and y; those with weights."""
+    rows = [[*unit[0].direction, unit[0].weight] for unit in units]
+    rows += [[0.0] * 4] * (number - len(units))
+    z, y, x, weights = torch.tensor(rows, dtype=torch.float64).T
     degree = math.isqrt(len(order)) - 1
-    values, of_parts = harmonics(directions, degree)[order].T, units_of_parts(degree)[order]
-    weights = values.new_tensor([[unit[0].weight] for unit in units])
-    for matrix in (values / of_parts, values * of_parts * weights):
-        yield from (matrix.flatten(), matrix.T.flatten())
+    values = harmonics(torch.stack([z, y.abs(), x.abs()], 1), degree)[order]
+    of_parts = units_of_parts(degree)[order, None]
+    return [(values / of_parts).flatten(), (values * of_parts * weights).flatten()]

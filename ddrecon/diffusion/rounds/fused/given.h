@@ -14,10 +14,10 @@ template <class F> struct Parts {
     F step, moved[3], part[4];
 };
 
-// Directions that go through the rows together: the way in y, which of all directions they are,
-// their pairs, where their matrices lie, and how many directions of the chunk are before them.
-struct Group {
-    int y_way, begin, members, first_pair, pairs, matrices, before;
+// Directions that go through the slices together: which of all they are, how many of them go up in
+// y, which come first, and how many there are; their units, and where the matrices of these lie.
+struct Chunk {
+    int begin, ups, members, first_unit, units, matrices;
 };
 
 // What kernels are given; what one does not use is absent. Changes begin with d_; those of fields
@@ -28,7 +28,7 @@ template <class F> struct Sweep {
     const F *light_parts[5], *source_parts[5], *bars[5];
     const F *d_factors, *d_scales, *d_gradient, *d_light_parts[5], *d_source_parts[5];
     const F *parts, *matrices;
-    const int *groups, *courses, *pairs, *order, *ranges, *chunks;
+    const int *courses, *units, *order, *ranges, *chunks;
     int depth, height, width, pitch, margin, colors, most, slab, slabs, directions;
     int extinction_channels, scattering_channels, scratch_rows, pieces, chunk_count;
     int together, color_from, chunk, half, adds;
@@ -36,21 +36,20 @@ template <class F> struct Sweep {
     double* sums;
 };
 
-// What a lane does in a launch: some groups of directions of a color, on the way up or down in z,
+// What a lane does in a launch: a chunk of directions of a color, on the way up or down in z,
 // `way` 1 or -1, through slices as it counts them: `to_middle` of them are until both ways meet.
 // There each goes on where the other has been, so that no two write to the same numbers at once.
 struct Job {
-    int lane, color, piece, way, group_from, group_to, slice_from, slice_to, to_middle;
+    int lane, color, piece, way, slice_from, slice_to, to_middle;
+    Chunk chunk;
 
     template <class F> INLINE Job(int lane, const Sweep<F>& of) : lane(lane) {
         const int is_down = lane / of.pieces % 2;
         color = of.color_from + lane / of.pieces / 2;
         piece = lane % of.pieces;
         way = is_down ? -1 : 1;
-        const int* groups =
-            of.chunks + 2 * ((is_down * of.pieces + piece) * of.chunk_count + of.chunk);
-        group_from = groups[0];
-        group_to = groups[1];
+        const int own = (is_down * of.pieces + piece) * of.chunk_count + of.chunk;
+        chunk = ((const Chunk*)of.chunks)[own];
         to_middle = (of.depth + is_down) / 2;
         slice_from = of.half ? to_middle : 0;
         slice_to = of.half ? of.depth : to_middle;

@@ -1,32 +1,31 @@
 #pragma once
 #include "ddrecon/diffusion/rounds/fused/lines.h"
 // Rows of moments from rows of radiance along directions, and the other way around (E2.8): products
-// of small matrices with rows. A direction and its mirror image in x, a pair, share sums over
-// moments even and odd in x.
+// of small matrices with rows. A direction and its mirror images in x, in y and in both, a unit,
+// share the sums over moments of each parity: these are sums of the four with different signs.
 
 namespace ddrecon {
 
-// So many at once, R or one: `step` is told how many, and the first.
-template <int N> struct Block {
-    static constexpr int size = N;
-};
-template <int R, class Step> INLINE void in_blocks(int count, Step step) {
-    int i = 0;
-    if constexpr (R > 1)
-        for (; i + R <= count; i += R) step(Block<R>(), i);
-    for (; i < count; ++i) step(Block<1>(), i);
-}
-
-// Radiance at cells of a row, by its pairs. The second of a pair is -1 where there is none.
-template <class F> struct Pairs {
+// Radiance at cells of a row, by its units: places of the four among directions, of which `ups` go
+// up in y and have lines of their own; -1 for none.
+template <class F> struct Units {
     const int* places;
-    int count;
-    F *lines, *copies;
+    int count, ups;
+    F *lines[2], *copies;
     long long stride, pitch;
     INLINE F* copied(int k) const { return copies + k * pitch; }
-    INLINE bool is_one(int p) const { return places[2 * p + 1] < 0; }
-    INLINE F* one(int p) const { return lines + places[2 * p] * stride; }
-    INLINE F* other(int p) const { return lines + places[2 * p + 1] * stride; }
+};
+// The lines of some units from one on, null for none.
+template <class F> struct Block {
+    static constexpr int SIZE = 2;
+    F* lines[SIZE][4];
+
+    INLINE Block(const Units<F>& units, int first) {
+        for (int n = 0; n < 4 * SIZE; ++n) {
+            const int j = units.places[4 * first + n];
+            lines[n / 4][n % 4] = j < 0 ? nullptr : units.lines[j >= units.ups] + j * units.stride;
+        }
+    }
 };
 
 // A moment of light; light is given as mean, flux along z, y, x, and what is higher, each of `all`
@@ -36,110 +35,122 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 }
 
-// Of moments to a DEGREE, those even in x come first. Few stay in registers. Many rows, which lie
-// far apart, take each other's places in a cache: they are copied one after another to where they
-// do not, and each that is read counts for some pairs at once.
+// Of moments to a DEGREE, those of parity p (even in y before odd, of each even in x before
+// odd) end before ENDS[p]: there are DEGREE + 1 - m of order m, odd in one of them where m is odd,
+// and as many of order -m, which are odd in the other.
 template <int DEGREE> struct Order {
-    static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
-    static constexpr int COUNT = EVEN + ODD;
-    static constexpr bool ARE_MANY = COUNT > 16;
+    static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
+    static constexpr int ODD = (DEGREE + 1) / 2 * (DEGREE / 2 + 1);
+    static constexpr int BOTH = DEGREE / 2 * ((DEGREE + 1) / 2);
+    static constexpr int ENDS[5] = {
+        0, COUNT - 2 * ODD - BOTH, COUNT - ODD - BOTH, COUNT - BOTH, COUNT};
 };
 // Sums of rows, each by a number, for each moment.
 template <class F, int COUNT, int TERMS> struct Sums {
     const F* rows[COUNT][TERMS];
     F by[COUNT][TERMS];
-    template <class T> INLINE T at(int k, int c, long long ahead) const {
-        T sum{};
-        UNROLLED
-        for (int i = 0; i < TERMS; ++i) {
-            sum += by[k][i] * read<T>(rows[k][i] + c);
-            if (sizeof(T) > sizeof(F)) __builtin_prefetch(rows[k][i] + ahead + c);
-        }
-        return sum;
-    }
 };
 
-// Radiance of pairs from moments that are sums; rows are `ahead` of the next ones, which are asked
-// for in time.
+// Sums and differences of four, first along x: values by parity from those of images, and back.
+template <class T> INLINE void mirror(T* x) {
+    const T even = x[0] + x[1], odd = x[0] - x[1], other_even = x[2] + x[3], other = x[2] - x[3];
+    x[0] = even + other_even;
+    x[1] = odd + other;
+    x[2] = even - other_even;
+    x[3] = odd - other;
+}
+
+// Radiance of units from moments that are sums. Rows of these lie far apart and take each other's
+// places in a cache: they are copied one after another to where they do not, and the next ones are
+// asked for in time.
 template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_directions(
-    const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Pairs<F>& pairs,
+    const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Units<F>& units,
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
-    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+    constexpr int R = Block<F>::SIZE;
+    for (int k = 0; k < Own::COUNT; ++k)
         in_steps<F>(from, to, [&](auto none, int c) HERE {
-            write(pairs.copied(k) + c, sums.template at<decltype(none)>(k, c, ahead));
+            typedef decltype(none) T;
+            T sum = none;
+            UNROLLED
+            for (int i = 0; i < TERMS; ++i) {
+                sum += sums.by[k][i] * read<T>(sums.rows[k][i] + c);
+                if (sizeof(T) > sizeof(F)) __builtin_prefetch(sums.rows[k][i] + ahead + c);
+            }
+            write(units.copied(k) + c, sum);
         });
-    in_steps<F>(from, to, [&](auto none, int c) HERE {
-        typedef decltype(none) T;
-        T in[Own::COUNT];
-        UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k)
-            if constexpr (Own::ARE_MANY)
-                in[k] = read<T>(pairs.copied(k) + c);
-            else
-                in[k] = sums.template at<T>(k, c, ahead);
-        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
-            constexpr int R = decltype(block)::size;
-            T sum[R], difference[R];
+    for (int u = 0; u < units.count; u += R) {
+        const Block<F> block(units, u);
+        in_steps<F>(from, to, [&](auto none, int c) HERE {
+            typedef decltype(none) T;
+            T found[R][4];
             UNROLLED
-            for (int a = 0; a < R; ++a) sum[a] = difference[a] = none;
-            UNROLLED
-            for (int k = 0; k < Own::COUNT; ++k) {
-                T* const found = k < Own::EVEN ? sum : difference;
+            for (int p = 0; p < 4; ++p) {
+                T sum[R];
                 UNROLLED
-                for (int a = 0; a < R; ++a) found[a] += matrix[(p + a) * Own::COUNT + k] * in[k];
+                for (int a = 0; a < R; ++a) sum[a] = none;
+                for (int k = Own::ENDS[p]; k < Own::ENDS[p + 1]; ++k) {
+                    const T moment = read<T>(units.copied(k) + c);
+                    UNROLLED
+                    for (int a = 0; a < R; ++a) sum[a] += matrix[k * units.count + u + a] * moment;
+                }
+                UNROLLED
+                for (int a = 0; a < R; ++a) found[a][p] = sum[a];
             }
             UNROLLED
             for (int a = 0; a < R; ++a) {
-                write(pairs.one(p + a) + c, sum[a] + difference[a]);
-                if (!pairs.is_one(p + a)) write(pairs.other(p + a) + c, sum[a] - difference[a]);
+                mirror(found[a]);
+                UNROLLED
+                for (int i = 0; i < 4; ++i)
+                    if (F* line = block.lines[a][i]) write(line + c, found[a][i]);
             }
         });
-    });
+    }
 }
 
 // The transpose: moments that `found` rows get, or what is added to them. Those that nothing is in
 // yet begin with `first` in the mean, less the rows `taken`.
 template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
     const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
-    const Pairs<F>& pairs, long long ahead, int width) {
+    const Units<F>& units, long long ahead, int width) {
     typedef Order<DEGREE> Own;
-    auto begin = [&](auto none, int k, int c) HERE {
-        typedef decltype(none) T;
-        if (!is_adding) return (k ? F(0) : first) - read<T>(taken[k] + c);
-        if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
-        return read<T>(found[k] + c);
-    };
-    in_steps<F>(0, width, [&](auto none, int c) HERE {
-        typedef decltype(none) T;
-        T out[Own::COUNT];
-        UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) out[k] = Own::ARE_MANY ? none : begin(none, k, c);
-        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
-            constexpr int R = decltype(block)::size;
-            T sum[R], difference[R];
+    constexpr int R = Block<F>::SIZE;
+    for (int u = 0; u < units.count; u += R) {
+        const Block<F> block(units, u);
+        in_steps<F>(0, width, [&](auto none, int c) HERE {
+            typedef decltype(none) T;
+            T given[R][4];
             UNROLLED
             for (int a = 0; a < R; ++a) {
-                sum[a] = difference[a] = read<T>(pairs.one(p + a) + c);
-                if (pairs.is_one(p + a)) continue;
-                const T other = read<T>(pairs.other(p + a) + c);
-                sum[a] += other;
-                difference[a] -= other;
+                UNROLLED
+                for (int i = 0; i < 4; ++i) {
+                    const F* line = block.lines[a][i];
+                    given[a][i] = line ? read<T>(line + c) : none;
+                }
+                mirror(given[a]);
             }
             UNROLLED
-            for (int k = 0; k < Own::COUNT; ++k) {
-                const T* const given = k < Own::EVEN ? sum : difference;
-                UNROLLED
-                for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * given[a];
-            }
+            for (int p = 0; p < 4; ++p)
+                for (int k = Own::ENDS[p]; k < Own::ENDS[p + 1]; ++k) {
+                    T sum = u ? read<T>(units.copied(k) + c) : none;
+                    UNROLLED
+                    for (int a = 0; a < R; ++a)
+                        sum += matrix[k * units.count + u + a] * given[a][p];
+                    write(units.copied(k) + c, sum);
+                }
         });
-        UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k)
-            write((Own::ARE_MANY ? pairs.copied(k) : found[k]) + c, out[k]);
-    });
-    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+    }
+    for (int k = 0; k < Own::COUNT; ++k)
         in_steps<F>(0, width, [&](auto none, int c) HERE {
-            write(found[k] + c, begin(none, k, c) + read<decltype(none)>(pairs.copied(k) + c));
+            typedef decltype(none) T;
+            T sum = read<T>(units.copied(k) + c);
+            if (is_adding) {
+                if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
+                sum += read<T>(found[k] + c);
+            } else {
+                sum += (k ? F(0) : first) - read<T>(taken[k] + c);
+            }
+            write(found[k] + c, sum);
         });
 }
 

@@ -2,9 +2,10 @@
 #include "ddrecon/diffusion/rounds/fused/rows.h"
 // Rows of cells along which radiance is followed backward: the adjoint of `Rows`.
 //
-// `Rows` kept what scatters and I of all slices of a slab. Of a row and a direction there is one
-// line, of the last slice as well, which is the next one that light crosses: the cotangents of what
-// comes to its cells, which go to those it comes from.
+// `Rows` kept what scatters and I of all slices of a slab. Of a row and a direction there are two
+// lines of cotangents: BAR, of means of I, which become those of what scatters, and RETURNING, of
+// what comes to cells, which go to those it comes from; those of the last slice are kept, which is
+// the next one that light crosses.
 
 namespace ddrecon {
 
@@ -14,9 +15,9 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
     typedef typename Light::Here Here;
     template <int POINTS> using Ways = typename Light::template Ways<POINTS>;
     static constexpr int COUNT = Light::COUNT;
+    enum { BAR, RETURNING };
 
-    // Of a row and a direction: where light went on to, by slice and row; cotangents of means of I,
-    // which become those of what scatters, and of what comes to cells.
+    // Of a row and a direction: where light went on to, by slice and row; both lines.
     template <int POINTS> struct Back {
         Line<F> from[POINTS];
         F *bar, *returning;
@@ -36,7 +37,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
           job(light.job),
           width(of.width),
           pitch(of.pitch),
-          stride(of.most * pitch),
+          stride(2LL * of.most * pitch),
           lines(of.returning + job.lane * ((of.height + 2) * stride + of.margin) + of.margin),
           e_bars(field_bar(of.e_bar, of.extinction_channels)),
           sc_bars(field_bar(of.sc_bar, of.scattering_channels)),
@@ -51,33 +52,42 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         const int shared = job.piece * of.together + job.color - of.color_from;
         return bars + (channels > 1 ? own : shared) * light.cells;
     }
-    INLINE F* bar_of(int j) const { return light.scratch_row(5 + j); }
-    INLINE F* line(int s, int t, int j) const {
+    INLINE F* line(int s, int t, int which, int j) const {
         const int place = (of.height - 1 - t + 2LL * s) % (of.height + 2);
-        return lines + place * stride + (light.group->before + j) * pitch;
+        return lines + place * stride + (2 * j + which) * pitch;
+    }
+    INLINE Units<F> units_at(const Here& here) const {
+        F* const downs = line(here.s, of.height - 1 - here.t, BAR, 0);
+        return light.units_of(line(here.s, here.t, BAR, 0), downs, 2 * pitch);
     }
     INLINE void clear(F* row) const {
         for (int c = 0; c < width; ++c) row[c] = F(0);
     }
 
-    INLINE void return_row(const Here& here, bool is_adding) const {
-        const long long at = job.color * light.cells + here.at;
-        const long long ahead = -light.group->y_way * width;
-        const Pairs<F> pairs = light.pairs_at(bar_of(0), pitch);
-        // E2.10 transposed: I_bar.
+    // E2.10 transposed: cotangents of means of I, and moments of what has become of them.
+    INLINE void find_bars(const Here& here) const {
         Sums<F, COUNT, 1> sums;
-        F* found[COUNT];
-        const F* taken[COUNT];
+        const long long at = job.color * light.cells + here.at;
         for (int i = 0; i < COUNT; ++i) {
             sums.rows[i][0] = light.row_of(part_of(of.bars, of.order[i], light.all), at);
             sums.by[i][0] = F(1);
+        }
+        to_directions<DEGREE>(light.matrix(1), sums, units_at(here), -width, 0, width);
+    }
+    INLINE void add_moments(const Here& here) const {
+        F* found[COUNT];
+        const F* taken[COUNT];
+        for (int i = 0; i < COUNT; ++i) {
             found[i] = light.found_row(here) + of.order[i] * light.all;
             taken[i] = light.empty;
         }
-        to_directions<DEGREE>(light.matrices[2], sums, pairs, ahead, 0, width);
+        to_moments<DEGREE>(
+            light.matrix(0), found, taken, F(0), of.adds, units_at(here), width, width);
+    }
+    INLINE void return_row(const Here& here) const {
         if (VARIES_NUMBERS) clear(scale_bar), clear(strength_bar), clear(inflow_bar);
         const auto before = light.find_before(here);
-        for (int j = 0; j < light.group->members; ++j)
+        for (int j = light.first(here); j < light.last(here); ++j)
             if (light.course(j).count == 1)
                 return_direction<1>(here, before, j);
             else
@@ -87,22 +97,21 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             const F* const rows[3] = {scale_bar, strength_bar, inflow_bar};
             for (int i = 0; i < 3; ++i) own_sums[i] += total(rows[i], width);
         }
-        to_moments<DEGREE>(light.matrices[1], found, taken, F(0), is_adding, pairs, ahead, width);
     }
 
     template <int POINTS> INLINE void return_direction(
         const Here& here, const typename Light::Before& before, int j) const {
         const Ways<POINTS> ways = light.template find_ways<POINTS>(here, before, j);
         const Course& course = light.course(j);
-        F* own = line(here.s, here.t, j);
-        Back<POINTS> back = {{}, bar_of(j), own};
+        F* own = line(here.s, here.t, RETURNING, j);
+        Back<POINTS> back = {{}, line(here.s, here.t, BAR, j), own};
         own[-1] = own[width] = F(0);
         // What returns from the cells to which light went on, but for those of this row.
         UNROLLED
         for (int i = 0; i < POINTS; ++i) {
             const int *point = course.points[i], s = here.s + point[0], t = here.t + point[1];
             const bool is_there = (point[0] || point[1]) && s < of.depth && t < of.height;
-            back.from[i] = {is_there ? line(s, t, j) : light.empty};
+            back.from[i] = {is_there ? line(s, t, RETURNING, j) : light.empty};
             back.from[i] = back.from[i] + point[2] * course.x_way;
         }
         if (course.is_along) {
@@ -191,12 +200,16 @@ INLINE void return_rows(int lane, const Sweep<F>& of) {
     for (int from, to = job.slice_to; to > job.slice_from; to = from) {
         from = light.slab_of(to - 1);
         light.follow(from, to);
-        for (int s = to - 1; s >= from; --s)
-            for (int g = job.group_to - 1; g >= job.group_from; --g) {
-                light.enter_group(g);
-                for (int t = of.height - 1; t >= 0; --t)
-                    back.return_row(light.place(s, t), of.adds || g < job.group_to - 1);
+        for (int s = to - 1; s >= from; --s) {
+            for (int t = of.height - 1; t >= 0; --t) {
+                back.find_bars(light.place(s, t));
+                back.return_row(light.place(s, t));
             }
+            for (int t = of.height - 1; t >= 0; --t) {
+                back.return_row(light.place(s, t, -1));
+                back.add_moments(light.place(s, of.height - 1 - t));
+            }
+        }
     }
 }
 

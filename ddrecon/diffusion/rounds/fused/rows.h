@@ -3,8 +3,9 @@
 // Rows of cells along which radiance is followed (E2.9, E2.10).
 //
 // A lane goes through the slices across z in the way that its light takes, s counting them, and in
-// each through the rows, t counting them in the way of a group of directions. Light comes to a cell
-// from up to four, which lie in this slice or the one before, in this row or the one before:
+// each through the rows, t counting them, twice: up in y with those directions that do, and down
+// with the others. What scatters in a slice is found before, and moments after. Light comes to a
+// cell from up to four, which lie in this slice or the one before, in this row or the one before:
 // wherever a direction goes, they were done already. Of a row and a direction there are two lines
 // of numbers: OWN, what scatters along it, which becomes the mean of I in each cell, and LIGHT, I
 // where it leaves cells, both less the light from outside; of tangents their changes as well. Lines
@@ -24,14 +25,14 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     static constexpr int COUNT = Order<DEGREE>::COUNT, LINES = IS_CHANGED ? 4 : 2;
     enum { OWN, LIGHT };
 
-    // A row of cells: its slice and its turn, where it is among cells, which of them have matter,
-    // and the depth of a unit length in the densest.
+    // A row of cells: its slice and its turn on the way in y, where it is among cells, which of
+    // them have matter, and the depth of a unit length in the densest.
     struct Here {
-        int s, t, from, to;
+        int s, t, y_way, from, to;
         long long at;
         F deepest;
     };
-    // Lines where light comes from to a row, of the group's first direction: in this slice or the
+    // Lines where light comes from to a row, of the chunk's first direction: in this slice or the
     // one before, in this row or the one before. Beyond the faces of the box there is no I.
     struct Before {
         Line<N> light[4];
@@ -50,17 +51,17 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
 
     const Sweep<F>& of;
     const Job& job;
+    const Chunk& chunk;
     const long long plane, cells, all, stride;
     F *const scratch, *const empty, *const lines;
     const Line<N> e_cells, sc_cells, gradients;
     N scale, strength, inflow;
     int slice_from = 0;
-    const Group* group = nullptr;
-    const F* matrices[4] = {};
 
     INLINE Rows(const Sweep<F>& of, const Job& job)
         : of(of),
           job(job),
+          chunk(job.chunk),
           plane((long long)of.height * of.width),
           cells(of.depth * plane),
           all(of.colors * cells),
@@ -110,41 +111,51 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         return of.saved + ((own * of.slabs + number) * of.height + t) * of.width;
     }
 
-    INLINE void enter_group(int g) {
-        group = (const Group*)of.groups + g;
-        for (int i = 0; i < 4; ++i)
-            matrices[i] = of.matrices + group->matrices + i * group->pairs * COUNT;
+    // Directions that go through a row on its way in y: from one of the chunk to another.
+    INLINE int first(const Here& here) const { return here.y_way > 0 ? 0 : chunk.ups; }
+    INLINE int last(const Here& here) const { return here.y_way > 0 ? chunk.ups : chunk.members; }
+    // All of a row, of which `ups` and `downs` have these lines, so far `apart`.
+    INLINE Units<F> units_of(F* ups, F* downs, long long apart) const {
+        const int* places = of.units + 4 * chunk.first_unit;
+        return {places, chunk.units, chunk.ups, {ups, downs}, scratch_row(5), apart, of.pitch};
     }
-    INLINE Pairs<F> pairs_at(F* first, long long apart) const {
-        return {of.pairs + 2 * group->first_pair, group->pairs, first,
-                scratch_row(5 + of.most),         apart,        of.pitch};
+    INLINE Units<F> units_at(const Here& here, bool are_changes) const {
+        const Line<N> ups = line(here.s, here.t, OWN, 0);
+        const Line<N> downs = line(here.s, of.height - 1 - here.t, OWN, 0);
+        const long long apart = (long long)LINES * of.pitch;
+        if constexpr (IS_CHANGED)
+            if (are_changes) return units_of(ups.change, downs.change, apart);
+        return units_of(ups.at, downs.at, apart);
     }
-    INLINE Here place(int s, int t) const {
+    INLINE const F* matrix(int which) const {
+        return of.matrices + chunk.matrices + which * COUNT * chunk.units;
+    }
+    INLINE Here place(int s, int t, int y_way = 1) const {
         const int k = job.way > 0 ? s : of.depth - 1 - s;
-        const int r = group->y_way > 0 ? t : of.height - 1 - t, row = k * of.height + r;
+        const int r = y_way > 0 ? t : of.height - 1 - t, row = k * of.height + r;
         const int* range = of.ranges + 2 * row;
-        return {
-            s, t, range[0], range[1], row * (long long)of.width, value_of(scale) * of.densest[row]};
+        const long long at = row * (long long)of.width;
+        return {s, t, y_way, range[0], range[1], at, value_of(scale) * of.densest[row]};
     }
     INLINE Before find_before(const Here& here) const {
         Before found;
         for (int i = 0; i < 4; ++i) {
             const int s = here.s - i / 2, t = here.t - i % 2;
             found.is_inside[i] = s >= 0 && t >= 0;
-            if (found.is_inside[i]) found.light[i] = line(s, t, LIGHT, group->before);
+            if (found.is_inside[i]) found.light[i] = line(s, t, LIGHT, 0);
         }
         return found;
     }
     INLINE const Course& course(int j) const {
-        return ((const Course*)of.courses)[group->begin + j];
+        return ((const Course*)of.courses)[chunk.begin + j];
     }
     template <int POINTS>
     INLINE Ways<POINTS> find_ways(const Here& here, const Before& before, int j) const {
         Ways<POINTS> found;
         const Course& own = course(j);
-        const Parts<F>& parts = ((const Parts<F>*)of.parts)[group->begin + j];
+        const Parts<F>& parts = ((const Parts<F>*)of.parts)[chunk.begin + j];
         found.step = parts.step;
-        found.own = line(here.s, here.t, OWN, group->before + j);
+        found.own = line(here.s, here.t, OWN, j);
         found.e = e_cells + here.at;
         found.sc = sc_cells + here.at;
         UNROLLED
@@ -165,11 +176,11 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     }
     INLINE Line<N> nothing() const { return line_at<N>(empty, 0); }
 
-    // What scatters along each direction of a row, from sums of the moments of what was found, is
-    // known and is given (E2.10).
+    // What scatters along each direction of a row t up in y, from sums of the moments of what was
+    // found, is known and is given (E2.10).
     INLINE const F* row_of(const F* part, long long at) const { return part ? part + at : empty; }
     INLINE void find_scattering(const Here& here, int from, int to) const {
-        const long long at = job.color * cells + here.at, ahead = group->y_way * of.width;
+        const long long at = job.color * cells + here.at;
         Sums<F, COUNT, 2> sums;
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i], own = k * of.colors + job.color;
@@ -180,9 +191,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             sums.by[i][0] = of.factors[own];
             sums.by[i][1] = of.beam_factors ? of.beam_factors[own] : F(1);
         }
-        const Line<N> own = line(here.s, here.t, OWN, group->before);
-        const long long apart = (long long)LINES * of.pitch;
-        to_directions<DEGREE>(matrices[0], sums, pairs_at(own.at, apart), ahead, from, to);
+        to_directions<DEGREE>(matrix(0), sums, units_at(here, false), of.width, from, to);
         if constexpr (IS_CHANGED) {
             Sums<F, COUNT, 3> changes;
             for (int i = 0; i < COUNT; ++i) {
@@ -194,35 +203,35 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                     changes.by[i][n] = by[n];
                 }
             }
-            const Pairs<F> pairs = pairs_at(own.change, apart);
-            to_directions<DEGREE>(matrices[0], changes, pairs, ahead, from, to);
+            to_directions<DEGREE>(matrix(0), changes, units_at(here, true), of.width, from, to);
         }
     }
 
     // Light through the slices from `slice_from` on.
     INLINE void follow(int slice_from, int slice_to) {
         this->slice_from = slice_from;
-        for (int s = slice_from - (KEEPS && slice_from > 0); s < slice_to; ++s)
-            for (int g = job.group_from; g < job.group_to; ++g) {
-                enter_group(g);
-                for (int t = 0; t < of.height; ++t) {
-                    const Here here = place(s, t);
-                    find_scattering(here, KEEPS ? 0 : here.from, KEEPS ? of.width : here.to);
-                    follow_row(here);
-                    if constexpr (!KEEPS) add_moments(here, of.adds || g > job.group_from);
-                }
+        for (int s = slice_from - (KEEPS && slice_from > 0); s < slice_to; ++s) {
+            for (int t = 0; t < of.height; ++t) {
+                const Here here = place(s, t);
+                find_scattering(here, KEEPS ? 0 : here.from, KEEPS ? of.width : here.to);
+                follow_row(here);
             }
+            for (int t = 0; t < of.height; ++t) {
+                follow_row(place(s, t, -1));
+                if constexpr (!KEEPS) add_moments(place(s, of.height - 1 - t));
+            }
+        }
     }
     INLINE void follow_row(const Here& here) const {
         const int width = of.width;
         const Before before = find_before(here);
-        for (int j = 0; j < group->members; ++j) {
+        for (int j = first(here); j < last(here); ++j) {
             const Course& own = course(j);
-            const Line<N> light = line(here.s, here.t, LIGHT, group->before + j);
+            const Line<N> light = line(here.s, here.t, LIGHT, j);
             light.put(-1, N(F(0)));
             light.put(width, N(F(0)));
             if (KEEPS && here.s < slice_from) {
-                const F* row = saved_row(here.s + 1, here.t, group->begin + j);
+                const F* row = saved_row(here.s + 1, here.t, chunk.begin + j);
                 for (int c = 0; c < width; ++c) light.at[c] = row[c];
                 continue;
             }
@@ -231,7 +240,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             else
                 follow_direction<4>(here, before, light, j);
             if (!KEEPS && of.saved && here.s + 1 < of.depth && slab_of(here.s + 1) == here.s + 1) {
-                F* row = saved_row(here.s + 1, here.t, group->begin + j);
+                F* row = saved_row(here.s + 1, here.t, chunk.begin + j);
                 for (int c = 0; c < width; ++c) row[c] = light.at[c];
             }
         }
@@ -299,12 +308,10 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         }
     }
     // What is found: moments of light, of which the known ones are taken away; or their changes.
-    INLINE void add_moments(const Here& here, bool is_adding) const {
-        const Line<N> within = line(here.s, here.t, OWN, group->before);
+    INLINE void add_moments(const Here& here) const {
         F* const begin = found_row(here);
         const F* taken[COUNT];
-        F *found[COUNT], first = change_of(inflow), *lines = within.at;
-        if constexpr (IS_CHANGED) lines = within.change;
+        F *found[COUNT], first = change_of(inflow);
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i];
             const bool is_known = k < 4 && !job.piece;
@@ -314,8 +321,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             found[i] = begin + k * all;
         }
         to_moments<DEGREE>(
-            matrices[3], found, taken, job.piece > 0 ? F(0) : first, is_adding,
-            pairs_at(lines, (long long)LINES * of.pitch), group->y_way * of.width, of.width);
+            matrix(1), found, taken, job.piece > 0 ? F(0) : first, of.adds,
+            units_at(here, IS_CHANGED), -of.width, of.width);
     }
     INLINE F* found_row(const Here& here) const {
         return of.found + job.piece * COUNT * all + job.color * cells + here.at;

@@ -24,8 +24,7 @@ _ROOM = "diffusion/rounds/fused"
 MARGIN = 16
 """Cells before an array of rows, which begin where vectors do."""
 NUMBERS = 7
-"""Rows of a lane's own besides those of directions and of moments: two empty ones, and what the
-adjoint sums."""
+"""Rows of a lane's own besides those of moments: two empty ones, and what the adjoint sums."""
 
 
 class Rows:
@@ -90,7 +89,7 @@ class Rows:
             "saved": saved, "sums": sums, "e_bar": fields[0], "sc_bar": fields[-1],
             "gradient_bar": gradient,
             "lines": self.like.new_empty(self._line_count(2, (self.slab + 1) * self.height)),
-            "returning": self.like.new_zeros(self._line_count(1, self.height + 2)),
+            "returning": self.like.new_zeros(self._line_count(2, self.height + 2)),
         }  # fmt: skip
         flag = f", {str(varies_numbers).lower()}"
         found = self._run("return_rows<", flag, {"bars": bars}, made)
@@ -113,7 +112,7 @@ class Rows:
         shape = self.pieces, self.count, *self.like.shape
         sums = self.like.new_empty(shape) if shape[0] == 1 else self.like.new_zeros(shape)
         numbers = self.tables["chunks"].shape[2]
-        scratch_rows = NUMBERS + self.tables["most"] + self.count
+        scratch_rows = NUMBERS + self.count
         scratch = self.like.new_zeros(self.lanes * scratch_rows * self.pitch)
         given = given | self.tables | {
             "light_parts": swept.light, "source_parts": swept.source, "factors": swept.factors,
