@@ -287,6 +287,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Of a film, which frame is taken, counted from 0. With `frames`, the one that the "
                 "scene's frame 0 is."
             ),
+            "time": "Seconds after which a film begins here: `frame` counts from there.",
             "split": "`test` views are never optimized on, and always reported.",
             "weight": "How much a training view counts.",
             "exposure": (

@@ -21,7 +21,7 @@ from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
 from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
 
-READERS: Mapping[str, Callable[[Path, int], Image]] = {
+READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "image": read_image,
     "background": read_image,
     "mask": read_mask,
@@ -66,7 +66,8 @@ def _build_view(
         if isinstance(path := getattr(section, name), Path):
             with problems.collecting():
                 require(scene_file, f"{key}.{name}", path)
-                stored = read(path, 0 if name == "background" else section.frame)
+                is_still = name == "background"
+                stored = read(path, 0, 0.0) if is_still else read(path, section.frame, section.time)
                 pixels = torch.from_numpy(stored.pixels).permute(2, 0, 1).contiguous()
                 pictures[name] = pixels.to(device, dtype)
                 step = stored.step if name == "image" else step

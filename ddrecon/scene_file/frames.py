@@ -43,5 +43,5 @@ def require_frames(scene_file: SceneFile) -> None:
                     with problems.collecting():
                         require(one, f"views.{index}.{key}", path)
                         if one is frames[-1] and path.suffix.lower() in FILMS:
-                            read_image(path, view.frame)
+                            read_image(path, view.frame, view.time)
     problems.raise_any()

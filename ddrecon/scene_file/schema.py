@@ -390,7 +390,8 @@ class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
     `frame`: which one of films is taken, or with `frames`, which number the scene's frame 0 has
-    here. `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    here; of a film that begins earlier, counted from the one that it shows at its `time` [s].
+    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
     `offset`; `background` is what it shows where the volume is empty.
     """
 
@@ -399,6 +400,7 @@ class ViewSection:
     image: Path | None = None
     mask: Path | None = None
     frame: int = 0
+    time: float = bounded(0.0, minimum=0.0)
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0, expert=True)
     exposure: Color = bounded(1.0, minimum=1e-3)

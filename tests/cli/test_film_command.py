@@ -294,7 +294,8 @@ def test_frames_of_films_are_those_of_pictures(film: Path, refuse: Refuse) -> No
             iio.imwrite(f"{name}_{number:02d}.png", noise[number + ahead])
         exact = {"codec": "libx264rgb", "output_params": ["-crf", "0"], "macro_block_size": 1}
         iio.imwrite(f"{name}.mp4", noise, pixelformat="rgb24", quality=None, **exact)
-        text = text.replace(f"'{name}_{{frame:02d}}.npy'", f"{name}.mp4, frame: {ahead}")
+        begin = f"time: {ahead / 10}" if ahead % 2 else f"frame: {ahead}"
+        text = text.replace(f"'{name}_{{frame:02d}}.npy'", f"{name}.mp4, {begin}")
     Path("mp4.yaml").write_text(text)
     Path("png.yaml").write_text(Path("film.yaml").read_text().replace(".npy", ".png"))
     for number in range(FRAMES):

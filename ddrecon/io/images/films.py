@@ -15,8 +15,8 @@ FILMS = {".mp4": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska"}
 """What ffmpeg takes a suffix for: by itself it would go by content, and follow playlists."""
 
 
-def read_frame(path: Path, number: int = 0) -> np.ndarray:
-    """The frame `number`, counted from 0, of the film at `path`: uint8 [h, w, 3].
+def read_frame(path: Path, number: int = 0, time: float = 0.0) -> np.ndarray:
+    """The frame `number`, counted from that at `time` [s], of the film at `path`: uint8 [h, w, 3].
 
     Raises FormatError where there is none, or the film is damaged.
     """
@@ -30,6 +30,7 @@ def read_frame(path: Path, number: int = 0) -> np.ndarray:
     try:
         about = next(read(path, input_params=asked))
         (width, height), rate = about["size"], about["fps"]
+        number += round(time * rate)
         check_size(4 * width * height, path, f"a film of {width} x {height} pixels")
         # Half a frame early: the times of frames are rounded.
         asked += ["-xerror", "-ss", f"{max(0.0, (number - 0.5) / rate):.6f}"]

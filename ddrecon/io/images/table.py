@@ -62,8 +62,8 @@ class Image:
         return self.pixels.shape[0], self.pixels.shape[1]
 
 
-def read_image(path: Path, frame: int = 0) -> Image:
-    """The image at `path`, of a film the one of this number.
+def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
+    """The image at `path`, of a film the one of this number after that at `time` [s].
 
     Raises FormatError where it is unknown, damaged, or not finite.
     """
@@ -72,7 +72,7 @@ def read_image(path: Path, frame: int = 0) -> Image:
         known = ", ".join(READERS)
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {known}")
     with guard_reading(path):
-        values = read_frame(path, frame) if reader is read_frame else reader(path)
+        values = read_frame(path, frame, time) if reader is read_frame else reader(path)
         if reader in (read_frame, _read_encoded):
             step = 1 / 65535 if values.dtype == np.uint16 else 1 / 255
             values = _decode(values)
@@ -96,9 +96,10 @@ def read_image(path: Path, frame: int = 0) -> Image:
     return Image(pixels, coverage, step)
 
 
-def read_mask(path: Path, frame: int = 0) -> Image:
+def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
     """The mask at `path`: 0 where its image is black or empty, and ignored, else 1."""
-    return Image(as_float32(read_image(path, frame).pixels.max(axis=2, keepdims=True) > 0))
+    image = read_image(path, frame, time)
+    return Image(as_float32(image.pixels.max(axis=2, keepdims=True) > 0))
 
 
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
