@@ -29,7 +29,3 @@ def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             value = eval(compile(ast.Expression(last.value), path.name, "eval"), namespace)
             if value is not None:
                 assert "<iframe" in value._repr_html_()
-
-
-def test_there_are_notebooks() -> None:
-    assert len(list(FOLDER.glob("*.ipynb"))) == 3
