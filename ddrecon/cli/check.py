@@ -44,7 +44,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
     for scene in frames:
         train, settings = select_views(scene, is_test=False), scene.optimize
         density = settings.parameters.get("density") if settings is not None else None
-        if settings is not None and density is not None:
+        if settings is not None and density is not None and train.views:
             auto = replace(density, support=density.support or AUTO)
             with nullcontext() if density.support else suppress(SceneError):
                 found.append(find_support(train, replace(settings, parameters={"density": auto})))
