@@ -202,7 +202,6 @@ def _render(
     metavar="K",
     help="Write pictures every K iterations.",
 )
-@click.option("--uncertainty", "has_uncertainty", is_flag=True, hidden=True)
 @click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @click.option(
     "--shared",
@@ -228,14 +227,11 @@ def optimize(
     iterations: str | None,
     resume: bool,
     preview_every: int | None,
-    has_uncertainty: bool,
     part: str | None,
     shared: Path | None,
     exported: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
-    if has_uncertainty:
-        raise click.UsageError(f"--uncertainty: say `ddrecon uncertainty {output} -o DIR` after it")
     if iterations is not None:
         session = session.with_override(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
