@@ -71,10 +71,10 @@ def memory_of(needs: Needs, is_short: bool = False) -> int:
     With derivatives where something is optimized. `is_short`: where freed memory is given back.
     """
     alive = CHUNK_NODES * _numbers_at_node(needs) + needs.cells * _numbers_in_cell(needs)
-    held = alive * _overhead(needs, is_short)
+    of_light = alive * _overhead(needs, is_short)
     # Targets, those of a coarser level, what rays meet, renders.
     in_pixel = 12 if needs.varied is None else 18
-    return int(needs.size * (held + in_pixel * needs.pixels)) + shared_memory(needs)
+    return int(needs.size * (of_light + in_pixel * needs.pixels)) + shared_memory(needs)
 
 
 def _numbers_in_cell(needs: Needs) -> float:

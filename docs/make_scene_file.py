@@ -428,11 +428,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "warm_start": "Whether a solve begins at the last one's solution.",
             "transport_rounds": (
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
-                "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
-                "where there are none: without model `p1` or scheme `conservative`. With "
-                "degree 5 it is one more, two in cells thicker than 4 optical depths. Where "
-                "none is, it is 1 in cells thicker than 3, and else at least 2 where the volume "
-                "emits light. Cells count as `refine` leaves them."
+                "it is 1; 2 where g is above 0.55 in size, or optimized; 3 where it is above 0.77; "
+                "0 without model `p1` or scheme `conservative`. Degree 5 adds one, or two in "
+                "cells thicker than 4 optical depths. With lower degrees it is 1 in cells thicker "
+                "than 3, and else at least 2 where the volume emits light. Cells count as "
+                "`refine` leaves them."
             ),
             "transport_tolerance": (
                 "Rounds end where one changes light by less of it, at most `transport_rounds` of "
@@ -442,12 +442,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Light is computed and seen in cells so many times as narrow; the medium is the "
                 "same. Left out, it is 3 where a cell is thicker than 1.5 optical depths (0.75 "
                 "where a face of the box is dense), or 9 where a third of it is, if there are no "
-                "more than 1,048,576 cells then and density is not sought; else 1."
+                "more than 1,048,576 cells then and density is not optimized; else 1."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "
                 "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not "
-                "sought and at most 0.32 in size. It is 5 where a face of the box is half as "
+                "optimized and at most 0.32 in size. It is 5 where a face of the box is half as "
                 "dense as the mean, or where g is below -0.67."
             ),
         },

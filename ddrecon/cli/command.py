@@ -96,11 +96,11 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
         except DdreconError as error:
             from ddrecon.ranks import tell_failure
 
-            told = tell_failure(error)
+            line = tell_failure(error)
             if debug:
                 raise
-            if told is not None:
-                click.echo(told, err=True)
+            if line is not None:
+                click.echo(line, err=True)
             sys.exit(error.exit_code)
         except (MemoryError, RuntimeError) as error:
             from ddrecon.memory import is_shortage

@@ -149,8 +149,8 @@ def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -
     if call.bounds.size != items:
         call.set_dim(items)
     for place, value in enumerate(given):
-        ready = value.__ctype__() if hasattr(value, "__ctype__") else value
-        call.set_param_at_index_from_ctype(place, ready)
+        one = value.__ctype__() if hasattr(value, "__ctype__") else value
+        call.set_param_at_index_from_ctype(place, one)
     call.launch(stream)
     calls.append(call)
 

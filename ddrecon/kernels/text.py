@@ -123,23 +123,23 @@ class TextKernel:
         Raises ValueError for an array that it writes and that is not `made`: of a copy of that
         nobody would see what is written. And for one that is, and that it does not write.
         """
-        record, held = self.new_record(), []
+        record, kept = self.new_record(), []
         if wrong := (self.made & given.keys()) | (made.keys() - self.made):
             raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
         for name, value in given.items():
             if name in self.lists:
-                ready = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
+                own = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
             else:
-                ready = self._ready(name, value)
-            self.write(record, name, ready)
-            held.append(ready)
+                own = self._ready(name, value)
+            self.write(record, name, own)
+            kept.append(own)
         for name, value in made.items():
             self.write(record, name, value)
         lists = (value if isinstance(value, list) else [value] for value in made.values())
         arrays = [array for each in lists for array in each if isinstance(array, Tensor)]
         clear_in_rehearsal(arrays)
         like = arrays[0]
-        return Bound(self, record, [held, made], like)
+        return Bound(self, record, [kept, made], like)
 
     def _ready(self, name: str, value: Any) -> Any:
         is_array = isinstance(value, Tensor)
@@ -187,11 +187,11 @@ def _texts(header: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Bound:
-    """A kernel with the `record` it is given; `held` keeps what this points to."""
+    """A kernel with the `record` it is given; `kept` is what this points to."""
 
     kernel: TextKernel
     record: Any
-    held: Any
+    kept: Any
     like: Tensor
 
     def launch(self, count: int, threads: int | None = None, **changed: Any) -> None:

@@ -88,15 +88,15 @@ def kink_width(place: Tensor, size: int) -> float:
 
 
 def ramp(place: Tensor, tolerance: float) -> Tensor:
-    """`place` held within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
+    """`place` kept within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
     if not is_varied(place):
         return place.clamp(0, 1)
-    held = place.detach()
-    is_near = (held > -tolerance) & (held < 1 + tolerance)
-    is_inside = (held > tolerance) & (held < 1 - tolerance)
+    at = place.detach()
+    is_near = (at > -tolerance) & (at < 1 + tolerance)
+    is_inside = (at > tolerance) & (at < 1 - tolerance)
     slope = 0.5 * (is_near.to(place.dtype) + is_inside.to(place.dtype))
     # The second term is 0 and has the slope.
-    return held.clamp(0, 1) + slope * (place - held)
+    return at.clamp(0, 1) + slope * (place - at)
 
 
 def third_order_weight(coordinate: Tensor, size: int, border: int) -> Tensor:

@@ -47,6 +47,6 @@ class Result(Displayed):
         """The reconstructed scene, in a notebook, and how well it fits."""
         last = self.rows[-1]
         test = [row.test_psnr for row in self.rows if row.test_psnr is not None][-1:]
-        held = f", {test[0]:.2f} dB of views held out" if test else ""
-        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of views trained on{held}"
+        tested = f", {test[0]:.2f} dB of views held out" if test else ""
+        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of views trained on{tested}"
         return f"<p>{fit}</p>{self.scene._repr_html_()}"

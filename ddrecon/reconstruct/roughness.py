@@ -33,7 +33,7 @@ def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> 
     # What holds neighbors together counts in both.
     for axis, factor in zip(AXES, factors, strict=True):
         count = field.shape[axis] - 1
-        held = stiffness.narrow(axis, 0, count) * factor**2
-        total.narrow(axis, 0, count).add_(held)
-        total.narrow(axis, 1, count).add_(held)
+        between = stiffness.narrow(axis, 0, count) * factor**2
+        total.narrow(axis, 0, count).add_(between)
+        total.narrow(axis, 1, count).add_(between)
     return total if knee is None else total.mul_(compressed_slope(field, knee).square_())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 LONGEST = 600
-SOURCES = sorted((ROOT / "ddrecon").rglob("*.py"))
+SOURCES = sorted(path for kind in ("*.py", "*.h") for path in (ROOT / "ddrecon").rglob(kind))
 
 
 def test_no_source_file_is_long() -> None:

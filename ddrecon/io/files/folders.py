@@ -35,7 +35,7 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
     lock = path / LOCK
     try:
         # No soft locks: what they leave behind would have to be judged stale or not.
-        held = FileLock(lock, fallback_to_soft=False).acquire(timeout=0)
+        own = FileLock(lock, fallback_to_soft=False).acquire(timeout=0)
     except Timeout:
         holder = ""
         with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
@@ -46,7 +46,7 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
         ) from None
     except OSError as error:
         raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
-    with held:
+    with own:
         lock.write_text(str(os.getpid()))
         try:
             if not may_exist and any(entry != lock for entry in path.iterdir()):

@@ -28,10 +28,10 @@ template <class F, int BLOCK> struct Ways {
         int n;
         F a;
         INLINE Between(F at, F most) {
-            const F held = at < F(0) ? F(0) : at > most ? most : at;
-            const int whole = (int)held, last = most < F(1) ? 0 : (int)most - 1;
+            const F inside = at < F(0) ? F(0) : at > most ? most : at;
+            const int whole = (int)inside, last = most < F(1) ? 0 : (int)most - 1;
             n = whole < last ? whole : last;
-            a = held - F(n);
+            a = inside - F(n);
         }
     };
     // The cells around sample i of way t.

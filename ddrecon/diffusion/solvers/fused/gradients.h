@@ -31,12 +31,12 @@ template <class F> APART void start(const Solve<F>& solve, const Share<F>& own) 
     const Size slice = l.slice, before = solve.color * l.cells;
     slot.clear(4);
     double norm = 0.0, square = 0.0;
-    int ready = own.from > 0 ? own.from - 1 : 0;
+    int next = own.from > 0 ? own.from - 1 : 0;
     for (int z = own.from; z < own.to; ++z) {
-        for (; ready <= z + 1 && ready < l.nz; ++ready) {
-            const F* __restrict u = solve.guess + before + ready * slice;
-            const F* __restrict scale = l.scale + ready * slice;
-            F* __restrict v = slot.ring(0, ready);
+        for (; next <= z + 1 && next < l.nz; ++next) {
+            const F* __restrict u = solve.guess + before + next * slice;
+            const F* __restrict scale = l.scale + next * slice;
+            F* __restrict v = slot.ring(0, next);
             for (Size i = 0; i < slice; ++i) v[i] = u[i] / scale[i];
         }
         const F* __restrict b = solve.source + before + z * slice, * __restrict v = slot.ring(0, z);
@@ -65,14 +65,14 @@ template <class F> APART void direct(const Solve<F>& solve, const Share<F>& own)
     const F* const before = solve.iteration == 0 ? p : solve.vector(D + solve.now());
     slot.clear(4);
     double curved = 0.0;
-    int ready = own.from > 0 ? own.from - 1 : 0;
+    int next = own.from > 0 ? own.from - 1 : 0;
     for (int z = own.from; z < own.to; ++z) {
-        for (; ready <= z + 1 && ready < l.nz; ++ready) {
-            F* __restrict v = slot.ring(0, ready);
-            const F* __restrict e = before + ready * l.slice, * __restrict c = p + ready * l.slice;
+        for (; next <= z + 1 && next < l.nz; ++next) {
+            F* __restrict v = slot.ring(0, next);
+            const F* __restrict e = before + next * l.slice, * __restrict c = p + next * l.slice;
             for (Size i = 0; i < l.slice; ++i) v[i] = more * e[i] + c[i];
-            F* __restrict kept = made + ready * l.slice;
-            if (ready >= own.from && ready < own.to)
+            F* __restrict kept = made + next * l.slice;
+            if (next >= own.from && next < own.to)
                 for (Size i = 0; i < l.slice; ++i) kept[i] = v[i];
         }
         const F* v = slot.ring(0, z);
