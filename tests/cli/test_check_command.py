@@ -82,8 +82,7 @@ def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     left_out = [f"-D{key}=null" for key in ("optimize", "views.0.image", "views.1.image")]
     lines = succeed("check", "scene.yaml", *left_out).stdout.splitlines()
     assert "optimizes: nothing" in lines and "  front: perspective, 8 x 6 pixels, train" in lines
-    without_images = succeed("check", "scene.yaml", *left_out[1:]).stdout
-    assert "optimizes: density" in without_images and "pictures leave" not in without_images
+    assert "optimizes: density" in succeed("check", "scene.yaml", *left_out[1:]).stdout
 
 
 def test_every_command_tells_the_same_doubts(succeed: Run) -> None:

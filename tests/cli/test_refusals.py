@@ -36,10 +36,7 @@ render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
 optimize scene.yaml -o out --iterations 0 => 2 -D optimize.iterations=0: optimize.iterations: must
 optimize scene.yaml -o out --iterations some => 2 -D optimize.iterations=some: optimize.iterations:
-optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty RUN -o
-optimize scene.yaml -o out --watch => 2 Error: --watch: say `ddrecon watch RUN` beside it
-optimize scene.yaml -o out --tensorboard => 2 Error: --tensorboard: loss.csv has the same numbers
-render scene.yaml -o out --ring 3 --mp4 => 2 Error: --mp4: say `ffmpeg -i DIR/ring_%03d.png ring.mp4
+optimize scene.yaml -o out --watch --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
