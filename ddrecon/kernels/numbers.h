@@ -134,15 +134,20 @@ template <class F> INLINE F eta_slope_series(F depth) {
     return series<OfEtaSlope, F, Format<F>::terms>(-depth);
 }
 
-// phi and psi (`numerics/decay.py`) of a depth of at least 0.
+// phi, psi and eta (`numerics/decay.py`) of a depth of at least 0, of which `kept` is the decay;
+// by series where it `is_thin`, below 1/2.
 template <class F> struct Decayed {
-    F phi, psi;
+    F phi, psi, eta;
 };
+template <class F> INLINE Decayed<F> decayed(F depth, F kept, bool is_thin) {
+    const F thin = is_thin ? depth : F(0), inverse = F(1) / (is_thin ? F(0.5) : depth);
+    const F near_psi = psi_series(thin), near_eta = eta_series(thin);
+    const F phi = is_thin ? F(1) - depth * near_psi : (F(1) - kept) * inverse;
+    const F psi = is_thin ? near_psi : (F(1) - phi) * inverse;
+    return {phi, psi, is_thin ? near_eta : (psi - F(0.5) * phi) * inverse};
+}
 template <class F> INLINE Decayed<F> decayed(F depth) {
-    const bool is_thin = depth < F(0.5);
-    const F near_psi = psi_series(is_thin ? depth : F(0)), thick = is_thin ? F(0.5) : depth;
-    const F phi = is_thin ? F(1) - depth * near_psi : (F(1) - decay(depth)) / thick;
-    return {phi, is_thin ? near_psi : (F(1) - phi) / thick};
+    return decayed(depth, decay(depth), depth < F(0.5));
 }
 
 // A sum in double precision, eight at a time.

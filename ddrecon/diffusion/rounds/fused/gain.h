@@ -6,12 +6,10 @@ namespace ddrecon {
 
 // psi / phi - 1/2 of a depth, and its slope (`numerics/decay.py`).
 template <class F> INLINE Sloped<F> find_lag(F depth) {
-    const Decayed<F> mean = decayed(depth);
-    const F inverse = F(1) / mean.phi;
-    const F eta = depth < F(0.5) ? eta_series(depth < F(0.5) ? depth : F(0))
-                                 : (mean.psi - F(0.5) * mean.phi) / depth;
+    const auto [phi, psi, eta] = decayed(depth);
+    const F inverse = F(1) / phi;
     // phi' = psi - phi, psi' = -2 eta
-    const F slope = (F(-2) * eta * mean.phi - mean.psi * (mean.psi - mean.phi)) * inverse * inverse;
+    const F slope = (F(-2) * eta * phi - psi * (psi - phi)) * inverse * inverse;
     return {depth * eta * inverse, slope};
 }
 

@@ -31,13 +31,9 @@ template <class N> struct Passage {
 template <Matter MATTER, class F, class N> INLINE Passage<N> pass_through(F d, const N& depth) {
     const F kept = MATTER == ANY ? decay(d) : F(0);
     const bool is_thin = MATTER != ANY || d < F(0.5);
-    const F thin = is_thin ? d : F(0), inverse = F(1) / (is_thin ? F(0.5) : d);
-    const F near = psi_series(thin);
-    const F near_eta = eta_series(thin);
-    const F near_slope = eta_slope_series(thin);
-    const F phi = is_thin ? F(1) - d * near : (F(1) - kept) * inverse;
-    const F psi = is_thin ? near : (F(1) - phi) * inverse;
-    const F eta = is_thin ? near_eta : (psi - F(0.5) * phi) * inverse;
+    const auto [phi, psi, eta] = decayed(d, kept, is_thin);
+    const F near_slope = eta_slope_series(is_thin ? d : F(0)),
+            inverse = F(1) / (is_thin ? F(0.5) : d);
     const F eta_slope = is_thin ? near_slope : (F(0.5) * (phi - psi) - F(3) * eta) * inverse;
     const F lost = d * phi, passed = MATTER == ANY ? kept : F(1) - lost;
     return {along(depth, Sloped<F>{phi, psi - phi}),
