@@ -15,7 +15,7 @@ from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.schema import PhaseSection
-from ddrecon.settings import DiffusionSettings
+from ddrecon.settings import DiffusionSettings, OptimizeSettings
 from ddrecon.variables.values import value_of, variable_names
 
 pytestmark = pytest.mark.usefixtures("few_directions")
@@ -48,13 +48,17 @@ def test_a_kind_of_scene_renders(config: Path) -> None:
     assert bool(picture.isfinite().all()) and float(picture.min()) >= 0 < float(picture.max())
 
 
-def test_every_phase_function_and_model_has_a_config() -> None:
-    texts = [config.read_text() for config in (ROOT / "configs").rglob("*.yaml")]
-    phases = [section.type for section in get_args(PhaseSection)]
-    models = next(field for field in fields(DiffusionSettings) if field.name == "model")
-    ordinary = {"henyey_greenstein", "p1"}
-    for name in {*phases, *models.metadata["choices"]} - ordinary:
-        assert any(f"type: {name}" in text or f"model: {name}" in text for text in texts), name
+def test_every_phase_function_model_and_loss_is_used() -> None:
+    """By a config, or in the measurements of the paper's g."""
+    used = [*(ROOT / "configs").rglob("*.yaml"), ROOT / "benchmarks" / "paper_g.py"]
+    text = "".join(path.read_text() for path in used).replace("=", ": ")
+    known = {f"type: {section.type}" for section in get_args(PhaseSection)}
+    for field in (*fields(DiffusionSettings), *fields(OptimizeSettings)):
+        if field.name in ("model", "loss"):
+            known |= {f"{field.name}: {choice}" for choice in field.metadata["choices"]}
+    # What scenes have that do not say.
+    by_default = {"type: henyey_greenstein", "model: p1", "loss: l2", "loss: display"}
+    assert {one for one in known if one not in text} <= by_default
 
 
 @pytest.mark.slow

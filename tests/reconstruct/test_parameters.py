@@ -20,15 +20,6 @@ def start() -> Parameter:
     return Parameter("density", ParameterSettings(), RATE, value, GRID)
 
 
-def test_the_first_step_goes_ahead_of_the_derivative_over_its_floored_size() -> None:
-    parameter, gradient = start(), random_values(*GRID.shape) - 0.5
-    before = parameter.value.detach()
-    parameter.step(gradient, 1.0)
-    size = gradient.abs() + FLOOR * gradient.square().mean().sqrt()
-    moved = before - FIRST * (1 + BETAS[0]) * gradient / size
-    torch.testing.assert_close(parameter.value.detach(), moved)
-
-
 def test_steps_do_not_depend_on_the_unit_of_the_objective() -> None:
     one, other = start(), start()
     for seed in range(3):
