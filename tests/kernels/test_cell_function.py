@@ -21,7 +21,9 @@ CELLS = [
 """Header, function, fields, outs, numbers."""
 
 
-@pytest.mark.parametrize(("header", "cell", "ins", "outs", "numbers"), CELLS)
+@pytest.mark.parametrize(
+    ("header", "cell", "ins", "outs", "numbers"), CELLS, ids=[cell for _, cell, *_ in CELLS]
+)
 def test_derivatives_are_those_of_values(
     header: str, cell: str, ins: int, outs: int, numbers: int
 ) -> None:
