@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.polynomial.legendre import leggauss, legval
+from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from ddrecon.balance import find_balance
@@ -131,13 +131,6 @@ class Layer:
         if self.depth == math.inf and not self.moments(3)[1:].any():
             return h_reflection(self.albedo, self.sun)
         return ordinates(self)
-
-    def once(self) -> Array:
-        """Of `up`, the part that is scattered once."""
-        moments = self.moments(256)
-        phase = legval(-self.sun * VIEWS, moments * (2 * np.arange(len(moments)) + 1))
-        passed = np.exp(-self.depth * (1 / self.sun + 1 / VIEWS))
-        return self.albedo / 4 * phase * (1 - passed) / (VIEWS + self.sun)
 
 
 @dataclass(frozen=True)
