@@ -128,11 +128,11 @@ class TextKernel:
             raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
         for name, value in given.items():
             if name in self.lists:
-                own = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
+                value = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
             else:
-                own = self._ready(name, value)
-            self.write(record, name, own)
-            kept.append(own)
+                value = self._ready(name, value)
+            self.write(record, name, value)
+            kept.append(value)
         for name, value in made.items():
             self.write(record, name, value)
         lists = (value if isinstance(value, list) else [value] for value in made.values())

@@ -153,6 +153,7 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
 
 def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     """The view of a `frame` of a file in `folder`, whose `shared` entries hold for all frames."""
+    from ddrecon.io.images.films import FILMS
     from ddrecon.io.images.table import READERS  # here, as it loads numpy
 
     own = frame.entries()
@@ -168,7 +169,10 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     if image is not None and image.suffix.lower() not in READERS:
         image = image.with_name(f"{image.name}.png")
     number = read_as(own["frame"], int, folder) if "frame" in own else 0
-    return ViewSection(camera=camera, image=image, mask=mask, frame=number)
+    # Of pictures, others call a time what lies between 0 and 1.
+    is_film = image is not None and image.suffix.lower() in FILMS
+    time = read_as(own["time"], float, folder) if is_film and "time" in own else 0.0
+    return ViewSection(camera=camera, image=image, mask=mask, frame=number, time=time)
 
 
 def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
@@ -268,7 +272,7 @@ def export_transforms(
             for key, file in files.items()
             if file is not None
         }
-        frames.append(names | {"frame": section.frame} | _camera(view))
+        frames.append(names | {"frame": section.frame, "time": section.time} | _camera(view))
         for name in LISTS[1:] if view.is_test else LISTS[:1]:
             splits[name] += [names["file_path"]] if "file_path" in names else []
     models = {frame["camera_model"] for frame in frames}

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,19 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
     text = transforms(tmp_path / "transforms.json", *frames, **shared)
     (line,) = refusal(text, kind=FormatError)
     assert line.startswith(f"transforms.json: {problem}")
+
+
+def test_a_film_begins_at_its_time(read: Read, tmp_path: Path) -> None:
+    """What others call a time, of pictures, is none; it comes back when views are exported."""
+    timed = frame("a.mp4", time=0.5), frame("b.png", time=0.5)
+    seen = views(read(transforms(tmp_path / "t.json", *timed, **NERFSTUDIO)))
+    assert [view.time for view in seen] == [0.5, 0.0]
+    empty = read(transforms(tmp_path / "t.json", frame(None), frame(None), **NERFSTUDIO))
+    scene = load_scene(tmp_path / "scene.yaml", dtype=torch.float64)
+    whole = replace(empty, tree=replace(empty.tree, views=seen))
+    export_transforms(scene, whole, tmp_path / "again.json", may_exist=False)
+    first = json.loads((tmp_path / "again.json").read_text())["frames"][0]
+    assert (first["time"], first["file_path"]) == (0.5, "a.mp4")
 
 
 def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
