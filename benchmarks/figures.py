@@ -17,6 +17,7 @@ import datetime
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,7 @@ COMMANDS = {
     "solvers": "python benchmarks/solver.py",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
+    "gpu": "python benchmarks/gpu.py",
     "scale": "python benchmarks/scaling.py",
     "speed": "ddrecon bench --quick",
     "hard": "ddrecon bench --hard",
@@ -188,6 +190,7 @@ def main() -> None:
     given = parser.parse_args()
     references = given.references.resolve()
     absent = [name for name in COPIED if not (references / name).exists()]
+    absent += [] if shutil.which("nvidia-smi") else ["gpu"]
     chosen = given.names or [name for name in COMMANDS if name not in absent]
     for name in [] if given.write else chosen:
         print(name, flush=True)

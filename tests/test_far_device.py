@@ -1,4 +1,4 @@
-"""What ddrecon does on a device of its own: all that CUDA would refuse, but no GPU is needed."""
+"""What ddrecon does on a device of its own, which refuses what CUDA would, and on a GPU if any."""
 
 import contextlib
 from collections.abc import Callable
@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 import torch
-from far_device import FAR, Far, near_kernels
+from far_device import FAR, near_kernels
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorDeviceMismatchError, FakeTensorMode
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import use_engine
+from ddrecon.engine import ENGINES, use_engine
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.log import Result
@@ -24,6 +24,7 @@ from ddrecon.variables.values import value_of, variable_names
 
 pytestmark = pytest.mark.usefixtures("shapes_by_python", "few_directions")
 CONFIGS = Path(__file__).parents[1] / "configs"
+DEVICES = [FAR, *map(torch.device, ["cuda"] * torch.cuda.is_available())]
 # Of one camera and one lamp, what capture.yaml seeks of each.
 CAPTURE = (
     "optimize.parameters={density: {init: 0, min: 0, support: auto, support_margin: 4},"
@@ -114,16 +115,27 @@ def run(device: torch.device) -> Result:
     return optimize(scene_at_level(replace(scene, views=few), 16), 2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["torch", "warp"])
-def test_iterations_there_find_what_they_find_on_the_processor(engine: str) -> None:
-    if engine == "warp":
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    if request.param == "warp":
         pytest.importorskip("warp")
-    use_engine(engine)
-    with near_kernels() if engine == "warp" else contextlib.nullcontext():
-        there = run(FAR)
+    use_engine(request.param)
+    return request.param
+
+
+def kernels_for(device: torch.device, engine: str) -> contextlib.AbstractContextManager[None]:
+    return near_kernels() if device == FAR and engine == "warp" else contextlib.nullcontext()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", DEVICES, ids=str)
+def test_iterations_there_find_what_they_find_on_the_processor(
+    device: torch.device, engine: str
+) -> None:
+    with kernels_for(device, engine):
+        there = run(device)
     here = run(torch.device("cpu"))
-    assert isinstance(there.scene.volume.density, Far)
+    assert there.scene.volume.density.device.type == device.type
     for one, other in zip(there.rows, here.rows, strict=True):
         assert one.loss == pytest.approx(other.loss, rel=1e-4)
         assert one.test_psnr == pytest.approx(other.test_psnr, abs=1e-2)
@@ -133,25 +145,31 @@ def mean_square(_: View, image: Tensor) -> Tensor:
     return image.square().mean()
 
 
+ALL, CLOUD = "gradcheck_all", "kinds/measured_phase"
+SMALL = ["volume.resolution=[3, 4, 3]", "volume.density=0.5"]
 EVERY_KIND = ["lights.2.directions=2", "diffusion.transport_rounds=1", "diffusion.degree=1"]
 GROUND = ["diffusion.transport_rounds=0", "optimize.parameters={density: {}, ground.albedo: {}}"]
 GROUND += ["lights=[{type: directional, direction: [-1, -2, -1], irradiance: 3}]"]
+CASES = {
+    "every kind": (ALL, EVERY_KIND),
+    "ground": (ALL, GROUND),
+    "phase by a table": (CLOUD, ["optimize={parameters: {density: {}}}"]),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["torch", "warp"])
-@pytest.mark.parametrize("overrides", [EVERY_KIND, GROUND], ids=["every kind", "ground"])
-def test_every_kind_of_derivative_is_found_there(overrides: list[str], engine: str) -> None:
-    if engine == "warp":
-        pytest.importorskip("warp")
-    use_engine(engine)
+@pytest.mark.parametrize("device", DEVICES, ids=str)
+@pytest.mark.parametrize("name", CASES)
+def test_every_kind_of_derivative_is_found_there(
+    name: str, device: torch.device, engine: str
+) -> None:
+    config, overrides = CASES[name]
     found = []
-    for device in (FAR, torch.device("cpu")):
-        is_near = engine == "torch" or device != FAR
-        with contextlib.nullcontext() if is_near else near_kernels():
-            small = ["volume.resolution=[3, 4, 3]", "volume.density=0.5", *overrides]
-            kind = {"dtype": torch.float64, "device": device}
-            scene = load_scene(CONFIGS / "gradcheck_all.yaml", overrides=small, **kind)
+    for place in (device, torch.device("cpu")):
+        with kernels_for(place, engine):
+            kind = {"dtype": torch.float64, "device": place}
+            path = CONFIGS / f"{config}.yaml"
+            scene = load_scene(path, overrides=[*SMALL, *overrides], **kind)
             scene = scene if overrides is GROUND else replace(scene, ground=None)
             names = scene.optimize.parameters.keys() & set(variable_names(scene))
             values = {name: value_of(scene, name).requires_grad_() for name in names}

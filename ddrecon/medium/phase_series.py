@@ -61,7 +61,7 @@ class Tabulated(PhaseFunction):
     def _integrals(self, count: int) -> Tensor:
         """Half the integrals over the cosine of the curve times P_l, [C, count]."""
         angles, weights = _quadrature(count)
-        curve = look_up(with_slopes(self.values), angles)[..., 0]
+        curve = look_up(with_slopes(self.values), angles.to(self.values.device))[..., 0]
         return curve @ weights.to(curve)
 
 
