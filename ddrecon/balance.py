@@ -69,7 +69,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
     box = _Box(
-        (medium, refine_medium(keep_medium(scene.volume), settings.times)),
+        (medium, refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)),
         DIRECTIONS[settings.angles],
         lit,
     )

@@ -79,9 +79,12 @@ class Grid:
             coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
         return coordinates
 
-    def refine(self, times: int) -> Grid:
-        """The same box with so many times as many cells, but along axes of a single one."""
-        z, y, x = (cells if cells == 1 else times * cells for cells in self.shape)
+    def refine(self, times: int, along: str = "xyz") -> Grid:
+        """The same box with so many times as many cells `along` axes that have more than one."""
+        z, y, x = (
+            times * cells if cells > 1 and axis in along else cells
+            for axis, cells in zip("zyx", self.shape, strict=True)
+        )
         return replace(self, shape=(z, y, x))
 
     def coarsen(self, factor: float) -> Grid:

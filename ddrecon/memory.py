@@ -12,6 +12,7 @@ import torch
 
 from ddrecon.diffusion.rounds.fused.directions import piece_numbers
 from ddrecon.engine import current_engine
+from ddrecon.grid import Grid
 from ddrecon.kernels import spare
 from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
@@ -37,7 +38,7 @@ class Needs:
     `resolution` (x, y, z), `colors` (1 or 3), `size`: bytes of a number, `pixels` of all views.
     `moments` is how many of light rounds keep. `varied` is how many fields are optimized, each
     color counted; None where nothing is. `threads` are those of fused kernels (`count_threads`).
-    Light is computed in cells so many `times` as narrow.
+    Light is computed in cells so many `times` as narrow `along` axes.
     """
 
     resolution: tuple[int, int, int]
@@ -52,12 +53,13 @@ class Needs:
     lights: int = 1
     threads: int = 1
     times: int = 1
+    along: str = "xyz"
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Cells along z, y and x, `times` as narrow as those of the scene."""
-        x, y, z = (count if count == 1 else self.times * count for count in self.resolution)
-        return z, y, x
+        grid = Grid.from_xyz(self.resolution, (0.0,) * 3, (1.0,) * 3)
+        return grid.refine(self.times, self.along).shape
 
     @property
     def cells(self) -> int:

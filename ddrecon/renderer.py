@@ -216,7 +216,7 @@ def _find_light(
     below: Moments | None = None,
 ) -> LightField:
     """The light of `lights` in `volume`, and of what comes from `below` on a grid of the box."""
-    medium = refine_medium(_medium_of(volume, settings), settings.times)
+    medium = refine_medium(_medium_of(volume, settings), settings.times, settings.refine_along)
     if below is not None:
         below = below.mapped(lambda field: resample(field, medium.grid))
     if medium.index != 1:

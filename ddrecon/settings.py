@@ -84,7 +84,8 @@ class DiffusionSettings:
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
     P1 towards transport, and keep angles to `degree`; with a `transport_tolerance` they end where
     one changes light by less of it (docs/theory.md, section 7). Light is computed and seen in cells
-    a `refine`th as wide. A scene file that leaves these out gets what its medium deserves.
+    a `refine`th as wide along the axes `refine_along`. A scene file that leaves these out gets what
+    its medium deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -104,6 +105,7 @@ class DiffusionSettings:
     transport_tolerance: float | None = bounded(None, above=0, below=1)
     degree: int | None = one_of(None, (1, 3, 5, 7))
     refine: int | None = one_of(None, (1, 3, 9), expert=True)
+    refine_along: str = one_of("xyz", ("x", "y", "z", "xy", "xz", "yz", "xyz"), expert=True)
 
     @property
     def angles(self) -> int:

@@ -133,8 +133,10 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
             rounds += f"; each leaves up to {left:.2g} of what diffusion lacks"
         terms.append(rounds)
         if settings.times > 1:
-            cells = " x ".join(map(str, reversed(scene.volume.grid.refine(settings.times).shape)))
-            terms.append(f"light in {cells} cells, {settings.times} times as narrow")
+            finer = scene.volume.grid.refine(settings.times, settings.refine_along)
+            cells = " x ".join(map(str, reversed(finer.shape)))
+            along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
+            terms.append(f"light in {cells} cells, {settings.times} times as narrow{along}")
         if scene.reason:
             terms.append(f"by default {scene.reason}")
         if _has_pairs(medium, scene):

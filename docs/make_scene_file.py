@@ -444,6 +444,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "where a face of the box is dense), or 9 where a third of it is, if there are no "
                 "more than 1,048,576 cells then and density is not optimized; else 1."
             ),
+            "refine_along": (
+                "The axes along which cells are divided. Where `refine` is left out and all would "
+                "be too many, those along which nothing varies and the box is eight times as long "
+                "as along another are left out, up to 3,145,728 cells and colors."
+            ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; "
                 "of a single round 18 for 1, 26 for 3. Left out, it is 3, or 1 where g is not "

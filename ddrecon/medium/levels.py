@@ -11,7 +11,7 @@ from torch.nn.functional import adaptive_avg_pool3d, interpolate
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, Volume, put_volume
 from ddrecon.medium.mixture import mix_media
-from ddrecon.numerics.periods import unroll
+from ddrecon.numerics.periods import Unrolled, unroll
 
 
 def volume_at_level(volume: Volume, grid: Grid) -> Volume:
@@ -27,15 +27,17 @@ def volume_at_level(volume: Volume, grid: Grid) -> Volume:
     return put_volume(volume, grid, partial(resample, grid=grid))
 
 
-def refine_medium(medium: Medium, times: int) -> Medium:
-    """`medium` in cells an odd number of `times` as narrow.
+def refine_medium(medium: Medium, times: int, along: str = "xyz") -> Medium:
+    """`medium` in cells an odd number of `times` as narrow `along` axes.
 
     It is the same between all its centers, which are centers there as well.
     """
     if times == 1:
         return medium
-    finer, period = medium.grid.refine(times), unroll(medium.grid, 1)
-    wide, around = period.wide.refine(times), unroll(finer, times)
+    finer, period = medium.grid.refine(times, along), unroll(medium.grid, 1)
+    wide = period.wide.refine(times, along)
+    more = tuple((n - own) // 2 for n, own in zip(wide.shape, finer.shape, strict=True))
+    around = Unrolled(finer, more, more)
     return medium.put(finer, lambda field: around.crop(resample(period.extend(field), wide)))
 
 

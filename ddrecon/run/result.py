@@ -46,6 +46,7 @@ def describe_result(
         "transport_rounds": scene.diffusion.transport_rounds,
         "degree": scene.diffusion.degree,
         "refine": scene.diffusion.refine,
+        "refine_along": scene.diffusion.refine_along,
     }
     described["diffusion"] |= {key: value for key, value in chosen.items() if value is not None}
     described["render"]["steps_per_voxel"] = scene.render.steps

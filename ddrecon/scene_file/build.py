@@ -67,10 +67,12 @@ THICK = 4.0
 """With degree 5 there is a round more, and two where a cell has more optical depths: theta of E7.2
 is less than 1 then. Measured on half-spaces and slabs (docs/accuracy.md).
 """
-FINER, FINER_FLAT, MOST_CELLS = 1.5, 0.75, 2**20
+FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
 """Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
 in a flat medium has more than the second, and there are no more cells then. Measured on blocks,
-half-spaces and merged balls (docs/accuracy.md).
+half-spaces and merged balls (docs/accuracy.md). Where there were more, cells stay as wide as they
+are along axes along which nothing varies and the box is so many times as long as along another;
+gray light may have as many then as three colors have numbers.
 """
 SOFT = 3.0
 """Where no face is dense and a cell has more optical depths, one round: later ones darken soft
@@ -122,8 +124,9 @@ def build_scene(
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     depth = sum(map(greatest_depth, media.values()))
-    is_flat = _is_flat(media.values())
-    diffusion, _ = choose_diffusion(tree, _phase_of(media), grid, depth, is_flat)
+    is_flat, colors = _is_flat(media.values()), _count_colors(media)
+    chosen_by = grid, depth, is_flat, colors, _axes_that_vary(media.values())
+    diffusion, _ = choose_diffusion(tree, _phase_of(media), *chosen_by)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -132,7 +135,7 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, reason = choose_diffusion(tree, volume.phase, grid, depth, is_flat)
+    diffusion, reason = choose_diffusion(tree, volume.phase, *chosen_by)
     render = tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume, diffusion.times))
@@ -300,9 +303,7 @@ def needs_of_scene(
     """
     phase, parameters = _phase_of(media), optimize.parameters if optimize else {}
     first = next(iter(media.values()))
-    glows = [first.emission, first.black_body]
-    colors = max(phase.colors, *(len(medium.sigma_a) for medium in media.values()))
-    colors = max(colors, *(len(one) for one in glows if one is not None), 1)
+    colors = _count_colors(media)
     is_directed = "g" in parameters or bool((phase.moments(3)[:, 1:] != 0).any())
     varied = [_varied(name, one, media, colors) for name, one in parameters.items()]
     z, y, x = first.grid.shape
@@ -319,7 +320,14 @@ def needs_of_scene(
         lights=len(lights),
         threads=count_threads(first.density.device),
         times=diffusion.times,
+        along=diffusion.refine_along,
     )
+
+
+def _count_colors(media: Mapping[str, Volume]) -> int:
+    first = next(iter(media.values()))
+    glows = [len(one) for one in (first.emission, first.black_body) if one is not None]
+    return max(_phase_of(media).colors, *(len(one.sigma_a) for one in media.values()), *glows)
 
 
 def _varied(
@@ -343,13 +351,20 @@ def _varied(
 
 
 def choose_diffusion(
-    tree: SceneTree, phase: PhaseFunction, grid: Grid, depth: float, is_flat: bool
+    tree: SceneTree,
+    phase: PhaseFunction,
+    grid: Grid,
+    depth: float,
+    is_flat: bool,
+    colors: int,
+    varies: str,
 ) -> tuple[DiffusionSettings, str]:
     """The diffusion settings of `tree`, where it leaves any out as a medium deserves; and why.
 
     By its `phase` function: one that is optimized may become any, and starts as one of strong peaks
     does. If its density is not optimized, also by the `depth` of its thickest cell on `grid`, and
-    whether it goes up to a face of the box, `is_flat`.
+    whether it goes up to a face of the box, `is_flat`. Cells of so many `colors` are divided along
+    all axes if there are not too many then, else along those of which it `varies` along any.
     """
     settings = tree.diffusion
     if not settings.rounds:
@@ -363,9 +378,12 @@ def choose_diffusion(
         depth, is_flat = 0.0, False
     times = 1 if settings.refine is None else settings.refine
     thin = FINER_FLAT if is_flat else FINER
+    along, most = settings.refine_along, MOST_CELLS
+    if along != varies and along == "xyz" and grid.refine(3).cells > most:
+        along, most = varies, 3 * MOST_CELLS // colors
     may_refine = settings.refine is None and not cells_are_shared()
     while may_refine and times < 9 and depth / times > thin:
-        if grid.refine(3 * times).cells > MOST_CELLS:
+        if grid.refine(3 * times, along).cells > most:
             break
         times *= 3
     if depth > thin:
@@ -390,12 +408,37 @@ def choose_diffusion(
     left_out: dict[str, Any] = {
         key: value for key, value in chosen.items() if getattr(settings, key) is None
     }
+    if settings.refine is None and times > 1 and along != settings.refine_along:
+        reasons.append("too many cells to divide all")
+        left_out["refine_along"] = along
     words = ", ".join(f"{key} {value}" for key, value in left_out.items())
     return replace(settings, **left_out), f"{words}: {', '.join(reasons)}" if words else ""
 
 
 def _turns_back(phase: PhaseFunction) -> bool:
     return float(phase.backward_tail(3, 1).max()) > BACKWARD
+
+
+def _axes_that_vary(media: Iterable[Volume]) -> str:
+    """The axes but those along which `media` are even in a box that is long: light hardly varies
+    along these.
+    """
+    fields, axes = list[Tensor](), ""
+    for one in media:
+        each = one.density, one.sigma_a, one.sigma_s, one.emission, one.black_body, one.phase.cells
+        fields += [field for field in each if field is not None and field.ndim > 2]
+        extent = one.grid.extent
+    for axis in range(3):
+        is_long = extent[axis] > LONG * min(extent)
+        if not is_long or any(_varies(field, axis) for field in fields):
+            axes = "zyx"[axis] + axes
+    return axes
+
+
+def _varies(field: Tensor, axis: int) -> bool:
+    if not field.stride(axis - 3):
+        return False
+    return not bool((field == field.narrow(axis - 3, 0, 1)).all())
 
 
 def _is_flat(media: Iterable[Volume]) -> bool:

@@ -62,20 +62,21 @@ def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings
     if not bool((volume.sigma_s > 0).any()):
         return []
     medium = scale_medium(volume, settings.angles)
+    finer = volume.grid.refine(settings.times, settings.refine_along)
     lost = medium.extinction.value
     lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
     thickest, whole = (
         max(
-            float(field.select(axis - 3, end).max()) * size / settings.times
-            for axis, size in enumerate(volume.grid.spacing)
+            float(field.select(axis - 3, end).max()) * size
+            for axis, size in enumerate(finer.spacing)
             for end in (0, -1)
         )
         for field in (lost, extinction * volume.density)
     )
     if thickest <= THICK_FACES:
         return []
-    finer, g = thickest / THICK_FACES, float(medium.g.max())
-    advice = f"take cells {finer:.1f} times smaller, and leave a layer of empty ones"
+    times, g = thickest / THICK_FACES, float(medium.g.max())
+    advice = f"take cells {times:.1f} times smaller, and leave a layer of empty ones"
     if g >= FORWARD:
         advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
     return [

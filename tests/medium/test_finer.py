@@ -17,12 +17,12 @@ SHAPE = 4, 1, 5
 GRID = Grid(SHAPE, (-0.4, -0.3, -0.5), (0.4, 0.3, 0.5))
 
 
-@pytest.mark.parametrize("times", [3, 9])
-def test_a_finer_medium_has_the_same_values_everywhere(times: int):
+@pytest.mark.parametrize(("times", "along"), [(3, "xyz"), (9, "xyz"), (3, "xy")])
+def test_a_finer_medium_has_the_same_values_everywhere(times: int, along: str):
     scene = make_scene(random_values(*SHAPE), sigma_s=random_values(3, *SHAPE, seed=1), grid=GRID)
     medium = scale_medium(scene.volume)
-    finer = refine_medium(medium, times)
-    assert finer.grid.shape == (4 * times, 1, 5 * times)
+    finer = refine_medium(medium, times, along)
+    assert finer.grid.shape == (4 * times if "z" in along else 4, 1, 5 * times)
     points = 2 * random_values(1, 500, 3, seed=2) - 1
 
     def seen(coefficient: Coefficient) -> torch.Tensor:
@@ -37,7 +37,7 @@ def test_a_finer_medium_that_repeats_has_no_seam():
     grid = replace(GRID, periodic=(2,))
     scene = make_scene(random_values(*SHAPE), grid=grid)
     turned = make_scene(scene.volume.density.roll(2, 2), grid=grid)
-    one, other = (refine_medium(scale_medium(each.volume), 3) for each in (scene, turned))
+    one, other = (refine_medium(scale_medium(each.volume), 3, "x") for each in (scene, turned))
     torch.testing.assert_close(other.extinction.field, one.extinction.field.roll(6, 3))
 
 

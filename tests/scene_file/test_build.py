@@ -13,6 +13,7 @@ from example_scene import SCENE, changed
 
 from ddrecon.errors import SceneError
 from ddrecon.io.volumes.table import write_field, write_fields
+from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
 
 Write = Callable[[str], Path]
@@ -80,6 +81,15 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
     assert glowing.rounds == (1 if expected[0] == 1 and depth > 1 else max(expected[0], 2))
     fixed = load_scene(write(text), overrides=("diffusion.refine=1",))
     assert fixed.diffusion.times == 1 and "refine" not in fixed.reason
+
+
+def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(build, "MOST_CELLS", 300)
+    bounds = {"min": [0, 0, 0], "max": [9, 1, 9]}
+    scene = load_scene(write(volume(bounds=bounds, resolution=[9, 3, 3], density=50)))
+    assert "refine 3, refine_along y: " in scene.reason
 
 
 def test_every_tensor_has_the_type_asked_for(write: Write):

@@ -21,6 +21,7 @@ from ddrecon.diffusion.operator import AXES
 from ddrecon.diffusion.rounds.characteristics import Course, Direction, Ends, radiance_along
 from ddrecon.diffusion.rounds.mirror import Mirror
 from ddrecon.engine import has_kernels
+from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
@@ -28,9 +29,10 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.slicing import NEARLY
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.slabs.exchange import add_halo, swap_layers
-from ddrecon.slabs.slab import Slab
+from ddrecon.slabs.slab import Slab, whole_of
 
 DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
 """By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
@@ -54,9 +56,8 @@ def sweep(
     """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
 
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `gradient` [3, C, z, y, x]:
-    of the first, as of `cell_gradient`; `inflow`: light from
-    outside, as of `radiance_along`; `directions`: how many (`count_directions`); `mirror`: what
-    faces reflect, None for nothing.
+    of the first, as of `steep_gradient`; `inflow`: light from outside, as of `radiance_along`;
+    `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
     courses, weights, values = sweep_rule(directions, count)
@@ -139,7 +140,7 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = apply_around(cell_gradient, light.mean + source.mean, medium.grid)
+    gradient = steep_gradient(medium, light.mean + source.mean, directions)
     where = light.mean.is_cuda, isinstance(medium.grid, Slab)
     is_apart = mirror is None and not medium.grid.periodic
     if is_apart and is_fused() and has_kernels("transport rounds", *where):
@@ -163,6 +164,49 @@ def sweep_change(
 def _without(light: Tensor, inflow: Tensor | None) -> Tensor:
     """`light` [K, C, z, y, x] less what enters without a medium."""
     return light if inflow is None else torch.cat([light[:1] - inflow, light[1:]])
+
+
+def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
+    """`cell_gradient` of `q` in `medium`, steeper by what makes smooth light diffuse as it should,
+    though it goes on to several cells (E2.16).
+    """
+    gradient = apply_around(cell_gradient, q, medium.grid)
+    shares, steps = _spread(whole_of(medium.grid), directions)
+    extinction = medium.extinction
+    if not any(shares):
+        return gradient
+    if is_fused():
+        from ddrecon.kernels.cell_function import apply_cell
+
+        scale = extinction.scale.view(1, -1)
+        depths = scale.new_tensor(steps)[:, None] * scale
+        numbers = torch.cat([depths, (2 * scale.new_tensor(shares)[:, None]).expand_as(depths)])
+        name = "diffusion/rounds/fused/steep.h", "Steep", 3
+        return torch.stack(apply_cell(*name, numbers, extinction.field, *gradient))
+
+    def steepen() -> Tensor:
+        depths = (step * extinction.value for step in steps)
+        return torch.stack(
+            [
+                along * (1 + 2 * share * d * (36 + d * d).sqrt() / (d * d + 0.01))
+                for along, share, d in zip(gradient, shares, depths, strict=True)
+            ]
+        )
+
+    return recompute(steepen)
+
+
+@functools.cache
+def _spread(grid: Grid, directions: int) -> tuple[list[float], list[float]]:
+    """x and s of E2.16, by axis."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
+    speed = (points / points.new_tensor(grid.spacing)).abs()
+    step = 1 / speed.amax(1)
+    part = step[:, None] * speed
+    over = weights / step @ (part * (1 - part) * points.new_tensor(grid.spacing) ** 2)
+    first, second = (weights * power @ points**2 for power in (step, step**2))
+    share = 0.5 * over / first
+    return torch.where(share > NEARLY, share, 0.0).tolist(), (second / first).tolist()
 
 
 def cell_gradient(q: Tensor) -> Tensor:

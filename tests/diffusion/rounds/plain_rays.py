@@ -1,6 +1,7 @@
 """Slow twins of a sweep and of a transport round: loops over directions, slices and cells."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -50,11 +51,17 @@ def rise_at(q: Tensor, cell: Cell, moved: list[float]) -> float:
 
 
 def by_cells(
-    medium: Medium, scatters: Tensor, even: Tensor, direction: Direction, inflow: float = 0.0
+    medium: Medium,
+    scatters: Tensor,
+    even: Tensor,
+    direction: Direction,
+    inflow: float = 0.0,
+    steep: Sequence[Tensor] = (),
 ) -> Tensor:
     """Means of I [z, y, x] of a gray medium, cell after cell (E2.9); `even` has the slope of q.
 
-    With what is emitted at the part s of a way, and I there, integrated by Gauss's rule.
+    It is `steep` times as much by axis, if given. With what is emitted at the part s of a way, and
+    I there, integrated by Gauss's rule.
     """
     extinction, scattering = medium.extinction.value[0], medium.remaining_scattering[0]
     axis, step = fastest_axis(medium.grid, direction)
@@ -64,7 +71,8 @@ def by_cells(
         product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * moved[axis]
     ):
         depth, strength = step * float(extinction[cell]), step * float(scattering[cell])
-        emitted = strength * (float(scatters[cell]) + rise_at(even, cell, moved) * (NODES - 0.5))
+        ways = [m * float(s[cell]) for m, s in zip(moved, steep, strict=True)] if steep else moved
+        emitted = strength * (float(scatters[cell]) + rise_at(even, cell, ways) * (NODES - 0.5))
         before, left = arriving(leaving, cell, moved, inflow), 1 - NODES
         # what is emitted at s is exp(-depth (t - s)) of it at t: at the end, and on average
         leaving[cell] = before * math.exp(-depth) + WEIGHTS @ (emitted * np.exp(-depth * left))
@@ -84,15 +92,30 @@ def quadrature(directions: int) -> list[tuple[Direction, float]]:
     return list(zip(map(tuple, points.tolist()), weights.tolist(), strict=True))
 
 
+def steepness(medium: Medium, directions: int) -> list[Tensor]:
+    """1 + 2 x d sqrt(36 + d^2) / (d^2 + 0.01) of E2.16, by axis [z, y, x]."""
+    over, first, second = np.zeros(3), np.zeros(3), np.zeros(3)
+    for w, weight in quadrature(directions):
+        step, h = fastest_axis(medium.grid, w)[1], np.array(medium.grid.spacing)
+        t = step * np.abs(w) / h
+        over += weight * t * (1 - t) * h**2 / step
+        first += weight * step * np.square(w)
+        second += weight * step**2 * np.square(w)
+    depths = (medium.extinction.value[0] * s for s in second / first)
+    each = zip(over / first, depths, strict=True)
+    return [1 + x * d * (36 + d**2).sqrt() / (d**2 + 0.01) for x, d in each]
+
+
 def sweep_by_loops(
     medium: Medium, source: Tensor, even: Tensor, inflow: float, directions: int
 ) -> Tensor:
     """The means of I Y_k [K, 1, z, y, x] (E2.8), gray, one direction after another."""
-    total = torch.zeros_like(source)
+    total, steep = torch.zeros_like(source), steepness(medium, directions)
     degree = math.isqrt(len(source)) - 1
     for w, weight in quadrature(directions):
         values = harmonics(torch.tensor(w, dtype=torch.float64), degree).view(-1, 1, 1, 1, 1)
-        total += weight * values * by_cells(medium, (values * source).sum(0)[0], even, w, inflow)
+        scatters = (values * source).sum(0)[0]
+        total += weight * values * by_cells(medium, scatters, even, w, inflow, steep)
     return total
 
 

@@ -14,7 +14,7 @@ from plain_rays import (
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
+from ddrecon.diffusion.rounds.sweep import steep_gradient, sweep
 from ddrecon.diffusion.rounds.transport import _mean_step, _transport_share, run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.moments import Moments
@@ -49,7 +49,7 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
     medium = gray_medium(shape, 0.4 * has_flux, varies)
     source = random_light(shape, degree).harmonics(degree)
     inflow = torch.full((1, 1, 1, 1), 0.3, dtype=torch.float64)
-    swept = sweep(medium, source, cell_gradient(source[0]), inflow, 26)
+    swept = sweep(medium, source, steep_gradient(medium, source[0], 26), inflow, 26)
     expected = sweep_by_loops(medium, source, source[0, 0], 0.3, 26)
     torch.testing.assert_close(swept, expected, rtol=1e-11, atol=1e-13)
 

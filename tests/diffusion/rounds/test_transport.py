@@ -15,7 +15,7 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import cell_gradient, sweep
+from ddrecon.diffusion.rounds.sweep import steep_gradient, sweep
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.engine import use_engine
@@ -51,7 +51,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
     light = last + source.mean
-    swept = sweep(medium, light[None], cell_gradient(light), None, 44)[0]
+    swept = sweep(medium, light[None], steep_gradient(medium, light, 44), None, 44)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
@@ -237,7 +237,8 @@ def test_memory_does_not_grow_with_directions():
         medium, source = scale_medium(scene.volume), torch.ones(1, 3, 10, 10, 10).double()
         found = []
         with saved_tensors_hooks(lambda one: found.append(one.detach()) or one, lambda one: one):
-            total = sweep(medium, source, cell_gradient(source[0]), None, directions).sum()
+            gradient = steep_gradient(medium, source[0], 26)
+            total = sweep(medium, source, gradient, None, directions).sum()
         assert total.requires_grad
         return len({one.data_ptr() for one in found if one.numel() >= 1000})
 
