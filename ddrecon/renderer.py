@@ -78,7 +78,8 @@ class LightField:
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
     camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `received` is
     what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells, else values at
-    centers. `ground` is what lies below, where there is any.
+    centers. `ground` is what lies below, where there is any. `reflected` is what of `diffuse` are
+    beams that faces have reflected (E5.8): no camera looks along these.
     """
 
     medium: Medium
@@ -89,6 +90,7 @@ class LightField:
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
+    reflected: Moments | None = None
 
     def unrolled(self) -> tuple[Unrolled, LightField]:
         """What view rays meet on their way through one period of the medium."""
@@ -219,11 +221,12 @@ def _find_light(
     medium = refine_medium(_medium_of(volume, settings), settings.times, settings.refine_along)
     if below is not None:
         below = below.mapped(lambda field: resample(field, medium.grid))
+    reflected = None
     if medium.index != 1:
         # With what faces reflect inside of light that is not yet scattered (E5.8).
-        below = reflected_light(average_cells(medium), lights, medium.degree)
+        below = reflected = reflected_light(average_cells(medium), lights, medium.degree)
     if not multiply_scatters(medium, settings):
-        return follow_unscattered_light(medium, lights, below)
+        return replace(follow_unscattered_light(medium, lights, below), reflected=reflected)
     # The paper's own scheme knows values at centers only.
     cells = medium if settings.scheme == "printed" else average_cells(medium)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
@@ -240,7 +243,9 @@ def _find_light(
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
     beams, has_means = follow_lights(medium, lights), settings.rounds > 0
-    return LightField(medium, beams, light, received, has_means, turned=received.turned)
+    return LightField(
+        medium, beams, light, received, has_means, turned=received.turned, reflected=reflected
+    )
 
 
 def follow_unscattered_light(
@@ -445,13 +450,16 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
+        at_faces = light_field.diffuse
+        if light_field.reflected is not None:
+            at_faces = at_faces.plus(light_field.reflected.scaled(-1, -1, -1))
         beside = look_behind(rays, given)
         radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
         for window in windows:
             behind = None if given is None else given[:, window.numbers]
             behind = look_behind(Rays(window.points, window.outside, None), behind)
             emission = _emission(light_field, window.sight.rays)
-            seen = see_through(window, emission, light_field.diffuse, medium, behind, scene.render)
+            seen = see_through(window, emission, at_faces, medium, behind, scene.render)
             colors = max(len(radiance), len(seen))
             radiance = radiance.expand(colors, len(rays.direction))
             radiance = radiance.index_copy(1, window.numbers, seen.expand(colors, -1))

@@ -431,8 +431,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "it is 1; 2 where g is above 0.55 in size, or optimized; 3 where it is above 0.77; "
                 "0 without model `p1` or scheme `conservative`. Degree 5 adds one, or two in "
                 "cells thicker than 4 optical depths. With lower degrees it is 1 in cells thicker "
-                "than 3, and else at least 2 where the volume emits light. Cells count as "
-                "`refine` leaves them."
+                "than 3, and else at least 2 where the volume emits light; 4 within faces "
+                "that reflect light (`volume.index`). Cells count as `refine` leaves them."
             ),
             "transport_tolerance": (
                 "Rounds end where one changes light by less of it, at most `transport_rounds` of "

@@ -25,14 +25,13 @@ from ddrecon.variables.values import value_of, with_values
 BEAM = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]
 
 
-def within(index: float, density: Tensor, **changes: Any) -> Scene:
-    """A scene of `make_scene` in a box of that `index`."""
-    scene = make_scene(density, **changes)
+def with_index(scene: Scene, index: float) -> Scene:
     return replace(scene, volume=replace(scene.volume, index=index))
 
 
-def within_one(scene: Scene) -> Scene:
-    return replace(scene, volume=replace(scene.volume, index=1.0))
+def within(index: float, density: Tensor, **changes: Any) -> Scene:
+    """A scene of `make_scene` in a box of that `index`."""
+    return with_index(make_scene(density, **changes), index)
 
 
 @pytest.mark.parametrize("n", [1.1, 1.4, 2.0])
@@ -78,9 +77,13 @@ def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any])
     scene = within(1.4, random_values(5, 4, 6), camera=camera, **medium, **changes)
     expected = torch.full((1, 5, 4, 6), 4 * math.pi * 0.7 * 1.4**2, dtype=torch.float64)
     torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
-    seen = ddrecon.render(scene)
-    passed = 1 - (0.4 / 2.4) ** 2
+    seen, passed = ddrecon.render(scene), 1 - (0.4 / 2.4) ** 2
     torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
+
+
+def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
+    empty, camera = 0 * random_values(4, 5, 6), make_camera((0.9, 1.3, 2.5))
+    assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
 
 
 @pytest.mark.parametrize("light", ["down", "slanted", "ambient", "beam"])
@@ -92,7 +95,7 @@ def test_no_power_is_lost_or_made(light: str) -> None:
     density = 0.5 + random_values(6, 7, 5)
     scene = within(1.4, density, **lights, **medium, transport_rounds=12)
     scene = replace(scene, lights=[BeamLight(*BEAM)]) if light == "beam" else scene
-    report, plain = (find_balance(one) for one in (scene, within_one(scene)))
+    report, plain = find_balance(scene), find_balance(with_index(scene, 1.0))
     assert abs(report["defect_percent"]) < abs(plain["defect_percent"]) + 0.5
     if light == "down":
         assert report["fractions"]["reflected"] == pytest.approx((0.4 / 2.4) ** 2)

@@ -246,7 +246,8 @@ def _build_ground(
         )
     for view in views:
         if float(view.camera.pose[2 - axis, 3]) <= section.height:
-            what = f"the camera of view {view.name!r} is not above it"
+            what = f"the camera of view {view.name!r} is not above it along {tree.volume.up}"
+            what += "; volume.up says which axis is up"
             raise scene_file.refused("ground.height", what)
     if isinstance(section.albedo, FieldFile):
         file = section.albedo.file
@@ -402,6 +403,10 @@ def choose_diffusion(
         # With fewer directions too much light goes exactly along the axes that repeat.
         reasons.append("a volume that repeats")
         rounds, degree = max(rounds, 2), 5
+    if getattr(tree.volume, "index", 1) != 1:
+        # What faces reflect comes back again and again.
+        reasons.append("faces that reflect light")
+        rounds = max(rounds, 4)
     if settings.transport_tolerance is not None:
         rounds = MOST_ROUNDS
     chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}

@@ -114,9 +114,9 @@ class _Medium:
         )
         density = self.values("density").to(device, dtype)[0].expand(grid.shape)
         emission = black_body = None
-        if getattr(self.section, "temperature", None) is not None:
+        if self.tree.glows and getattr(self.section, "temperature", None) is not None:
             black_body = black_body_radiance(self.values("temperature")[0]).to(device, dtype)
-        elif getattr(self.section, "emission", None) is not None:
+        elif self.tree.glows and getattr(self.section, "emission", None) is not None:
             emission = self.values("emission").to(device, dtype)
         elif self.tree.may_change(self.prefix + "emission"):
             emission = sigma_a.new_zeros(3)

@@ -24,6 +24,8 @@ FORWARD = 0.5
 """From this mean cosine on g may be traded for fewer scatterings."""
 SMALLEST = 2.0
 """A box of fewer pixels than this, along its diagonal, shows nothing."""
+UPRIGHT = 0.7
+"""A camera whose right is so much along the way up lies on its side."""
 UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
 
 
@@ -105,11 +107,15 @@ def _doubt_cameras(scene: Scene) -> list[str]:
 
 
 def _doubt_ground(scene: Scene) -> list[str]:
-    """Lights that a ground hides."""
+    """Lights that a ground hides, and cameras that lie on their side."""
     if scene.ground is None:
         return []
-    plane = scene.ground.plane
-    return [
+    plane, up = scene.ground.plane, 2 - scene.ground.plane.axis
+    tilted = [view.name for view in scene.views if abs(float(view.camera.pose[up, 0])) > UPRIGHT]
+    tilted = [
+        f"ground: volume.up is {'xyz'[up]}, and camera {it} lies on its side" for it in tilted
+    ]
+    return tilted[:1] + [
         f"lights.{index}: shines from below the ground at {plane.height:g}, and is not seen"
         for index, light in enumerate(scene.lights)
         if not isinstance(light, EnvironmentLight) and not stay_above([light], plane)

@@ -535,7 +535,7 @@ class SceneTree:
     def glows(self) -> bool:
         """Whether the volume emits light, or may come to."""
         given = (getattr(self.volume, name, None) for name in ("emission", "temperature"))
-        return any(one is not None for one in given) or self.may_change("emission")
+        return any(one not in (None, 0, (0, 0, 0)) for one in given) or self.may_change("emission")
 
     def violations(self) -> Iterator[Violation]:
         if not self.lights and not self.glows:
