@@ -145,13 +145,9 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     it begins with light that goes to and fro on a coarse grid (E5.4).
     """
     volume, sources, settings = cut_volume(scene.volume), scene_sources(scene), scene.diffusion
-    require_refracting(scene)
+    require_supported(scene)
     if scene.ground is None:
         return _find_light(volume, sources, settings, memory)
-    if isinstance(volume.grid, Slab):
-        raise UsageError(
-            "ground: there is none where processes share out cells; leave --share cells out"
-        )
     coarse = volume_at_level(volume, exchange_grid(volume.grid))
     as_given = replace(settings, refine=1)
     plane, render_settings = scene.ground.plane, scene.render
@@ -174,23 +170,24 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     return replace(light_field, ground=replace(lit, sent=sent))
 
 
-def require_refracting(scene: Scene) -> None:
-    """Raises UsageError for what is not computed where faces refract light, or cells are shared."""
-    settings, is_there = scene.diffusion, dict[str, bool]()
-    if settings.times > 1 and isinstance(own_slab(scene.volume.grid), Slab):
-        raise UsageError(
-            "diffusion.refine: cells are as they are where processes share them out; say refine: 1"
-        )
-    if scene.volume.index != 1:
-        is_there = {
-            "a ground": scene.ground is not None,
-            "point lights": any(isinstance(light, PointLight) for light in scene.lights),
-            "diffusion.scheme: printed": settings.scheme == "printed",
-            "diffusion.model: flux_limited": settings.model == "flux_limited",
-            "--share cells": isinstance(own_slab(scene.volume.grid), Slab),
-        }
-    if lacks := [what for what, is_so in is_there.items() if is_so]:
-        raise UsageError(f"volume.index: there is none with {lacks[0]}")
+def require_supported(scene: Scene) -> None:
+    """Raises UsageError for what is not computed where ranks share out cells, or faces refract.
+
+    Its line begins with the key.
+    """
+    settings, is_cut = scene.diffusion, isinstance(own_slab(scene.volume.grid), Slab)
+    neither = {
+        "ground": scene.ground is not None,
+        "diffusion.scheme: printed": settings.scheme == "printed",
+        "diffusion.model: flux_limited": settings.model == "flux_limited",
+    }
+    in_slabs = neither | {"diffusion.refine: above 1": settings.times > 1}
+    has_points = any(isinstance(light, PointLight) for light in scene.lights)
+    refracted = neither | {"point lights": has_points, "--share cells": is_cut}
+    for what in [name for name, is_so in in_slabs.items() if is_so and is_cut]:
+        raise UsageError(f"{what}: not where processes share out cells; leave --share cells out")
+    for what in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
+        raise UsageError(f"volume.index: there is none with {what}")
 
 
 def exchange_grid(grid: Grid) -> Grid:

@@ -627,7 +627,12 @@ def _parameters() -> str:
             "N is the place of a light in its list, counted from 0.",
             "NAME is a view's name, or `*` for all training views.",
             "Where there are two media, `media.cloud.density` is as `density` is, and so on.",
-            "[Commands](cli.md#names-of-parameters) has the same names, by light.",
+            "Colors have entries `.r`, `.g`, `.b`; places and directions have `.x`, `.y`, `.z`.",
+            "A lens has its coefficients, `.k1` and so on.",
+            "A `camera` has `.rotation_x` ... and `.x` ...: a rotation about the middle of the box"
+            " [radians], then a shift [u], both in its axes (right, up, backward).",
+            "A `focal` length is in widths of the image.",
+            "`render --gradient` and `gradcheck --parameter` take the same names.",
             "",
             "| name | kept within | by color | from cell to cell |",
             "|---|---|---|---|",

@@ -152,7 +152,6 @@ def _render(
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.ranks import is_first
-    from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.render_folder import (
         remove_targets,
         render_lines,
@@ -166,7 +165,6 @@ def _render(
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
-    require_sharing(loaded)
     views = [loaded.view(name) for name in dict.fromkeys(choice.names)] or loaded.views
     if choice.is_relit or choice.count is not None:
         loaded = remove_targets(loaded, views, choice.count)
@@ -255,11 +253,9 @@ def optimize(
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
-    from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
     built, environment = session.build(scene_file), session.environment()
-    require_sharing(built)
     if not is_first():
         follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         return

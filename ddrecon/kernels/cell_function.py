@@ -102,7 +102,7 @@ class RowFunction:
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
         """The kernel of "values", "tangents" or "cotangents", for so many fields."""
         code = self.header, self.name, self.place, self.declared, len(self.shapes)
-        return _kernel(kind, ins, bits, *code)
+        return _kernel(kind, ins, bits, code)
 
 
 class _Found(torch.autograd.Function):
@@ -158,9 +158,8 @@ def _one_by_one(fields: Sequence[Tensor]) -> list[Tensor]:
 
 
 @functools.cache
-def _kernel(
-    kind: str, ins: int, bits: int, header: str, name: str, place: str, declared: str, outs: int
-) -> TextKernel:
+def _kernel(kind: str, ins: int, bits: int, code: tuple[str, str, str, str, int]) -> TextKernel:
+    header, name, place, declared, outs = code
     title = f"{name.split('<')[0].lower()}_{kind}"
     at, made = f"row, {place}channels, fields", "made"
     if kind == "values":

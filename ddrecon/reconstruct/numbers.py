@@ -35,7 +35,7 @@ from ddrecon.variables.values import with_values
 
 def single_numbers(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Those of `parameters` that are no field and no map."""
-    return [p for p in parameters if not p.is_field and p.value.numel() <= tuning.MOST_ENTRIES]
+    return [p for p in parameters if not p.is_field and p.value.ndim < 2]
 
 
 @dataclass(frozen=True)
@@ -157,13 +157,10 @@ class NumberSteps:
         """Finds the curvatures anew of those views that were `compared` whose are too old."""
         if not self.curvatures:
             self.begun = iteration
-        made = {name: made for name, (made, _) in self.curvatures.items()}
-        old = [
-            name
-            for name in dict.fromkeys(view.name for view in compared.views)
-            if name not in made
-            or iteration - made[name] >= min(max(made[name] - self.begun, 1), tuning.REFRESH)
-        ]
+        names = dict.fromkeys(view.name for view in compared.views)
+        made = {name: self.curvatures.get(name, (-math.inf,))[0] for name in names}
+        limits = {name: min(max(at - self.begun, 1), tuning.REFRESH) for name, at in made.items()}
+        old = [name for name in names if iteration - made[name] >= limits[name]]
         weights = {
             name: compared.targets[name].weights_at(picture)
             for name, picture in compared.pictures.items()

@@ -51,7 +51,7 @@ class Parameter:
         self.start, self.value = value.detach(), value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
-        self.moments = (torch.zeros_like(value), torch.zeros_like(value))
+        self.moments = [torch.zeros_like(value)] * 2
 
     def penalty(self, power: float = 1.0) -> Tensor:
         """What its total variation adds to the loss, where the targets' mean square is `power`.
@@ -93,7 +93,7 @@ class Parameter:
         second = self.moments[1].mul(keep[1]).addcmul_(gradient, gradient, value=1 - keep[1])
         size = (second.sqrt() / weights[1] ** 0.5) + smallest
         value = before - gradient.lerp(first, keep[0]) / size * (rate / weights[0])
-        value, self.moments = value.clamp_(self.low, self.high), (first, second)
+        value, self.moments = value.clamp_(self.low, self.high), [first, second]
         if self.support is not None:
             value.mul_(self.support)
         self.value = value.requires_grad_()
@@ -126,21 +126,23 @@ class Parameter:
     def refine(self, grid: Grid) -> None:
         """Carries a field to `grid`, where its optimizer begins anew.
 
-        The sizes of derivatives that it remembers are those of an emptier volume: with them it
-        would hardly move.
+        Interpolation blurs: finer cells also get what their means lack of the value before. The
+        sizes of derivatives that it remembers are those of an emptier volume, and would hinder it.
         """
-        self.grid = grid
+        before, own, self.grid = self.value.detach(), self.grid, grid
         if self.is_field:
-            self.value = self.value_on(grid).requires_grad_()
+            value = self.value_on(grid)
+            if grid.cells > own.cells:
+                value += resample(before - resample(value, own), grid)
+            self.value = value.clamp_(self.low, self.high).requires_grad_()
             self.steps = 0
-            self.moments = torch.zeros_like(self.value), torch.zeros_like(self.value)
+            self.moments = [torch.zeros_like(value)] * 2
 
     def restrict(self, support: Tensor) -> None:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
         self.value = (self.value.detach() * self.support).requires_grad_()
-        first, second = self.moments
-        self.moments = first * self.support, second * self.support
+        self.moments = [moment * self.support for moment in self.moments]
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it; further steps make new tensors."""
@@ -148,7 +150,7 @@ class Parameter:
             "value": self.value.detach(),
             "shape": list(self.grid.shape),
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
-            "moments": list(self.moments),
+            "moments": self.moments,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -156,5 +158,4 @@ class Parameter:
         self.grid = replace(self.grid, shape=tuple(state["shape"]))
         self.value = state["value"].to(self.value).clone().requires_grad_()
         self.steps = int(state["steps"])
-        first, second = (moment.to(self.value) for moment in state["moments"])
-        self.moments = first, second
+        self.moments = [moment.to(self.value) for moment in state["moments"]]

@@ -103,8 +103,7 @@ def rate_at(iteration: int, iterations: int, begin: int, final: float) -> float:
     """
     if iteration < begin:
         return 0.0
-    fall: float = final ** min(1.0, (iteration - begin) / (iterations - begin))
-    return fall
+    return float(final ** min(1.0, (iteration - begin) / (iterations - begin)))
 
 
 def pick_views(count: int, drawn: int, iteration: int, seed: int) -> list[int]:

@@ -11,30 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.errors import UsageError
-from ddrecon.ranks import (
-    cells_are_shared,
-    is_first,
-    own_rank,
-    rank_count,
-    sum_numbers,
-    sum_over_ranks,
-)
+from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers, sum_over_ranks
 from ddrecon.scene import Scene, View
 from ddrecon.slabs.slab import Slab, own_slab
-
-
-def require_sharing(scene: Scene) -> None:
-    """Raises UsageError where ranks are to share cells, and cannot in `scene`."""
-    if not cells_are_shared():
-        return
-    settings, problems = scene.diffusion, list[str]()
-    if settings.model == "flux_limited":
-        problems.append("diffusion.model: flux_limited light needs all cells; say p1")
-    if settings.scheme == "printed":
-        problems.append("diffusion.scheme: the printed scheme needs all cells; say conservative")
-    if problems:
-        raise UsageError([f"--share cells: {problem}, or share views" for problem in problems])
 
 
 def has_slabs(scene: Scene) -> bool:

@@ -1,6 +1,7 @@
-"""Every constant of the optimization that is no law of physics, and what it was chosen on.
+"""Every constant of this room that is no law of physics, and what it was chosen on.
 
-A module reads them as `tuning.NAME`, so that an ablation changes one place.
+Rates stand with their variables (`variables/kinds.py`), knees with their losses (`losses.py`), for
+rooms below have them. A module reads these as `tuning.NAME`, so that an ablation changes one place.
 """
 
 from __future__ import annotations
@@ -25,8 +26,6 @@ full size, and would throw away what a coarser grid has found. With 10 the plume
 
 # How numbers move: damped Gauss-Newton steps (E10.2). Chosen on the capture at half size, and seen
 # on Fig. 10 and 14.
-MOST_ENTRIES = 16
-"""Parameters of more values, such as maps of radiance, are not among single numbers."""
 DAMPING = 1.0
 """How much of its own curvature each parameter is damped by: alone, it goes half of the way."""
 LARGEST_STEP = 4.0

@@ -36,7 +36,7 @@ from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, count_threads, make_room
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.ranks import cells_are_shared
-from ddrecon.renderer import require_refracting
+from ddrecon.renderer import require_supported
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
@@ -151,11 +151,12 @@ def build_scene(
         reason=reason,
     )
     try:
-        require_refracting(scene)
+        require_supported(scene)
         for view in views if volume.index != 1 else ():
             look_inside(view.camera, grid, volume.index, render)
     except UsageError as error:
-        raise scene_file.refused("volume.index", str(error).partition(": ")[2]) from None
+        key, _, what = str(error).partition(": ")
+        raise scene_file.refused(key, what) from None
     problems = Problems()
     for name, settings in optimize.parameters.items() if optimize else ():
         with problems.collecting():

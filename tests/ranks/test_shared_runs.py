@@ -229,7 +229,7 @@ def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
 def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
     assert runs.codes["cells refused"][0] == 2
     lines = runs.text("cells refused", 0, "err").splitlines()
-    assert len(lines) == 1 and lines[0].startswith("--share cells: diffusion.model: flux_limited")
+    assert len(lines) == 1 and ": diffusion.model: flux_limited: not where processes" in lines[0]
     assert not (runs.folder / "none").exists()
 
 

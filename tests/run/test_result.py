@@ -39,6 +39,7 @@ views:
   - name: side
     camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1,
       resolution: [5, 4]}}
+diffusion: {{transport_rounds: 0}}
 optimize: {{iterations: 2, refine_at: [], parameters: {{{parameters}}}}}
 """
 VARIED = [

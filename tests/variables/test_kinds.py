@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.tuning import MOST_ENTRIES
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -16,7 +15,7 @@ from ddrecon.variables.values import component_names, value_of, variable_names, 
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
 SMALL = ["volume.resolution=[5, 4, 3]", "volume.density=0.7", "volume.sigma_a=[0.3, 0.4, 0.5]"]
-SMALL += ["lights.0.irradiance=[3, 2, 1]", "lights.2.directions=3"]
+SMALL += ["lights.0.irradiance=[3, 2, 1]", "lights.2.directions=3", "diffusion.transport_rounds=0"]
 SMALL += [f"views.{index}.camera.resolution=[7, 6]" for index in range(4)]
 LOBES = "volume.phase={type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
 MEDIA = (
@@ -61,6 +60,7 @@ def test_phase_g_is_g_where_there_is_but_one(scenes: dict[str, Scene]) -> None:
     assert value_of(changed, "g") == value_of(changed, "phase.g") == 0.1
 
 
+@pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("pattern", KINDS)
 def test_a_kind_is_settable_and_differentiable(scene: Scene, pattern: str) -> None:
     name = name_of(pattern, scene)
@@ -87,7 +87,7 @@ def test_values_are_within_bounds_and_stay_there_in_a_step(scene: Scene, pattern
     for sign in (1, -1):
         parameter = Parameter(name, ParameterSettings(), rate, value, scene.volume.grid)
         for _ in range(20):
-            if parameter.is_field or value.numel() > MOST_ENTRIES:
+            if parameter.is_field or value.ndim > 1:
                 parameter.step(torch.full_like(value, sign), 1.0)
             else:
                 parameter.move(-sign * torch.as_tensor(rate).expand_as(value))

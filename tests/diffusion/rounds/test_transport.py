@@ -29,7 +29,12 @@ from ddrecon.validate.hard import ball as hard_ball
 from ddrecon.validate.hard import layer
 
 CUBES = (1.0, 1.0, 1.0)
-WHITE = {"sigma_a": (0.0,), "sigma_s": (10.0,)}
+
+
+@pytest.fixture(autouse=True)
+def whatever_is_fastest(same_engine: None) -> None:
+    """What holds of rounds holds with either engine, to rounding (`test_fused_sweep.py`)."""
+    use_engine("auto")
 
 
 def ball(cells: int = 12, radius: float = 0.35) -> Tensor:
@@ -139,7 +144,7 @@ def left_of_noise(
 )
 def test_rounds_forget_where_they_began(g: float, degree: int, thickness: float):
     """In a box full of medium, where diffusion passes few waves on."""
-    full = torch.ones(16, 16, 16, dtype=torch.float64)
+    full = torch.ones(12, 12, 12, dtype=torch.float64)
     (begun, left) = left_of_noise(full, CUBES, thickness, g, degree, (0, 16))
     assert left < 2e-3 * begun
 
@@ -183,7 +188,7 @@ def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
         return render(scene)
 
     coarse = ball(8, 0.4)
-    fine = interpolate(coarse[None, None], scale_factor=4, mode="trilinear")[0, 0]
+    fine = interpolate(coarse[None, None], scale_factor=3, mode="trilinear")[0, 0]
     truth = image(fine, 4)
     diffuse, few, many = (
         float((image(coarse, rounds) - truth).norm() / truth.norm()) for rounds in (0, 3, 8)
@@ -231,6 +236,7 @@ def test_derivatives_by_g_pass_through_zero_smoothly():
 
 def test_memory_does_not_grow_with_directions():
     """Arrays of cells that are kept for the backward pass of a sweep."""
+    use_engine("torch")
 
     def kept(directions: int) -> int:
         scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
