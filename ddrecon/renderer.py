@@ -32,7 +32,7 @@ from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.outgoing import scatter_towards
+from ddrecon.light.outgoing import scatter_back, scatter_towards
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
@@ -45,13 +45,14 @@ from ddrecon.light.reduced import (
     sum_unscattered_sky,
 )
 from ddrecon.light.sky import Sky, Source, decompose_lights
-from ddrecon.march.emission import Emission
+from ddrecon.march.emission import Emission, Inflow
 from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
 from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.march.windows import look_inside, see_through
 from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
+from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.levels import refine_medium, resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
@@ -76,10 +77,11 @@ class LightField:
 
     `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `turned` is light that backward peaks have turned (E8.11). `received` is
-    what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells, else values at
-    centers. `ground` is what lies below, where there is any. `reflected` is what of `diffuse` are
-    beams that faces have reflected (E5.8): no camera looks along these.
+    camera's rays anew. `outside` [C, 1, 1, 1] is the radiance that enters through faces, None where
+    nothing is known of that. `turned` is light that backward peaks have turned (E8.11). `received`
+    is what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells, else values
+    at centers. `ground` is what lies below, where there is any. `reflected` is what of `diffuse`
+    are beams that faces have reflected (E5.8): no camera looks along these.
     """
 
     medium: Medium
@@ -90,6 +92,7 @@ class LightField:
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
+    outside: Tensor | None = None
     reflected: Moments | None = None
 
     def unrolled(self) -> tuple[Unrolled, LightField]:
@@ -100,8 +103,10 @@ class LightField:
         beams = (replace(beam, mass=period.extend(beam.mass)) for beam in self.beams)
         turned = (replace(one, radiance=period.extend(one.radiance)) for one in self.turned)
         medium = self.medium.put(period.wide, period.extend)
-        light = self.diffuse.mapped(period.extend)
+        light, source = self.diffuse.mapped(period.extend), self.received.source
+        source = Moments(source.mean, source.flux).mapped(period.extend)
         wide = replace(self, medium=medium, beams=tuple(beams), diffuse=light, turned=tuple(turned))
+        wide = replace(wide, received=replace(self.received, source=source))
         return period, wide
 
 
@@ -240,9 +245,8 @@ def _find_light(
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
     beams, has_means = follow_lights(medium, lights), settings.rounds > 0
-    return LightField(
-        medium, beams, light, received, has_means, turned=received.turned, reflected=reflected
-    )
+    found = LightField(medium, beams, light, received, has_means, turned=received.turned)
+    return replace(found, outside=outside if has_means else None, reflected=reflected)
 
 
 def follow_unscattered_light(
@@ -296,7 +300,7 @@ def _glow(
     if not has_source:
         return lambda rays, _: _emission(light_field, rays)
     source = light_field.received.source
-    medium, others = light_field.medium, replace(light_field, beams=())
+    medium, others = light_field.medium, replace(light_field, beams=(), outside=None)
     values = harmonics(-upwards(plane)[0], medium.degree).T.to(source.mean)
     scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
     if not medium.is_cellwise:
@@ -386,7 +390,7 @@ def view_image(
         return _image(light_field, scene, camera, behind)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
     parts = [
-        (replace(light_field, diffuse=nothing, turned=()), scene, camera, behind),
+        (replace(light_field, diffuse=nothing, turned=(), outside=None), scene, camera, behind),
         (
             replace(_without_glow(light_field), beams=(), skies=(), ground=None),
             _without_background(scene),
@@ -492,6 +496,7 @@ def _emission(
         medium.remaining if medium.is_cellwise else None,
         medium.support,
         medium.emission,
+        inflow=_inflow(wide, bundle),
     )
     if not light_field.medium.grid.periodic:
         return emission
@@ -501,6 +506,21 @@ def _emission(
         return _emission(light_field, replace(bundle, eye=eye), (period, wide))
 
     return replace(emission, period=period, from_eye=from_eye if depends else None)
+
+
+def _inflow(light_field: LightField, rays: Rays) -> Inflow | None:
+    """What comes in through faces, as seen along `rays`."""
+    if light_field.outside is None:
+        return None
+    medium = light_field.medium
+    kept = (
+        torch.ones_like(medium.g.view(-1)[:1])
+        if medium.is_cellwise
+        else 1 - medium.forward_fraction
+    )
+    # Faces let out and in a part only of what goes through.
+    back = transmitted_moments(medium.index)[0] * scatter_back(medium, rays)
+    return Inflow(light_field.outside, light_field.received.source, kept, back)
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor | None:

@@ -60,6 +60,16 @@ def scatter_towards(
     return recompute(scatter)
 
 
+def scatter_back(medium: Medium, rays: Rays) -> Tensor:
+    """The part [6, C] of even light from outside of each face of the box that is scattered into
+    `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the rays (E2.17).
+    """
+    towards = -torch.nn.functional.normalize(rays.direction.sum(0), dim=0)
+    p_1 = remaining_moments(medium)[1].mean((1, 2, 3)) if medium.degree else towards.new_zeros(1)
+    cosines = torch.stack([-towards, towards], 1).view(6, 1)
+    return (0.5 - 0.75 * cosines * p_1).clamp(min=0)
+
+
 def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:
     """What light of all `turned` beams scatters towards the camera of `rays`."""
     towards = rays.towards_eye(medium.grid)

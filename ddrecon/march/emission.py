@@ -11,11 +11,27 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
+from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.periods import Unrolled
 from ddrecon.numerics.third_order import ThirdOrder
+
+
+@dataclass(frozen=True)
+class Inflow:
+    """What comes in through faces of the box, where a medium that went on would send light (E2.17).
+
+    `outside` [C, 1, 1, 1] is that; `received` are the mean and the flux of what cells receive of
+    beams, `kept` times which counts as `diffuse` light does. `backward` [6, C] is, by face, the
+    part of light from there that is scattered into the camera's rays.
+    """
+
+    outside: Tensor
+    received: Moments
+    kept: Tensor
+    backward: Tensor
 
 
 @dataclass(frozen=True)
@@ -30,7 +46,7 @@ class Emission:
     `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for. `emitted`
     [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11). Where the
     volume repeats, fields are those of an unrolled `period`; `from_eye`, if given, is what is seen
-    from another place, as other periods are.
+    from another place, as other periods are. `inflow`, if given, is what comes in through faces.
     """
 
     grid: Grid
@@ -45,6 +61,7 @@ class Emission:
     emitted: Tensor | None = None
     period: Unrolled | None = None
     from_eye: Callable[[Tensor], Emission] | None = None
+    inflow: Inflow | None = None
 
     @property
     def diffusing(self) -> Coefficient:
@@ -82,7 +99,7 @@ class Emission:
             lit = replace(self.scattering, field=self.scattering.field * beam.profile)
             one = replace(self, scattering=lit, beams=(replace(beam, profile=None),))
             dark = torch.zeros_like(self.diffuse[:1])
-            parts.append(replace(one, diffuse=dark, remaining=None))
+            parts.append(replace(one, diffuse=dark, remaining=None, inflow=None))
         return [replace(self, beams=tuple(plain)), *parts]
 
     @functools.cached_property

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -26,6 +27,10 @@ from ddrecon.slabs.slab import Slab
 GRAZING = 0.1
 """Cosine from which on a beam shines fully through a face. Below, ever less: where it only grazes
 a face, what lies closely behind that is lit through others.
+"""
+RAISED, UNEVEN = 0.4, 4 / 3
+"""Of what light lacks on a face, the part that it has more of at the outermost centers, which keeps
+cells' means; and the optical depth of cells in which half of it is within the outermost cell.
 """
 OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
@@ -60,8 +65,45 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
                 shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
                 outside = shade * _limit(outside, line, extinction.mass_bound)
         lines = is_line if is_light else NOWHERE
-        extended[name] = _WithOutside.apply(axis, lines, field, outside.to(field))
+        lacks = _find_lacks(emission, is_line) if name == "diffuse" else [None] * len(FACES)
+        extended[name] = _WithOutside.apply(axis, lines, field, outside.to(field), *lacks)
     return extended
+
+
+def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | None]:
+    """By how much diffuse light on faces is less than on the line to there (E2.17).
+
+    By face [C, rows + 2, columns + 2], or None: less of it comes in than medium sends out.
+    """
+    inflow, grid = emission.inflow, emission.grid
+    if inflow is None:
+        return [None] * len(FACES)
+    extinction, diffusing, lacks = emission.extinction, emission.diffusing, list[Tensor | None]()
+    for (axis, side), is_so, backward in zip(FACES, is_line, inflow.backward, strict=True):
+        if not is_so:
+            lacks.append(None)
+            continue
+
+        def layer(field: Tensor, axis: int = axis, side: int = side) -> Tensor:
+            return field.select(1 + axis, -side)
+
+        width, normal = grid.spacing[axis], 2 * side - 1
+        received = layer(inflow.received.mean)
+        if inflow.received.flux is not None:
+            received = received - 0.5 * normal * layer(inflow.received.flux[axis])
+        kept = inflow.kept.view(-1, 1, 1)
+        light = layer(emission.diffuse) + kept * received
+        lost = layer(extinction.scale) * layer(extinction.field)
+        scattered = layer(diffusing.scale) * layer(diffusing.field)
+        sent = scattered * light - lost * layer(inflow.outside)
+        if emission.emitted is not None:
+            sent = sent + layer(emission.emitted)
+        part = width * kept * backward.view(-1, 1, 1)
+        lack = part * sent / (UNEVEN + width * lost + part * scattered)
+        if emission.emitted is not None:
+            lack = layer(diffusing.scale) * lack
+        lacks.append(pad(lack, (1, 1, 1, 1), mode="replicate"))
+    return lacks
 
 
 def _is_line(grid: Grid, axis: int, side: int) -> bool:
@@ -169,11 +211,18 @@ def _add_up(values: Tensor, taken: Tensor, put: Tensor, parts: Tensor, count: in
 class _WithOutside(torch.autograd.Function):
     """`cells` with those `outside` [C, M]: beyond faces where they are on `lines`, not on these.
 
-    But those across `axis` are on faces. Linear.
+    But those across `axis` are on faces. Linear. On faces they are less by what each one `lacks`,
+    and the outermost cells' more by the part `RAISED` of it.
     """
 
     @staticmethod
-    def forward(axis: int | None, lines: Sequence[bool], cells: Tensor, outside: Tensor) -> Tensor:
+    def forward(
+        axis: int | None,
+        lines: Sequence[bool],
+        cells: Tensor,
+        outside: Tensor,
+        *lacks: Tensor | None,
+    ) -> Tensor:
         longer = cells.new_empty(len(cells), *(count + 2 for count in cells.shape[1:]))
         longer[:, 1:-1, 1:-1, 1:-1] = cells
         places = _places(tuple(cells.shape[1:]), cells.device).expand(len(cells), -1)
@@ -182,32 +231,54 @@ class _WithOutside(torch.autograd.Function):
             if is_line and face[0] != axis:
                 outer, last = _layers(longer, face)
                 outer.mul_(2).sub_(last)
+        for face, lack in zip(FACES, lacks, strict=True):
+            if lack is not None:
+                outer, last = _layers(longer, face)
+                outer.sub_(lack, alpha=_weight(axis, face))
+                last[:, 1:-1, 1:-1].add_(lack[:, 1:-1, 1:-1], alpha=RAISED)
         return longer
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.axis, ctx.lines, ctx.shape = *inputs[:2], inputs[2].shape
+        ctx.has = [lack is not None for lack in inputs[4:]]
 
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> tuple[Any, ...]:
-        longer = bar.clone()
+        longer, bars = bar.clone(), list[Tensor | None]()
+        for face, has in zip(FACES, ctx.has, strict=True):
+            outer, last = _layers(bar, face)
+            bars.append(-_weight(ctx.axis, face) * outer if has else None)
+            if (one := bars[-1]) is not None:
+                one[:, 1:-1, 1:-1].add_(last[:, 1:-1, 1:-1], alpha=RAISED)
         for face, is_line in reversed(list(zip(FACES, ctx.lines, strict=True))):
             if is_line and face[0] != ctx.axis:
                 outer, last = _layers(longer, face)
                 last -= outer
                 outer *= 2
         outside = _places(tuple(ctx.shape[1:]), bar.device)
-        return None, None, longer[:, 1:-1, 1:-1, 1:-1], longer.flatten(1).index_select(1, outside)
+        found = longer.flatten(1).index_select(1, outside)
+        return None, None, longer[:, 1:-1, 1:-1, 1:-1], found, *bars
 
     @staticmethod
     def jvp(
-        ctx: Any, _axis: None, _lines: None, cells: Tensor | None, outside: Tensor | None
+        ctx: Any,
+        _axis: None,
+        _lines: None,
+        cells: Tensor | None,
+        outside: Tensor | None,
+        *lacks: Tensor | None,
     ) -> Tensor:
-        like = next(one for one in (cells, outside) if one is not None)
+        like = next(one for one in (cells, outside, *lacks) if one is not None)
         count = len(_places(tuple(ctx.shape[1:]), like.device))
         cells = like.new_zeros(ctx.shape) if cells is None else cells
         outside = like.new_zeros(len(cells), count) if outside is None else outside
-        return _WithOutside.forward(ctx.axis, ctx.lines, cells, outside)
+        return _WithOutside.forward(ctx.axis, ctx.lines, cells, outside, *lacks)
+
+
+def _weight(axis: int | None, face: tuple[int, int]) -> float:
+    """How much less is what stands for a face, where that lacks 1 and the last cell has more."""
+    return 1.0 if face[0] == axis else 2.0 + RAISED
 
 
 def _layers(longer: Tensor, face: tuple[int, int]) -> list[Tensor]:

@@ -17,15 +17,15 @@ VAN_DE_HULST = {
 """`SLAB` in van de Hulst's Multiple Light Scattering, 1980."""
 
 # What is claimed of our defaults, in percent.
-HALF_SPACE = {"R": 0.3, "up": 1.5}
-VAN_DE_HULST_SLAB = {"R": 1.2, "up": 4.5, "T": 0.5, "down": 1.2}
+HALF_SPACE = {"R": 0.3, "up": 1.0}
+VAN_DE_HULST_SLAB = {"R": 1.0, "up": 2.0, "T": 0.5, "down": 1.0}
 SLABS = {
-    ("Rayleigh", 1.0): {"R": 0.6, "up": 2.0, "T": 0.4, "down": 1.5},
-    ("Rayleigh", 8.0): {"R": 0.6, "up": 4.0, "T": 6.5, "down": 7.0},
-    ("g 0.75", 1.0): {"R": 0.7, "up": 5.0, "T": 0.2, "down": 1.0},
-    ("g 0.75", 8.0): {"R": 0.5, "up": 5.5, "T": 1.0, "down": 1.5},
-    ("haze", 1.0): {"R": 0.5, "up": 4.5, "T": 0.2, "down": 0.8},
-    ("haze", 8.0): {"R": 1.0, "up": 4.5, "T": 0.4, "down": 1.0},
+    ("Rayleigh", 1.0): {"R": 0.6, "up": 1.5, "T": 0.4, "down": 1.0},
+    ("Rayleigh", 8.0): {"R": 0.6, "up": 1.5, "T": 1.5, "down": 2.0},
+    ("g 0.75", 1.0): {"R": 0.7, "up": 2.5, "T": 0.2, "down": 1.0},
+    ("g 0.75", 8.0): {"R": 0.9, "up": 2.0, "T": 1.2, "down": 1.5},
+    ("haze", 1.0): {"R": 0.5, "up": 3.0, "T": 0.2, "down": 0.8},
+    ("haze", 8.0): {"R": 1.3, "up": 2.0, "T": 0.5, "down": 1.0},
 }
 """By phase function and depth; albedo 0.9, cells of 0.25 and 0.5 optical depths."""
 CLOUDS = {

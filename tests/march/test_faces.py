@@ -10,9 +10,10 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
+from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
-from ddrecon.march.emission import Emission
+from ddrecon.march.emission import Emission, Inflow
 from ddrecon.march.faces import FACES, extend_fields, shine_through
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.settings import RenderSettings
@@ -93,17 +94,25 @@ def test_light_through_a_face_begins_smoothly():
 
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
 def test_extended_fields_have_both_derivatives(axis: int | None):
-    """By light, by masses, and by where it comes from; some of what goes on would be negative."""
-    diffuse, *masses = (random_values(1, *GRID.shape, seed=k).pow(4) for k in range(3))
+    """By light, by masses, and by where it comes from; some of what goes on would be negative.
+
+    And by what thick cells receive, of which less comes in than goes out.
+    """
+    diffuse, *masses, got = (random_values(1, *GRID.shape, seed=k).pow(4) for k in range(4))
+    backward = random_values(6, 1, seed=5)
     direction, position = TRAVEL + 0.05, torch.tensor([-0.6, 0.1, 0.2], dtype=torch.float64)
 
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
-        masses, places = rest[:2], rest[2:]
+        masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
         emission = emission_of(diffuse, *masses)
+        coming = Inflow(0.2 * depth, Moments(rest[5], (rest[5],) * 3), 0.9 * depth, backward)
+        matter = replace(emission.extinction, scale=depth)
+        emission = replace(emission, extinction=matter, scattering=matter, inflow=coming)
         beam, point = emission.beams
         beams = replace(beam, direction=places[0]), replace(point, position=places[1])
         fields = extend_fields(replace(emission, beams=beams), axis)
         return fields["diffuse"], fields["mass 0"], fields["mass 1"]
 
-    given = [one.requires_grad_() for one in (diffuse, *masses, direction, position)]
+    depth = TRAVEL.new_tensor(4.0)
+    given = [one.requires_grad_() for one in (diffuse, *masses, direction, position, depth, got)]
     assert torch.autograd.gradcheck(extend, given, check_forward_ad=True, fast_mode=True)
