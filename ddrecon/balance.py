@@ -21,7 +21,7 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.bounced import TURNS, follow_inside
 from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, sweep_rule
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
 from ddrecon.diffusion.rounds.transport import face_mirror
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
@@ -82,7 +82,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
     source = light_field.diffuse.weighted(factors).plus(received)
-    rise = cell_gradient(light_field.diffuse.mean + received.mean)
+    light = light_field.diffuse.mean + received.mean
+    rise = steep_gradient(average_cells(medium), light, box.directions)
     scattered = (
         passing - unscattered + box.sweep_out(medium, source, rise, light=light_field.diffuse)
     )

@@ -70,6 +70,7 @@ def _without_light(emission: Emission) -> Emission:
         peak=None,
         remaining=None,
         emitted=None,
+        inflow=None,
     )
 
 
