@@ -89,20 +89,6 @@ def test_indices_and_masks_go_to_the_device_and_not_back() -> None:
             far[refused] = near[:2]
 
 
-@pytest.mark.parametrize(
-    "refused",
-    [
-        lambda far: far.numpy(),
-        lambda far: torch.stack([far[0], torch.ones(())]),
-        lambda far: torch.rand(3, device=FAR, generator=torch.Generator()),
-    ],
-    ids=["as an array of numpy", "numbers in one tensor", "the processor's generator"],
-)
-def test_what_fake_tensors_let_pass_is_refused(refused: Callable[[Tensor], Any]) -> None:
-    with pytest.raises((TypeError, RuntimeError)):
-        refused(torch.ones(3, device=FAR))
-
-
 def run(device: torch.device) -> Result:
     """Two iterations; rounds are among the derivatives below."""
     overrides = ["optimize.refine_at=[]", "diffusion.tolerance=0.01", CAPTURE]

@@ -7,22 +7,18 @@ import itertools
 import json
 import math
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from media import make_scene, random_values
 
-from ddrecon.layer import VolumeRenderer
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Result, Row
 from ddrecon.report import volumes
-from ddrecon.report.curve import MOST, draw_curve, logarithmic_ticks, ticks
+from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
     items,
@@ -82,31 +78,10 @@ def test_a_page_names_no_other_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-FINITE = st.floats(-1e3, 1e3)
-
-
 def places(svg: str) -> list[list[tuple[float, float]]]:
     """The points of every line."""
     lines = re.findall(r'<polyline points="([^"]*)"', svg)
     return [[tuple(map(float, pair.split(","))) for pair in line.split()] for line in lines]
-
-
-@given(FINITE, st.floats(1e-2, 1e6))
-def test_ticks_are_round_and_within(low: float, span: float) -> None:
-    found = ticks(low, low + span)
-    slack = 1e-6 * span + 1e-9 * abs(low)
-    assert 2 <= len(found) <= 6
-    assert all(low - slack <= value <= low + span + slack for value in found)
-    steps = {round((b - a) / span, 6) for a, b in itertools.pairwise(found)}
-    mantissa = 10 ** (math.log10(found[1] - found[0]) % 1)
-    assert len(steps) == 1 and min(abs(mantissa - factor) for factor in (1, 2, 5, 10)) < 1e-3
-
-
-@given(st.floats(-12, 12), st.floats(1e-3, 20))
-def test_logarithmic_ticks_lie_within_and_ascend(low: float, span: float) -> None:
-    found = logarithmic_ticks(low, low + span)
-    assert 1 <= len(found) <= 8 and found == sorted(found)
-    assert all(low - 1e-6 <= value <= low + span + 1e-6 for value in found)
 
 
 def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
@@ -123,16 +98,6 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
     (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
     assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
-
-
-def test_a_long_log_is_thinned_and_keeps_its_ends() -> None:
-    points = [(float(x), float(x % 7)) for x in range(20_003)]
-    (line,), ends = (
-        places(draw_curve("a", {"": points}, "x")),
-        places(draw_curve("a", {"": [points[0], (points[-1][0], 6.0)]}, "x"))[0],
-    )
-    assert len(line) <= MOST + 20
-    assert (line[0][0], line[-1][0]) == (ends[0][0], ends[-1][0])
 
 
 def embedded(*fields: Shown) -> list[dict]:
@@ -207,16 +172,3 @@ def test_scene_volume_and_result_show_their_fields() -> None:
         assert fields[0]["size"] == [5, 4, 3] and "5 x 4 x 3 cells, density up to" in page
     told = "31.25 dB of views trained on, 28.50 dB of views held out"
     assert told in Result(scene, [row])._repr_html_()
-
-
-def test_what_is_printed_is_as_short_for_a_large_scene() -> None:
-    """Shapes, the device and ranges, and no more of many views than of some."""
-    density = torch.linspace(0, 3, 8000).view(20, 20, 20)
-    scene = make_scene(density.requires_grad_())
-    scene = replace(scene, views=9 * scene.views)
-    rows = 500 * [Row(7, 1.0, 0.1, 31.25, 28.5, 1, 1, 60, 0.1, 0.0)]
-    for shown in (scene, scene.volume, Result(scene, rows), VolumeRenderer(scene)):
-        text = str(shown)
-        assert "density=<[20, 20, 20] float32 on cpu, 0 to 3>" in text and len(text) < 2000
-        assert type(shown).__name__ in text and "tensor(" not in text
-    assert ", ...]" in str(scene)

@@ -2,28 +2,20 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from click.testing import Result
-from media import half_empty, make_scene
 
 from ddrecon import memory
 from ddrecon.cli.check import memory_estimate
-from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import write_field
-from ddrecon.kernels import spare
-from ddrecon.light.lights import PointLight
 from ddrecon.memory import Needs, is_shortage, memory_of
-from ddrecon.renderer import render_each
 from ddrecon.run import render_folder
 from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
-from ddrecon.variables.values import with_values
 
 Run = Callable[..., Result]
 COMMANDS = {
@@ -107,63 +99,6 @@ def test_the_prediction_is_the_estimate(
     monkeypatch.setattr(build, "make_room", lambda needs, _: predicted.append(needs))
     scene = load_scene("scene.yaml", overrides=overrides)
     assert memory_of(predicted[0]) == memory_estimate(scene) > 0
-
-
-@pytest.mark.parametrize("case", ["lights", "gray rounds"])
-def test_copies_of_many_threads_are_predicted_and_bounded(
-    monkeypatch: pytest.MonkeyPatch, case: str
-) -> None:
-    """Bytes that 64 threads add to, beyond those of two, by what kernels are handed."""
-    pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-    from ddrecon.kernels.text import TextKernel
-
-    density, gray = half_empty(6, 10, 12, dtype=torch.float32), case == "gray rounds"
-    sections = {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (2.0,)} if gray else {}
-    rounds = 1 if "rounds" in case else 0
-    scene = make_scene(density, g=0.4, degree=1, transport_rounds=rounds, **sections)
-    if case == "lights":
-        place, power = density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0])
-        scene.lights += [PointLight(place, power), PointLight(-place, power)]
-    use_engine("warp")
-
-    def copies(threads: int) -> int:
-        """The most bytes of copies that a launch has."""
-        sizes = [0]
-        launch, bind = TextKernel.launch, TextKernel.bind
-
-        def count_launch(self: Any, *given: Any, shares: Any = (), **named: Any) -> None:
-            parts = [each for own in shares for value in own.values() for each in listed(value)]
-            sizes.append(sum(part.nbytes for part in parts))
-            launch(self, *given, shares=shares, **named)
-
-        def count_bind(self: Any, given: Any, made: Any) -> Any:
-            if self.name in ("follow_rows", "return_rows"):
-                sizes.append(sum(part.nbytes for value in made.values() for part in listed(value)))
-            return bind(self, given, made)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(TextKernel, "launch", count_launch)
-            patch.setattr(TextKernel, "bind", count_bind)
-            patch.setattr(torch, "get_num_threads", lambda: threads)
-            leaf = density.clone().requires_grad_()
-            changed = with_values(scene, {"density": leaf})
-            image = render_each(changed, changed.views, SolveMemory())[0]
-            torch.autograd.grad(image.sum(), leaf)
-        return max(sizes)
-
-    of_two = copies(2)
-    needs = Needs((12, 10, 6), 1 if gray else 3, 4, 0, has_flux=True, has_rounds=rounds > 0)
-    needs = replace(needs, moments=4, varied=1.0, lights=len(scene.lights), threads=64)
-    assert of_two <= copies(64) <= of_two + memory.shared_memory(needs)
-    monkeypatch.setattr(spare, "MOST_COPIED", 4 * of_two)
-    assert copies(64) <= of_two + memory.shared_memory(needs) <= 5 * of_two
-    assert memory.shared_memory(replace(needs, threads=2)) == 0
-
-
-def listed(value: Any) -> list[torch.Tensor]:
-    """The tensors of an argument."""
-    parts = value if isinstance(value, list) else [value]
-    return [part for part in parts if isinstance(part, torch.Tensor)]
 
 
 def write_group(folder: Path, files: dict[str, str]) -> None:
