@@ -1,9 +1,9 @@
 """What an iteration of a reconstruction asks of the machine: calls, launches, waits.
 
-    python benchmarks/launches.py [--views 3] [--device cpu]
+    python benchmarks/launches.py [--views 3] [--device cpu] [--modules]
 
-Prints two tables in Markdown: of each engine without and with a transport round, and where in
-ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full resolution.
+Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
+another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full resolution.
 
 A call is an operation of torch, views of tensors not counted; on a GPU each costs at least 5
 microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
@@ -235,6 +235,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engines", nargs="+", default=ENGINES, choices=ENGINES)
     parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
+    parser.add_argument("--modules", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)  # so that a kernel is one launch, as on a GPU
     found = {}
@@ -243,7 +244,8 @@ def main() -> None:
         for rounds in options.rounds:
             found[engine, rounds] = count(load(options.views, rounds, options.device))
     print_totals(found)
-    print_modules(found)
+    if options.modules:
+        print_modules(found)
 
 
 if __name__ == "__main__":
