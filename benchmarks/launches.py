@@ -3,7 +3,8 @@
     python benchmarks/launches.py [--views 3] [--device cpu] [--modules]
 
 Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
-another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full resolution.
+another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full
+resolution.
 
 A call is an operation of torch, views of tensors not counted; on a GPU each costs at least 5
 microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
