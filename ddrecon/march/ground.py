@@ -135,8 +135,13 @@ def reflect(lit: LitGround, medium: Medium, settings: RenderSettings) -> tuple[T
     """
     plane, even = lit.ground.plane, lit.even
     points = texel_centers(medium.grid, plane, even)
-    along = (torch.gradient(points[..., axis], dim=dim)[0] for dim, axis in enumerate(plane.across))
-    width = WIDE * torch.maximum(*along).flatten()
+    along = (
+        torch.gradient(points[..., axis], dim=dim)[0]
+        if points.shape[dim] > 1
+        else points.new_full((), medium.grid.extent[axis])
+        for dim, axis in enumerate(plane.across)
+    )
+    width = WIDE * torch.maximum(*along).expand(points.shape[:2]).flatten()
     direct = _direct_irradiance(lit, medium, points.flatten(0, 1), width, settings)
     for light in lit.lights:
         if isinstance(light, DirectionalLight):
