@@ -519,7 +519,8 @@ def _inflow(light_field: LightField, rays: Rays) -> Inflow | None:
         else 1 - medium.forward_fraction
     )
     # Faces let out and in a part only of what goes through.
-    back = transmitted_moments(medium.index)[0] * scatter_back(medium, rays)
+    let_in = transmitted_moments(medium.index)[0]
+    back = [let_in * part for part in scatter_back(medium, rays)]
     return Inflow(light_field.outside, light_field.received.source, kept, back)
 
 

@@ -60,16 +60,18 @@ def scatter_towards(
     return recompute(scatter)
 
 
-def scatter_back(medium: Medium, rays: Rays) -> Tensor:
-    """The part [6, C] of even light from outside of each face of the box that is scattered into
-    `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the rays (E2.17); p_1 counts as 0
-    where it differs from cell to cell.
+def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
+    """The part [C, rows, columns] of even light from outside of each face of the box that its
+    outermost cells scatter into `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the
+    rays (E2.17).
     """
     towards = -torch.nn.functional.normalize(rays.direction.sum(0), dim=0)
-    is_even = medium.degree > 0 and not medium.is_cellwise
-    p_1 = remaining_moments(medium)[1].flatten() if is_even else towards.new_zeros(1)
-    cosines = torch.stack([-towards, towards], 1).view(6, 1)
-    return (0.5 - 0.75 * cosines * p_1).clamp(min=0)
+    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
+    return [
+        (0.5 - 0.75 * normal * towards[axis] * p_1.select(1 + axis, last)).clamp(min=0)
+        for axis in range(3)
+        for normal, last in ((-1, 0), (1, -1))
+    ]
 
 
 def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:

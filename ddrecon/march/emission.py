@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,14 +24,14 @@ class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
     `outside` [C, 1, 1, 1] is that; `received` are the mean and the flux of what cells receive of
-    beams, `kept` times which counts as `diffuse` light does. `backward` [6, C] is, by face, the
-    part of light from there that is scattered into the camera's rays.
+    beams, `kept` times which counts as `diffuse` light does. `backward` are, by face, the parts
+    [C, rows, columns] of light from there that are scattered into the camera's rays.
     """
 
     outside: Tensor
     received: Moments
     kept: Tensor
-    backward: Tensor
+    backward: Sequence[Tensor]
 
 
 @dataclass(frozen=True)

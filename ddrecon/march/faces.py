@@ -98,7 +98,7 @@ def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | No
         sent = scattered * light - lost * layer(inflow.outside)
         if emission.emitted is not None:
             sent = sent + layer(emission.emitted)
-        part = width * kept * backward.view(-1, 1, 1)
+        part = width * kept * backward
         lack = part * sent / (UNEVEN + width * lost + part * scattered)
         if emission.emitted is not None:
             lack = layer(diffusing.scale) * lack

@@ -99,7 +99,7 @@ def test_extended_fields_have_both_derivatives(axis: int | None):
     And by what thick cells receive, of which less comes in than goes out.
     """
     diffuse, *masses, got = (random_values(1, *GRID.shape, seed=k).pow(4) for k in range(4))
-    backward = random_values(6, 1, seed=5)
+    backward = random_values(6, 1, 1, 1, seed=5)
     direction, position = TRAVEL + 0.05, torch.tensor([-0.6, 0.1, 0.2], dtype=torch.float64)
 
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
