@@ -378,23 +378,53 @@ def choose_diffusion(
     reasons = [f"a second moment of {left:.2g} of the phase function"]
     if any(name.endswith("density") for name in optimized):
         depth, is_flat = 0.0, False
-    times = 1 if settings.refine is None else settings.refine
     thin = FINER_FLAT if is_flat else FINER
-    along, most = settings.refine_along, MOST_CELLS
+    times, along = _choose_cells(settings, grid, depth / thin, colors, varies)
+    if depth > thin:
+        reasons.append(f"cells of {depth:.2g} optical depths")
+    rounds, degree, causes = _choose_rounds(tree, phase, left, depth / times, is_flat)
+    reasons += causes
+    if settings.transport_tolerance is not None:
+        rounds = MOST_ROUNDS
+    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    left_out: dict[str, Any] = {
+        key: value for key, value in chosen.items() if getattr(settings, key) is None
+    }
+    if settings.refine is None and times > 1 and along != settings.refine_along:
+        reasons.append("too many cells to divide all")
+        left_out["refine_along"] = along
+    words = ", ".join(f"{key} {value}" for key, value in left_out.items())
+    return replace(settings, **left_out), f"{words}: {', '.join(reasons)}" if words else ""
+
+
+def _choose_cells(
+    settings: DiffusionSettings, grid: Grid, excess: float, colors: int, varies: str
+) -> tuple[int, str]:
+    """How many times as narrow cells are, and along which axes, as of `choose_diffusion`.
+
+    Cells have `excess` times as many optical depths as are thin.
+    """
+    times, along, most = settings.times, settings.refine_along, MOST_CELLS
     if along != varies and along == "xyz" and grid.refine(3).cells > most:
         along, most = varies, 3 * MOST_CELLS // colors
     may_refine = settings.refine is None and not cells_are_shared()
-    while may_refine and times < 9 and depth / times > thin:
+    while may_refine and times < 9 and excess > times:
         if grid.refine(3 * times, along).cells > most:
             break
         times *= 3
-    if depth > thin:
-        reasons.append(f"cells of {depth:.2g} optical depths")
+    return times, along
+
+
+def _choose_rounds(
+    tree: SceneTree, phase: PhaseFunction, left: float, depth: float, is_flat: bool
+) -> tuple[int, int, list[str]]:
+    """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
+    reasons = list[str]()
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     if is_flat or _turns_back(phase):
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
-        rounds, degree = rounds + 1 + (depth / times > THICK), 5
-    elif depth / times > SOFT:
+        rounds, degree = rounds + 1 + (depth > THICK), 5
+    elif depth > SOFT:
         rounds = 1
     elif tree.glows:
         # Around a small bright core diffusion is far too bright, and a single round too dark.
@@ -408,17 +438,7 @@ def choose_diffusion(
         # What faces reflect comes back again and again.
         reasons.append("faces that reflect light")
         rounds = max(rounds, 4)
-    if settings.transport_tolerance is not None:
-        rounds = MOST_ROUNDS
-    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
-    left_out: dict[str, Any] = {
-        key: value for key, value in chosen.items() if getattr(settings, key) is None
-    }
-    if settings.refine is None and times > 1 and along != settings.refine_along:
-        reasons.append("too many cells to divide all")
-        left_out["refine_along"] = along
-    words = ", ".join(f"{key} {value}" for key, value in left_out.items())
-    return replace(settings, **left_out), f"{words}: {', '.join(reasons)}" if words else ""
+    return rounds, degree, reasons
 
 
 def _turns_back(phase: PhaseFunction) -> bool:
