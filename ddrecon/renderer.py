@@ -8,8 +8,9 @@ itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -32,7 +33,7 @@ from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.outgoing import scatter_back, scatter_towards
+from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towards, sum_turned
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
@@ -55,7 +56,7 @@ from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium,
 from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.levels import refine_medium, resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
@@ -157,18 +158,13 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     as_given = replace(settings, refine=1)
     plane, render_settings = scene.ground.plane, scene.render
     medium = _medium_of(coarse, settings)
-    cells = average_cells(medium)
     ambient = ambient_radiance(sources, medium.g).flatten()
-
-    def from_below(even: Tensor, texels: Tensor) -> Moments:
-        """What the ground sends into the box, less the ambient light from everywhere."""
-        return light_from_below(cells, plane, even - ambient, texels)
-
+    from_below = light_from_below(average_cells(medium), plane, ambient)
     lit = light_evenly(scene.ground, sources, coarse.grid, ambient)
     for _ in range(EXCHANGES if coarse.grid.periodic else 1):
         begun = from_below(*reflect(lit, medium, render_settings))
         first = _find_light(coarse, sources, as_given, replace(memory, last={}), begun)
-        glow = _glow(first, plane, multiply_scatters(medium, settings))
+        glow = partial(_glow, first, plane, multiply_scatters(medium, settings))
         lit = light_texels(lit, sources, medium, glow, render_settings)
     sent = reflect(lit, medium, render_settings)
     light_field = _find_light(volume, sources, settings, memory, from_below(*sent))
@@ -290,28 +286,32 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
 
 
 def _glow(
-    light_field: LightField, plane: Plane, has_source: bool
-) -> Callable[[Rays, int], Emission]:
-    """What the medium sends down to a ground, along rays into one of the directions `upwards`.
+    light_field: LightField, plane: Plane, has_source: bool, bundles: Sequence[Rays]
+) -> Emission:
+    """What the medium sends down to a ground, along `bundles` of rays into directions `upwards`.
 
-    Its beams count by what cells receive of them where it `has_source`: that leaves out their
-    forward peak, which the ground receives as direct light.
+    Its `diffuse` light is that along one bundle after another, [N C, z, y, x]. Beams count by what
+    cells receive of them where it `has_source`: that leaves out their forward peak, which the
+    ground receives as direct light.
     """
     if not has_source:
-        return lambda rays, _: _emission(light_field, rays)
-    source = light_field.received.source
-    medium, others = light_field.medium, replace(light_field, beams=(), outside=None)
-    values = harmonics(-upwards(plane)[0], medium.degree).T.to(source.mean)
-    scattered = torch.tensordot(values, source.harmonics(medium.degree), 1)
-    if not medium.is_cellwise:
-        scattered = (1 - medium.forward_fraction) * scattered
-    scattered = unroll(medium.grid, HALO).extend(scattered)
-
-    def glow(rays: Rays, number: int) -> Emission:
-        emission = _emission(others, rays)
-        return replace(emission, diffuse=emission.diffuse + scattered[number])
-
-    return glow
+        each = [_emission(light_field, rays) for rays in bundles]
+        return replace(each[0], diffuse=torch.cat([one.diffuse for one in each]))
+    period, wide = light_field.unrolled()
+    light, degree = scatter_once_more(wide.medium, wide.diffuse), wide.medium.degree
+    values = harmonics(-upwards(plane)[0], degree).T.to(light.mean)
+    diffuse = torch.tensordot(values, light.harmonics(degree), 1)
+    if wide.turned:
+        diffuse = diffuse + torch.stack([sum_turned(wide.medium, r, wide.turned) for r in bundles])
+    diffuse = recompute(light.floored, diffuse)
+    if light_field.has_means:
+        diffuse = sharpen(wide.medium, diffuse.flatten(0, 1)).unflatten(0, (len(bundles), -1))
+    scattered = torch.tensordot(values, light_field.received.source.harmonics(degree), 1)
+    if not wide.medium.is_cellwise:
+        scattered = (1 - wide.medium.forward_fraction) * scattered
+    diffuse = (diffuse + period.extend(scattered)).flatten(0, 1)
+    others = replace(light_field, beams=(), outside=None)
+    return replace(_emission(others, bundles[0]), diffuse=diffuse)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,8 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
+from ddrecon.march import ground as below
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render, solve_light, view_components
@@ -167,6 +170,37 @@ def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.Mo
         return (weights * render(with_values(scene, changed))).sum()
 
     assert_derivatives(total, values, 1e-4)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6, -0.75])
+def test_directions_together_are_each_by_itself(g: float) -> None:
+    glow = random_values(1, *SHAPE)
+    scene = on_ground(half_empty(*SHAPE), g=g, emission=glow, transport_rounds=1)
+    lit = solve_light(scene, SolveMemory())
+    assert lit.ground is not None
+    medium, plane = lit.medium, lit.ground.ground.plane
+    behind = tensor(0.1, 0.2, 0.3)[:, None]
+    texels = texel_centers(medium.grid, plane, behind)
+    ways, angles = below.upwards(plane)
+    sights = below._sights(medium.grid, plane, scene.render, behind.dtype, behind.device)
+    unlit = replace(lit, beams=(), outside=None)
+    source, total = lit.received.source, torch.zeros(3, texels[..., 0].numel()).double()
+    for way, angle, sight in zip(ways, angles, sights, strict=True):
+        one = renderer._emission(unlit, sight.rays)
+        towards = tuple(-way)
+        scattered = (1 - medium.forward_fraction) * source.along(towards)
+        one = replace(one, diffuse=one.diffuse + scattered)
+        seen = march(one, sight, scene.render, behind.expand(3, len(sight.rays.origin)))
+        total = total + angle * way[plane.axis] * (seen - behind)
+    sent = partial(renderer._glow, lit, plane, True)
+    known = below.light_texels(
+        replace(lit.ground, even=behind[:, 0]),
+        [AmbientLight(behind[:, 0])],
+        medium,
+        sent,
+        scene.render,
+    )
+    assert torch.allclose(known.texels.flatten(1), total, rtol=1e-12, atol=1e-13)
 
 
 def test_parts_sum_to_the_picture() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Medium, mean_width, thinness
+from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.third_order import second_difference
@@ -69,13 +69,14 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
         from ddrecon.kernels.cell_function import apply_cell
 
         numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
+        numbers = for_channels(numbers.T, len(means)).T
         given = "diffusion/fused/sharp.h", "Sharp", 1, numbers
         bends = apply_around(bend, means, grid)
         (light,) = apply_cell(*given, means, bends, extinction.field)
         return _whole(light, grid)
 
     def find() -> Tensor:
-        share = thinness(grid, extinction.value, THIN) / 8
+        share = for_channels(thinness(grid, extinction.value, THIN) / 8, len(means))
         return (means - share * apply_around(bend, means, grid)).clamp(min=0)
 
     return _whole(recompute(find), grid)

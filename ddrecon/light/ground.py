@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -170,20 +170,27 @@ def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     return directions, 2 * math.pi / count * power * part ** (power - 1)
 
 
-def light_from_below(medium: Medium, plane: Plane, even: Tensor, texels: Tensor) -> Moments:
-    """Light of a ground at `plane`, not yet scattered, in `medium` (E5.3).
+def light_from_below(
+    medium: Medium, plane: Plane, ambient: Tensor
+) -> Callable[[Tensor, Tensor], Moments]:
+    """What a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
 
-    Its radiance is `even` [C], and in `texels` [C, rows, columns] so much more.
+    It is given the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much more
+    that is. What it returns is less the light that is `ambient` [C] from everywhere.
     """
-    directions, angles = (part.to(even) for part in hemisphere(plane.axis, UPWARDS, 1.0))
+    directions, angles = (part.to(ambient) for part in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
     weights = moment_weights(rays, medium.degree)[..., 0]
-    one, arriving = even.new_ones(1, 1, 1), list[Tensor]()
-    axis, centers = plane.axis, medium.grid.centers(even)
-    for way in directions:
-        (passed,) = attenuate_few(medium, way[None], one)
-        drift = (centers[axis] - plane.height) / way[axis]
-        points = (centers[one] - way[one] * drift for one in plane.across)
-        sent = even.view(-1, 1, 1, 1) + look_up_texels(texels, medium.grid, plane, *points)
-        arriving.append(passed * sent)
-    return Moments.of_sums(torch.tensordot(weights.T, torch.stack(arriving), 1))
+    # Each direction is a moment of its own.
+    passed = attenuate_few(medium, directions, torch.eye(len(directions)).to(ambient)[..., None])
+    axis, centers = plane.axis, medium.grid.centers(ambient)
+    ways = directions.T.view(3, -1, 1, 1, 1)
+    drift = (centers[axis] - plane.height) / ways[axis]
+    points = [centers[one] - ways[one] * drift for one in plane.across]
+
+    def send(even: Tensor, texels: Tensor) -> Moments:
+        more = look_up_texels(texels, medium.grid, plane, *points).transpose(0, 1)
+        sent = passed * ((even - ambient).view(-1, 1, 1, 1) + more)
+        return Moments.of_sums(torch.tensordot(weights.T, sent, 1))
+
+    return send

@@ -154,18 +154,20 @@ class Moments:
         return radiance
 
     def positive_along(self, direction: Vector, more: Tensor | None = None) -> Tensor:
-        """Radiance r = `along` + `more`, floored below m = MARGIN (|L0| + |r - L0|).
+        """Radiance `along` + `more`, `floored`."""
+        radiance = self.along(direction)
+        return self.floored(radiance if more is None else radiance + more)
+
+    def floored(self, radiance: Tensor) -> Tensor:
+        """`radiance` r of this light [..., C, z, y, x], floored below m = MARGIN (|L0| + |r - L0|).
 
         It is r where r >= m, m (1 + r/m)^2 / 4 from there down to -m, and 0 below. E2.3 is negative
         where light is more directed than two terms in angle can say; where g is not 0 so may L0 be,
         since E2.4's source then has either sign. Both mean darkness. Without a flux E2.7's M-matrix
         keeps L0 >= 0, and what a solve leaves below zero is cut off.
         """
-        radiance = self.along(direction)
         if self.flux is None:
             return radiance.clamp(min=0)
-        if more is not None:
-            radiance = radiance + more
         margin = MARGIN * (self.mean.abs() + (radiance - self.mean).abs())
         divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
         floored = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4

@@ -48,7 +48,7 @@ def scatter_towards(
     """
     if light.flux is None:
         return scatter_once_more(medium, light).mean.clamp(min=0)
-    more = recompute(_sum_turned, medium, rays, turned) if turned else None
+    more = recompute(sum_turned, medium, rays, turned) if turned else None
     if is_fused() and not medium.is_cellwise and rays.pane is None:
         from ddrecon.light.fused.outgoing import scatter_fused
 
@@ -74,7 +74,7 @@ def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
     ]
 
 
-def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:
+def sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:
     """What light of all `turned` beams scatters towards the camera of `rays`."""
     towards = rays.towards_eye(medium.grid)
     return functools.reduce(torch.add, (_scatter_turned(medium, beam, towards) for beam in turned))

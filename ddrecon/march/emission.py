@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,7 +13,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
-from ddrecon.medium.coefficients import Coefficient
+from ddrecon.medium.coefficients import Coefficient, for_channels
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.periods import Unrolled
 from ddrecon.numerics.third_order import ThirdOrder
@@ -47,6 +47,7 @@ class Emission:
     [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11). Where the
     volume repeats, fields are those of an unrolled `period`; `from_eye`, if given, is what is seen
     from another place, as other periods are. `inflow`, if given, is what comes in through faces.
+    `extended` are `fields` up to the faces, where they are known.
     """
 
     grid: Grid
@@ -62,6 +63,7 @@ class Emission:
     period: Unrolled | None = None
     from_eye: Callable[[Tensor], Emission] | None = None
     inflow: Inflow | None = None
+    extended: Mapping[str, Tensor] | None = None
 
     @property
     def diffusing(self) -> Coefficient:
@@ -97,10 +99,11 @@ class Emission:
                 plain.append(beam)
                 continue
             lit = replace(self.scattering, field=self.scattering.field * beam.profile)
-            one = replace(self, scattering=lit, beams=(replace(beam, profile=None),))
+            beams = (replace(beam, profile=None),)
+            one = replace(self, scattering=lit, beams=beams, extended=None)
             dark = torch.zeros_like(self.diffuse[:1])
             parts.append(replace(one, diffuse=dark, remaining=None, inflow=None))
-        return [replace(self, beams=tuple(plain)), *parts]
+        return [replace(self, beams=tuple(plain), extended=None), *parts] if parts else [self]
 
     @functools.cached_property
     def fields(self) -> dict[str, Tensor]:
@@ -110,7 +113,9 @@ class Emission:
         `peak` where it is the same everywhere. Where the phase function differs from cell to cell,
         `number` is that of its numbers which does, and `remaining` is what scatters diffuse light.
         """
-        diffuse = self.diffuse if self.emitted is None else self.diffuse * self.diffusing.scale
+        diffuse = self.diffuse
+        if self.emitted is not None:
+            diffuse = diffuse * for_channels(self.diffusing.scale, len(diffuse))
         fields = {"extinction": self.extinction.field, "diffuse": diffuse}
         fields |= {f"mass {index}": beam.mass for index, beam in enumerate(self.beams)}
         if self.scattering.field is not self.extinction.field:

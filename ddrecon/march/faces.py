@@ -20,7 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
-from ddrecon.medium.coefficients import thinness
+from ddrecon.medium.coefficients import for_channels, thinness
 from ddrecon.numerics.remember import remember
 from ddrecon.slabs.slab import Slab
 
@@ -59,7 +59,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
             if name == "diffuse":
                 scale = extinction.scale[: len(field)].view(-1, 1)
                 share = thinness(grid, scale * matter[0][: len(field)], OPAQUE)
-                outside = torch.lerp(outside, line, share)
+                outside = torch.lerp(outside, line, for_channels(share, len(field)))
             else:
                 lit = shine_through(emission.beams[int(name.split()[1])], grid)
                 shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))

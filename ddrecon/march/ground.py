@@ -22,6 +22,7 @@ from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source
 from ddrecon.march.direct import Beamed, rays_against, shine_on, transmittance
 from ddrecon.march.emission import Emission
+from ddrecon.march.faces import extend_fields
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
@@ -68,20 +69,18 @@ def light_texels(
     lit: LitGround,
     sources: Sequence[Source],
     medium: Medium,
-    glow: Callable[[Rays, int], Emission],
+    glow: Callable[[Sequence[Rays]], Emission],
     settings: RenderSettings,
 ) -> LitGround:
     """What is `lit` evenly by `sources`, under `medium` and in its light (E5.1).
 
-    `glow`: what the medium sends along rays into a direction, by its number in `upwards`.
+    `glow`: what the medium sends along bundles of rays into the directions `upwards`. Its `diffuse`
+    light is that towards one bundle after another, [N C, z, y, x].
     """
     grid, plane, ambient = medium.grid, lit.ground.plane, ambient_radiance(sources, lit.even)
     points = texel_centers(grid, plane, lit.even)
     shape, points = points.shape[:2], points.flatten(0, 1)
     behind = ambient.view(-1, 1).expand(-1, len(points))
-
-    def look(sight: Sight, number: int) -> Tensor:
-        return march(glow(sight.rays, number), sight, settings, behind) - behind
 
     def shade(travel: Tensor) -> Tensor:
         return transmittance(medium, rays_against(grid, points, travel), settings) - 1
@@ -89,8 +88,24 @@ def light_texels(
     texels = torch.zeros_like(behind)
     directions, angles = upwards(plane)
     parts = (angles * directions[:, plane.axis]).tolist()
-    for number, sight in enumerate(_sights(grid, plane, settings, behind.dtype, behind.device)):
-        texels = texels + parts[number] * look(sight, number)
+    sights = _sights(grid, plane, settings, behind.dtype, behind.device)
+    sent = glow([sight.rays for sight in sights])
+    each = sent.diffuse.split(len(sent.diffuse) // len(sights))
+    alike = dict[int | None, list[int]]()
+    for number, sight in enumerate(sights):
+        if sight.way is not None:
+            alike.setdefault(sight.way.axis, []).append(number)
+    # Directions across the same slices have their fields up to the faces together.
+    for axis, numbers in alike.items():
+        some = replace(sent, diffuse=torch.cat([each[number] for number in numbers]))
+        fields = extend_fields(some, axis)
+        split = fields["diffuse"].split(len(each[0]))
+        for number, diffuse in zip(numbers, split, strict=True):
+            extended = fields | {"diffuse": diffuse}
+            one = replace(sent, diffuse=each[number], extended=extended)
+            texels = texels + parts[number] * (
+                march(one, sights[number], settings, behind) - behind
+            )
     for sky in sources:
         if isinstance(sky, Sky):
             for travel, vector in zip(sky.travel, sky.vector, strict=True):

@@ -7,6 +7,7 @@ transmittance has a closed form. `integrate_segments` is that; all else says whe
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -140,6 +141,7 @@ def march_rays(
     `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
     """
     emission, hitting, values = sampler.emission, rays.select(crossing.hit), sampler.values
+    sizes = {name: len(field) for name, field in sampler.fields.items()}
 
     def run(chunk: Tensor) -> Tensor:
         chosen = hitting.select(chunk)
@@ -147,7 +149,8 @@ def march_rays(
         sampled, distance = sampler.sample(values, chosen, near, far)
         nodes = Nodes(chosen.origin, chosen.direction, distance)
         before = None if front is None else front[:, chunk]
-        return torch.cat(integrate_segments(emission, sampled, nodes, before))
+        at_nodes = dict(zip(sizes, sampled.split([*sizes.values()], 1), strict=True))
+        return torch.cat(integrate_segments(emission, at_nodes, nodes, before))
 
     count = max(CHUNK_NODES, emission.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
     chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(max(1, count))
@@ -162,14 +165,12 @@ def opacity_of(emission: Emission, mass: Tensor) -> Tensor:
 
 
 def integrate_segments(
-    emission: Emission, values: Tensor, nodes: Nodes, front: Tensor | None = None
+    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Scattered radiance [C, R] from `values` [N, channels, R] at the `nodes`, and mass [K, R].
+    """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R].
 
     `front` [K, R] is the mass between the camera and the first node, 0 if left out.
     """
-    sizes = [len(field) for field in emission.fields.values()]
-    at_nodes = dict(zip(emission.fields, values.split(sizes, 1), strict=True))
     extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
     scattering = extinction if scattering is None else scattering
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)

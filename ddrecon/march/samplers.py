@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -77,9 +78,9 @@ class Sampler:
         return torch.linspace(0, 1, nodes, dtype=like.dtype, device=like.device)
 
     @functools.cached_property
-    def fields(self) -> dict[str, Tensor]:
+    def fields(self) -> Mapping[str, Tensor]:
         """Those of the emission up to the faces of the box, [channels, z + 2, y + 2, x + 2]."""
-        return extend_fields(self.emission, self.way.axis)
+        return self.emission.extended or extend_fields(self.emission, self.way.axis)
 
     @functools.cached_property
     def values(self) -> Tensor:

@@ -373,6 +373,12 @@ def thinness(grid: Grid, extinction: Tensor, depth: float) -> Tensor:
     return 1 / (1 + (given / (1 + 1e-6 * given)).square().square())
 
 
+def for_channels(values: Tensor, count: int) -> Tensor:
+    """`values` [C, ...] of colors for `count` channels, which are theirs again and again."""
+    times = count // len(values)
+    return values.repeat(times, *[1] * (values.ndim - 1)) if times > 1 else values
+
+
 def mean_width(grid: Grid) -> float:
     """That of a cell by whose optical depth it is thin or thick [u]."""
     return float((sum(width**-2 for width in grid.spacing) / 3) ** -0.5)
