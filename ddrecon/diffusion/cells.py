@@ -6,8 +6,6 @@ light is computed in a medium of cells' means, and what it is there is the mean 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -29,18 +27,7 @@ def average_cells(medium: Medium) -> Medium:
 
     Beyond the outermost centers they stay as they are there.
     """
-    names = "extinction", "scattering", "remaining", "absorption"
-    fields = {name: getattr(medium, name).field for name in names}
-    different = {id(field): field for field in fields.values()}
-    means = {key: _average(field, medium.grid) for key, field in different.items()}
-    coefficients = {
-        name: replace(getattr(medium, name), field=means[id(field)])
-        for name, field in fields.items()
-    }
-    emission = medium.emission
-    if emission is not None:
-        emission = _average(emission, medium.grid)
-    return replace(medium, emission=emission, **coefficients)
+    return medium.mapped(lambda field: _average(field, medium.grid), "emission")
 
 
 def _average(field: Tensor, grid: Grid) -> Tensor:

@@ -46,10 +46,8 @@ def scatter_towards(
 
     With what the `turned` beams scatter (E8.12). As `Moments.positive_along` has it.
     """
-    if light.flux is None:
-        return scatter_once_more(medium, light).mean.clamp(min=0)
     more = recompute(sum_turned, medium, rays, turned) if turned else None
-    if is_fused() and not medium.is_cellwise and rays.pane is None:
+    if is_fused() and light.flux and not medium.is_cellwise and rays.pane is None:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)

@@ -93,8 +93,7 @@ def light_texels(
     each = sent.diffuse.split(len(sent.diffuse) // len(sights))
     alike = dict[int | None, list[int]]()
     for number, sight in enumerate(sights):
-        if sight.way is not None:
-            alike.setdefault(sight.way.axis, []).append(number)
+        alike.setdefault(sight.way.axis if sight.way else None, []).append(number)
     # Directions across the same slices have their fields up to the faces together.
     for axis, numbers in alike.items():
         some = replace(sent, diffuse=torch.cat([each[number] for number in numbers]))

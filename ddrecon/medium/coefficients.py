@@ -184,26 +184,30 @@ class Medium:
         """Whether the phase function differs from that of isotropic scattering, or may come to."""
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
 
-    def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
-        """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
+    def mapped(self, function: Callable[[Tensor], Tensor], *others: str, **changed: Any) -> Medium:
+        """With what `function` makes of its coefficients' fields, and of `others` that are fields.
+
+        `changed` are values in place of its own.
+        """
         names = "extinction", "scattering", "remaining", "absorption"
         fields = {name: getattr(self, name).field for name in names}
         # A field that coefficients share, they share there as well.
-        moved = {id(field): put(field) for field in fields.values()}
-        changed: dict[str, Any] = {
-            name: replace(getattr(self, name), field=moved[id(field)])
-            for name, field in fields.items()
-        }
-        others = ["support", "emission", "peak"]
-        phase = self.seen.phase
-        if phase.cells is not None:
-            others += ["g", "mean_cosine", "forward_fraction"]
-            changed["seen"] = SeenPhase(phase.with_cells(put(phase.cells)), self.seen.degree)
+        moved = {id(field): function(field) for field in fields.values()}
+        for name, field in fields.items():
+            changed[name] = replace(getattr(self, name), field=moved[id(field)])
         for name in others:
             value = getattr(self, name)
             if value is not None and tuple(value.shape[-3:]) == self.grid.shape:
-                changed[name] = put(value)
-        return replace(self, grid=grid, **changed)
+                changed[name] = function(value)
+        return replace(self, **changed)
+
+    def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
+        """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
+        others, seen = ["support", "emission", "peak"], self.seen
+        if seen.phase.cells is not None:
+            others += ["g", "mean_cosine", "forward_fraction"]
+            seen = SeenPhase(seen.phase.with_cells(put(seen.phase.cells)), seen.degree)
+        return self.mapped(put, *others, grid=grid, seen=seen)
 
 
 def cut_volume(volume: Volume) -> Volume:
