@@ -58,11 +58,10 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     emits enters as well; `into_ground` is what of all that leaves falls on the ground. Where faces
     refract light, what is `reflected` by them from outside counts as entering, too. `fractions` are
     the same of all that enters; `defect_percent` is what enters and neither is absorbed nor leaves.
-    Of one color each is a number, else a list of three. Raises UsageError where no light enters, or
-    where nobody follows light that is scattered.
+    Of what repeats it is the balance of one period, whose sides nothing crosses. Of one color each
+    is a number, else a list of three. Raises UsageError where no light enters, or where nobody
+    follows light that is scattered.
     """
-    if scene.volume.grid.periodic:
-        raise UsageError("volume.periodic: of a volume that repeats there is no balance")
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
     medium, lit = light_field.medium, light_field.ground
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):
@@ -96,12 +95,15 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     left = absorbed + reflected + (unscattered + scattered).sum(0)
 
     def in_units(unit: Tensor) -> dict[str, Any]:
-        parts = zip(FACES, unscattered / unit, scattered / unit, strict=True)
         return {
             "enters": {name: _plain(power / unit) for name, power in enters.items()},
             **({} if medium.index == 1 else {"reflected": _plain(reflected / unit)}),
             "absorbed": _plain(absorbed / unit),
-            "leaves": {f: {"unscattered": _plain(u), "scattered": _plain(s)} for f, u, s in parts},
+            "leaves": {
+                f: {"unscattered": _plain(u / unit), "scattered": _plain(s / unit)}
+                for f, u, s in zip(FACES, unscattered, scattered, strict=True)
+                if "zyx".index(f[1]) not in medium.grid.periodic
+            },
             **({"into_ground": _plain(into_ground / unit)} if lit else {}),
         }
 
@@ -145,6 +147,13 @@ class _Box:
         """The axis that points up; any where no ground asks for it."""
         return self.lit.ground.plane.axis if self.lit else 1
 
+    @property
+    def areas(self) -> list[float]:
+        """Those of the faces across each axis, 0 where there are none: what repeats has no end."""
+        grid = self.media[0].grid
+        sides = enumerate(grid.extent)
+        return [(axis not in grid.periodic) * math.prod(grid.extent) / side for axis, side in sides]
+
     def cross(self, parts: Sequence[Source]) -> Tensor:
         """What crosses of a light, of those of its `parts` that the ground does not hide."""
         parts = stay_above(parts, self.lit.ground.plane) if self.lit else parts
@@ -181,11 +190,11 @@ class _Box:
 
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
         """What crosses of a `radiance` [C] that is the same everywhere: `sides` are down and up."""
-        extent, nothing = self.media[0].grid.extent, self.media[0].extinction.value * 0
-        areas = [math.prod(extent) / extent[axis] for axis in (0, 0, 1, 1, 2, 2)]
+        nothing = self.media[0].extinction.value * 0
         halves = torch.full((2, len(FACES)), 0.5)
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
-        parts = (halves * torch.tensor(areas, dtype=torch.float64))[..., None].to(radiance.device)
+        areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
+        parts = (halves * areas)[..., None].to(radiance.device)
         falling, given = math.pi * parts * radiance, (Moments(nothing), cell_gradient(nothing))
         index = self.media[0].index
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
@@ -206,20 +215,21 @@ class _Box:
         for axis, side in product(range(3), range(2)):
             lines, size = grid.centers(field), list(grid.spacing)
             lines[axis] = field.new_full((1, 1, 1), (grid.lower, grid.upper)[side][axis])
-            area, size[axis] = math.prod(size) / size[axis], 0.0
-            points = torch.stack(torch.broadcast_tensors(*lines), -1).flatten(0, 2)
+            points, size[axis] = torch.stack(torch.broadcast_tensors(*lines), -1).flatten(0, 2), 0.0
             rays, travel, irradiance = shine_on(light, points, grid, max(grid.spacing), size)
             if ambient is not None and self.lit and self.lit.sent:
                 plane, (even, texels) = self.lit.ground.plane, self.lit.sent
                 met = plane.meet(points, travel)
                 more = look_up_texels(texels, grid, plane, *(met[:, a] for a in plane.across))
                 irradiance = irradiance * ((even - ambient)[:, None] + more)
-            power = area * irradiance * (travel[:, axis] * (2 * side - 1)).clamp(min=0)
-            passing = (power * transmittance(medium, rays, RAY_BY_RAY) for medium in self.media)
+            out = self.areas[axis] / len(points) * (2 * side - 1)
+            power = irradiance * (out * travel[:, axis]).clamp(min=0)
+            media = self.media if bool(power.any()) else ()
+            passing = [power * transmittance(one, rays, RAY_BY_RAY) for one in media] or 2 * [power]
             leaving = torch.stack(torch.broadcast_tensors(power, 0 * power, *passing)).double()
             is_up = travel[:, self.up] > 0
             powers.append(torch.stack([(leaving * ~is_up).sum(2), (leaving * is_up).sum(2)], 1))
-        return torch.stack(powers, 2)
+        return torch.stack(torch.broadcast_tensors(*powers), 2)
 
     def _follow_refracted(self, light: Beamed, turns: int) -> Tensor:
         """What crosses of a beam that faces refract, and reflect inside so often."""
@@ -276,7 +286,7 @@ class _Box:
                 part = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
                 for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
                     moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
-                    if moved:
+                    if moved and axis not in grid.periodic:
                         lost = layer.sum(across, dtype=torch.float64)
                         gone[2 * axis + (moved > 0)] = part * abs(moved) * lost
                 power = power + _split(gone, direction[self.up])
@@ -290,7 +300,9 @@ def _leave_turned(beam: TurnedBeam, grid: Grid, up: int) -> Tensor:
         layers = beam.radiance.unbind(1 + axis)[:: -1 if along > 0 else 1]
         last, before = layers[0], layers[min(1, len(layers) - 1)]
         area = 4 * math.pi * abs(along) * math.prod(grid.spacing) / grid.spacing[axis]
-        power[2 * axis + (along > 0)] = area * (1.5 * last - 0.5 * before).clamp(min=0).sum((1, 2))
+        if axis not in grid.periodic:
+            end = (1.5 * last - 0.5 * before).clamp(min=0)
+            power[2 * axis + (along > 0)] = area * end.sum((1, 2))
     return _split(power, float(beam.direction[up]))
 
 

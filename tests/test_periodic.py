@@ -12,6 +12,7 @@ from media import half_empty, make_scene, render_tangent
 from torch import Tensor
 
 from ddrecon import load_scene
+from ddrecon.balance import find_balance
 from ddrecon.cameras import Camera, look_at
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SceneError
@@ -99,6 +100,29 @@ def test_engines_tangents_and_adjoints_agree(kind: str):
     for name in (*names, "image"):
         one, other = (found[engine, name] for engine in ENGINES)
         assert_near(one, other, 1e-11)
+
+
+@pytest.mark.parametrize("kind", ["fine angles", "white sky", "backward"])
+def test_the_balance_of_a_period_is_half_of_that_of_two(kind: str) -> None:
+    """Nothing leaves by its sides, and by its faces enters what falls on them."""
+    density, settings = half_empty(*SHAPE), KINDS[kind]
+    one = find_balance(repeated(density, **settings))
+    two = find_balance(repeated(torch.cat([density, density]), (2, 3), **settings))
+    area, travel = SHAPE[0] * SHAPE[2] * CELL**2, settings.get("travel")
+    falling = -3 * travel[1] / math.hypot(*travel) if travel else 2 * math.pi * 0.3
+    assert one["enters"] == pytest.approx({"lights.0": falling * area})
+    assert one["leaves"].keys() == {"-y", "+y"}
+    assert two["absorbed"] == pytest.approx(2 * one["absorbed"], rel=1e-8)
+    for face, parts in one["leaves"].items():
+        twice = {way: 2 * power for way, power in parts.items()}
+        assert two["leaves"][face] == pytest.approx(twice, rel=1e-8)
+    assert abs(one["defect_percent"]) < 5
+
+
+def test_a_ground_sends_back_its_part_of_all_that_leaves_a_period_downwards() -> None:
+    one = find_balance(repeated(half_empty(2, 3, 2), **KINDS["ground"]))
+    assert one["into_ground"] == pytest.approx(sum(one["leaves"]["-y"].values()))
+    assert one["enters"]["ground"] == pytest.approx(0.5 * one["into_ground"], rel=0.06)
 
 
 def even(*shape: int) -> Tensor:

@@ -27,8 +27,9 @@ PLUGINS = {
     "medium": ("heterogeneous",),
     "volume": ("gridvolume",),
     "phase": ("hg", "blendphase", "rayleigh", "tabphase"),
-    "shape": ("cube",),
-    "bsdf": ("null",),
+    "shape": ("cube", "rectangle"),
+    "bsdf": ("null", "diffuse"),
+    "texture": ("bitmap",),
     "emitter": ("directional", "point", "constant", "envmap"),
 }
 """Mitsuba's plugins by what they are, which XML says and a dictionary does not."""

@@ -60,7 +60,7 @@ class Layer:
 
     `phase` as in a scene file; `sun`: cosine of the sun with the normal; `cell`: depth of a cell.
     With `across` 0 it is one column, a million times as wide as deep. Else the cells are cubes,
-    `across` optical depths of them.
+    `across` optical depths of them, which may repeat along `periodic` axes.
     """
 
     albedo: float
@@ -69,6 +69,7 @@ class Layer:
     sun: float = 1.0
     cell: float = 0.25
     across: float = 0.0
+    periodic: str = ""
 
     @property
     def shown_depth(self) -> float:
@@ -97,6 +98,7 @@ class Layer:
         half = self.across / 2 or 5e5 * depth
         box = {"min": [-half, -half, -depth], "max": [half, half, 0.0]}
         cells = {"bounds": box, "resolution": [columns, columns, layers], "density": 1.0}
+        cells["periodic"] = list(self.periodic)
         return cells | {"sigma_t": 1.0, "albedo": self.albedo, "phase": self.phase}
 
     def balance(self) -> Seen:

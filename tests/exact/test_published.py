@@ -69,10 +69,11 @@ def test_half_spaces_are_ambartsumians(albedo: float, sun: float):
     ("layer", "truth"),
     [
         (replace(SLAB, across=0.0), VAN_DE_HULST),
+        (replace(SLAB, across=1.0, periodic="xy"), VAN_DE_HULST),
         *((Layer(albedo), h_reflection(albedo, 1.0)) for albedo in (0.5, 0.9, 0.99)),
         (Layer(0.9, sun=0.5), h_reflection(0.9, 0.5)),
     ],
-    ids=["slab", "albedo 0.5", "0.9", "0.99", "slanted"],
+    ids=["slab", "periodic", "albedo 0.5", "0.9", "0.99", "slanted"],
 )
 def test_balances_are_those_of_slabs_and_half_spaces(layer: Layer, truth: dict[str, Any]) -> None:
     """Within 1 %, or 0.2 % of what enters."""

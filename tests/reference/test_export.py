@@ -15,6 +15,7 @@ from media import make_camera, make_scene, random_values
 
 from ddrecon.errors import UsageError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
 from ddrecon.reference.trace import Traced, open_tracer
@@ -74,15 +75,16 @@ def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("with_sky", [False, True])
 def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
-    """Through a camera of either kind, by lights of every kind."""
+    """Through a camera of either kind, by each light, over a ground with and without a map."""
     pytest.importorskip("mitsuba", reason=NEEDED)
-    lights = NEAR
+    lights, reflected = NEAR, COLOR / 4
     if with_sky:
         pytest.importorskip("OpenImageIO")
-        lights = [*NEAR, sky()]
+        lights, reflected = [*NEAR, sky()], random_values(3, 4, 2)
     camera = make_camera(eye=(2.0, 0.5, 0.1), is_perspective=with_sky, half_width=0.6)
     scene = make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
-    scene = replace(scene, lights=lights, views=[View("other", camera)])
+    ground = Ground(reflected, Plane(-0.7, 1))
+    scene = replace(scene, lights=lights, views=[View("other", camera)], ground=ground)
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     np.testing.assert_allclose(
         opened(tmp_path / "scene.xml", seed=5, spp=16),
