@@ -18,12 +18,11 @@ template <class F> struct Place {
 
 // What points n - 1 to n + 2 count for at a place: linearly, and in what third order takes off
 // that. As dual numbers they change with the place along `way`: on a point by the mean of both
-// sides' slopes. Where `is_end`, nothing is taken off before point 0.
+// sides' slopes.
 template <class N> struct Taps {
     N linear[4], bend[4];
 
-    template <class F>
-    INLINE Taps(const Place<F>& place, int size, bool is_end = false, int way = 0) {
+    template <class F> INLINE Taps(const Place<F>& place, int size, int way = 0) {
         const int nearest = (int)(place.q + 0.5);
         const double off = place.q - nearest;
         const bool is_kink = (off < 0 ? -off : off) < KINK<F> * size;
@@ -44,11 +43,17 @@ template <class N> struct Taps {
                 UNROLLED
                 for (int t = 0; t < 4; ++t)
                     linear[t].by[way] = F(0.5) * F((t == center + 1) - (t == center - 1));
-                weight.by[way] = is_end && nearest == 0 ? F(0.25) : F(0);
             }
         }
         UNROLLED
         for (int t = 0; t < 4; ++t) bend[t] = weight * bend[t];
+    }
+    // Linearly for the first point of a field, or the last, that is even beyond it: as all from
+    // there on.
+    INLINE void extend(bool is_first, bool is_last) {
+        for (int t = 2; is_first && t >= 0; --t) linear[t] += linear[t + 1];
+        for (int t = 1; is_last && t < 4; ++t)
+            linear[t] = is_first ? linear[0] : linear[t] + linear[t - 1];
     }
     // Values a `stride` apart, by both: those of plain numbers leave out what counts for nothing.
     template <class M> INLINE auto linearly(const M* value, int stride = 1) const {

@@ -10,6 +10,7 @@ before a slab is handed on as sums along rays, which are as few as a slice has c
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,10 +24,12 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
-from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.numerics.third_order import ThirdOrder, kink_width, ramp
 from ddrecon.slabs.exchange import add_halo, sum_before
 from ddrecon.slabs.slab import Slab, whole_of
 
+LEAST_SLOPE = 1e-6
+"""Beams of a smaller slope enter through no side."""
 MARGIN = 2
 """Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
@@ -39,12 +42,13 @@ def sum_masses(
     The mass is the integral of `field` along the beam, from the box on. Slices are those across the
     axis along which the beam crosses most cells.
 
-    `field`: [K, z, y, x]; outside the box it falls to zero within half a cell, which keeps the mass
-    of the outer half cells. `directions`: [L, 3], unit, array order, the way light travels.
-    `bound`: 1 over the most by which each of two corrections may change a mass, 0 for no limit.
+    `field`: [K, z, y, x]; up to the faces of the box it is as in the outermost cells. `directions`:
+    [L, 3], unit, array order, the way light travels. `bound`: 1 over the most by which each of two
+    corrections may change a mass, 0 for no limit.
 
     Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
     between slices, and its mass is carried back to cells to third order: the two corrections.
+    Slices' sides let it in as faces do (E5.9).
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
@@ -88,17 +92,18 @@ def _sum_mass(
         # Near the ends of a slab rays are missing: there its neighbors' cells are right.
         rays = rays.of_layers(grid.axis, grid.first, grid.last, count)
         before = rays.cut(before)
-    on_slices, bends = rays.look(field)
+    within, bends, missing = rays.look(field)
     # Trapezoids over half steps are more than those over whole ones by
     # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    curved = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
+    curved = torch.cat([torch.zeros_like(within[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
-    passed = on_slices.cumsum(0) - on_slices
+    passed = within.cumsum(0) - within
     if before is not None:
         passed, curved = passed + before[0], curved + before[1]
-    third_order = ThirdOrder(0, 1, bound)
-    mass = passed * step + third_order.bounded(curved * (0.5 * step))
-    entered = rays.to_cells(mass, third_order)
+    outside = 1 - rays.shear.inside(within)
+    limit = ThirdOrder(0, 1, bound * (1 - 0.5 * outside))
+    mass = passed * step + limit.bounded((0.5 * curved - missing) * step)
+    entered = rays.to_cells(mass, ThirdOrder(0, 1, bound))
     return add_halo(grid.own(entered), grid) if isinstance(grid, Slab) else entered, step
 
 
@@ -108,7 +113,7 @@ def _sum_before(field: Tensor, slab: Slab, rays: Part, count: int, is_upwards: b
     def sums(begin: int, end: int) -> Tensor:
         part = rays.of_layers(slab.axis, begin, end, count)
         layers = field.narrow(slab.axis - 3, begin - slab.first, end - begin)
-        found = torch.stack([each.sum(0) for each in part.look(layers)])
+        found = torch.stack([each.sum(0) for each in part.look(layers)[:2]])
         return part.spread(found, rays.shear.lattice)
 
     begin, end = slab.cuts[slab.rank : slab.rank + 2]
@@ -160,13 +165,14 @@ class Part:
         lines = []
         for which, slope in enumerate(whole.slope.tolist()):
             low, cells = (begin, end - begin) if which == cut else (0, whole.size[which])
+            faces = tuple(face - low for face in whole.faces[which])
             drifts, start = (slope * number, slope * (number + count - 1)), low + whole.first[which]
             nearest = max(math.floor(start - max(drifts)) - MARGIN, 0)
             farthest = math.ceil(start + cells - min(drifts)) + MARGIN
             rays = min(farthest, whole.lattice[which]) - nearest
-            lines.append((cells, rays, start - nearest, nearest))
-        size, lattice, first, offset = zip(*lines, strict=True)
-        shear = Shear(whole.slope, size, lattice, first, number)
+            lines.append((cells, rays, start - nearest, faces, nearest))
+        size, lattice, first, faces, offset = zip(*lines, strict=True)
+        shear = Shear(whole.slope, size, lattice, first, faces, number)
         return Part(self.slicing, shear, offset, added, after)
 
     def cut(self, sums: Tensor) -> Tensor:
@@ -179,16 +185,20 @@ class Part:
         (row, column), (rows, columns) = self.offset, self.shear.lattice
         return pad(sums, (column, lattice[1] - column - columns, row, lattice[0] - row - rows))
 
-    def look(self, layers: Tensor) -> tuple[Tensor, Tensor]:
-        """The field on rays: rho_k on slices [N, K, *lattice], and how much it bends between two.
+    def look(self, layers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The field on rays within the box: rho_k on slices [N, K, *lattice], how much it bends
+        between two, and what is missing (E5.9).
 
-        That is rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean of
-        rho_k and rho_(k + 1).
+        It bends by rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean
+        of rho_k and rho_(k + 1).
         """
+        shear = self.shear
         slices = pad(self.slicing.lay(layers), (0, 0, 0, 0, 0, 0, self.added, self.after))
-        on_slices = self.shear.to_rays(slices, 0.0)
-        midway = self.shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
-        return on_slices, midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+        on_slices = shear.to_rays(slices, 0.0)
+        midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+        bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+        inside = shear.inside(on_slices)
+        return on_slices * inside, bends * inside[:-1], on_slices * (1 - inside)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
         """`values` [N, K, *lattice] on the rays at the centers of cells, [K, z, y, x]."""
@@ -202,37 +212,68 @@ class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell. Slices are counted from number `begin` on.
+    there is a ray for every cell. Slices are counted from number `begin` on. The `faces` of the box
+    lie at so many cells, below and above; cells between are of this part or of others.
     """
 
     slope: Tensor
     size: tuple[int, ...]
     lattice: tuple[int, ...]
     first: tuple[int, ...]
+    faces: tuple[tuple[float, ...], ...]
     begin: int = 0
 
     @staticmethod
     def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
-        """The rays that meet so many `slices` of `size` (height, width)."""
+        """The rays that meet so many `slices` of `size` (height, width), or come near."""
         slopes = slope.tolist()
         more = [math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slopes]
-        lattice = tuple(n + own for n, own in zip(size, more, strict=True))
-        first = tuple(own * (s > 0) for own, s in zip(more, slopes, strict=True))
-        return Shear(slope, tuple(size), lattice, first)
+        lattice = tuple(n + own + 3 for n, own in zip(size, more, strict=True))
+        first = tuple(1 + own * (s > 0) for own, s in zip(more, slopes, strict=True))
+        return Shear(slope, tuple(size), lattice, first, tuple((-0.5, n - 0.5) for n in size))
+
+    @functools.cached_property
+    def entries(self) -> Tensor:
+        """On which slice rays enter through a side of the box, [*lattice]."""
+        lines = []
+        for slope, count, first, (low, high) in zip(
+            self.slope, self.lattice, self.first, self.faces, strict=True
+        ):
+            place = torch.arange(count, dtype=slope.dtype, device=slope.device) - first
+            ways = low - place, place - high
+            way = torch.maximum(*ways) if slope == 0 else ways[int(slope < 0)]
+            lines.append(way / slope.abs().clamp(min=LEAST_SLOPE))
+        return torch.maximum(lines[0][:, None], lines[1])
+
+    def inside(self, like: Tensor) -> Tensor:
+        """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].
+
+        There are as many slices as `like` has.
+        """
+        entered = self._numbers(like, 0.5)[:, None, None] - self.entries
+        return ramp(entered, kink_width(entered, self.begin + len(like) + 1))[:, None]
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        They fall to zero one cell beyond their outermost centers.
+        Beyond faces they are as the outermost cells; beyond a part of the box they fall to zero.
         """
-        # Around each slice lies a ring of zeros.
-        points = self._points(slices, shift, self.lattice, self.size, 1, ring=1)
-        return sample_slices(pad(slices, (1, 1, 1, 1)), points).unflatten(-1, self.lattice)
+        (low, high), (left, right) = (
+            (int(low < -0.5), int(high > size - 0.5))
+            for (low, high), size in zip(self.faces, self.size, strict=True)
+        )
+        points = self._points(slices, shift, self.lattice, self.size, 1, (low, left), (high, right))
+        slices = pad(slices, (left, right, low, high))
+        return sample_slices(slices, points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
         points = self._points(values, 0.0, self.size, self.lattice, -1)
         return sample_slices(values, points, third_order).unflatten(-1, self.size)
+
+    def _numbers(self, like: Tensor, shift: float) -> Tensor:
+        count = torch.arange(like.shape[0], dtype=like.dtype, device=like.device)
+        return count + (self.begin + shift)
 
     def _points(
         self,
@@ -241,20 +282,20 @@ class Shear:
         points: tuple[int, ...],
         cells: tuple[int, ...],
         sign: int,
-        ring: int = 0,
+        before: tuple[int, int] = (0, 0),
+        after: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """Where `points` fall among `cells` and those of a `ring` around, [N, count, 2] in [-1, 1].
+        """Where `points` fall among `cells` and more around these, [N, count, 2] in [-1, 1].
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
-        index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + (
-            self.begin + shift
-        )
-        lines = []
-        for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
+        index, lines = self._numbers(like, shift), []
+        rows = zip(self.slope, self.first, points, cells, before, after, strict=True)
+        for slope, first, count, size, low, high in rows:
             drift = sign * (index * slope - first)
             position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
-            lines.append((2 * position + 1 - size) / (size + 2 * ring))
-        rows, columns = lines
-        pairs = torch.broadcast_tensors(columns[:, None], rows[:, :, None])
+            whole = low + size + high
+            lines.append((2 * (position + low) + 1 - whole) / whole)
+        row, column = lines
+        pairs = torch.broadcast_tensors(column[:, None], row[:, :, None])
         return torch.stack(pairs, -1).flatten(1, 2)

@@ -30,39 +30,45 @@ def sum_mass_to_cells(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Ten
 def by_rays(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
     """The mass [z, y, x], and how far each cell's ray stays from the sides [cells].
 
-    From every cell's center back towards the light, a slice at a time: the field on slices, and
-    midway between two of them the mean of both. The sides are the outermost cells' centers.
+    From every cell's center back towards the light, a slice at a time, to the face through which it
+    came: the field on slices, and midway between two of them the mean of both. The sides are the
+    outermost cells' centers.
     """
     speed = [d / h for d, h in zip(direction.tolist(), grid.spacing, strict=True)]
     axis = max(range(3), key=lambda a: abs(speed[a]))
     back = [-s / abs(speed[axis]) for s in speed]
     values = field.tolist()
 
-    def cell_value(place: tuple[int, ...]) -> float:
-        z, y, x = place
-        is_inside = all(0 <= i < size for i, size in zip(place, grid.shape, strict=True))
-        return values[z][y][x] if is_inside else 0.0
-
     def on_slice(slice_index: int, place: list[float]) -> float:
-        """Bilinear within a slice, at `place` [cells]; zeros surround the box."""
+        """Bilinear within a slice, at `place` [cells]; beyond it as in its outermost cells."""
         low = [slice_index if a == axis else math.floor(p) for a, p in enumerate(place)]
         total = 0.0
         for up in itertools.product(*((0,) if a == axis else (0, 1) for a in range(3))):
             corner = tuple(i + u for i, u in zip(low, up, strict=True))
             weights = (1 - abs(place[a] - corner[a]) for a in range(3) if a != axis)
-            total += math.prod(weights) * cell_value(corner)
+            z, y, x = (min(max(i, 0), n - 1) for i, n in zip(corner, grid.shape, strict=True))
+            total += math.prod(weights) * values[z][y][x]
         return total
 
     mass, margin = torch.zeros_like(field), torch.zeros_like(field)
     for cell in itertools.product(*map(range, grid.shape)):
         passed, place, nearest = 0.0, [float(i) for i in cell], math.inf
         index, toward_light = cell[axis], round(back[axis])
-        while 0 <= index + toward_light < grid.shape[axis]:
+        # So many slices lie between the center and the side where light enters.
+        ways = [
+            ((-0.5 if b < 0 else grid.shape[a] - 0.5) - cell[a]) / b
+            for a, b in enumerate(back)
+            if a != axis and b
+        ]
+        for count in itertools.count(1):
+            if not 0 <= index + toward_light < grid.shape[axis]:
+                break
             between = [p + b / 2 for p, b in zip(place, back, strict=True)]
             before = [p + b for p, b in zip(place, back, strict=True)]
             here, there = on_slice(index, place), on_slice(index + toward_light, before)
             midway = (on_slice(index, between) + on_slice(index + toward_light, between)) / 2
-            passed += there + (midway - (here + there) / 2) / 2
+            part = min(max(min(ways, default=count + 1) - (count - 0.5), 0), 1)
+            passed += part * (there + (midway - (here + there) / 2) / 2)
             place, index = before, index + toward_light
         for a in {0, 1, 2} - {axis}:
             ends = cell[a], place[a]

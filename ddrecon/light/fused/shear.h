@@ -8,8 +8,7 @@
 // between two rays, and every interpolation is a sum over shifted rows with the same weights.
 //
 // Of each slice k only those rays matter that meet it or are next to one that does: its window of
-// (height + 3) x (width + 3) rays, from ray floor(q) - 1 on. Those that would lie outside the
-// lattice of rays hold the values of its outermost ray.
+// (height + 3) x (width + 3) rays, from ray floor(q) - 1 on.
 
 namespace ddrecon {
 
@@ -20,6 +19,13 @@ template <class N, class F> INLINE void add_row(
     const int first = begin < 0 ? -begin : 0;
     const int last = size - begin < count ? size - begin : count;
     for (int t = first; t < last; ++t) to[t] += weight * from[begin + t];
+}
+// The same where `from` is even beyond both its ends.
+template <class N, class F> INLINE void add_even_row(
+    N* __restrict to, const N* __restrict from, int begin, int count, int size, F weight) {
+    add_row(to, from, begin, count, size, weight);
+    for (int t = 0; t < count && begin + t < 0; ++t) to[t] += weight * from[0];
+    for (int t = size > begin ? size - begin : 0; t < count; ++t) to[t] += weight * from[size - 1];
 }
 template <class N> INLINE void clear(N* to, int count) {
     for (int t = 0; t < count; ++t) to[t] = N(0);
@@ -35,6 +41,9 @@ INLINE double less_product(double c, double a, double b) {
     return c - a * b;
 #endif
 }
+
+// Beams of a smaller slope enter through no side.
+constexpr double LEAST_SLOPE = 1e-6;
 
 struct Slices {
     int slices, height, width, rows, columns, first_row, first_column, start, slice_stride;
@@ -69,23 +78,76 @@ template <class F, int BLOCK> struct Shear : Slices {
                (long long)row * row_stride;
     }
 
-    // Rays of row i, ghosts of the outermost rows included, on all slices. From `lo` to `hi` they
-    // are in a slice's window.
+    // On which slice a ray `place` cells from cell 0 of slice 0 enters through a side of the box.
+    static INLINE F entry(int place, int cells, F slope) {
+        const F low = F(-0.5) - place, high = place + F(0.5) - cells,
+                size = slope < 0 ? -slope : slope;
+        const F way = slope > 0 ? low : slope < 0 ? high : low > high ? low : high;
+        return way / (size > F(LEAST_SLOPE) ? size : F(LEAST_SLOPE));
+    }
+    static INLINE F entry_slope(F entry, F slope) {
+        return slope > F(LEAST_SLOPE) || slope < -F(LEAST_SLOPE) ? -entry / slope : F(0);
+    }
+    // Which part of a step around a place is in the box, half a step less than `u` after entry.
+    static INLINE F inside(F u) { return u < F(0) ? F(0) : u > F(1) ? F(1) : u; }
+    INLINE F inside_slope(F u) const {
+        const F width = KINK<F> * (slices + 1);
+        return F(0.5) * (F(u > -width && u < 1 + width) + F(u > width && u < 1 - width));
+    }
+
+    // Rays of row i on all slices. From `lo` to `hi` they are in a slice's window, as row m of it.
     struct Rays {
-        int channel, i, ray, begin, end, lo, hi;
-        bool is_ghost;
-        INLINE void meet(const Place<F>& column, int width) {
-            lo = begin > column.n - 1 ? begin : column.n - 1;
-            hi = end < column.n + width + 2 ? end : column.n + width + 2;
-        }
+        int channel, i, begin, end, lo, hi, m;
+        F by_row, by_column[BLOCK], entries[BLOCK];
     };
     INLINE Rays rays_of(int item) const {
-        const int blocks = (columns + BLOCK - 1) / BLOCK, i = item / blocks % (rows + 3) - 1;
-        const int begin = item % blocks * BLOCK;
-        const int end = begin + BLOCK < columns ? begin + BLOCK : columns;
-        const int ray = i < 0 ? 0 : i < rows ? i : rows - 1;
-        return {item / blocks / (rows + 3), i, ray, begin, end, 0, 0, ray != i};
+        const int blocks = (columns + BLOCK - 1) / BLOCK;
+        Rays own;
+        own.channel = item / blocks / rows;
+        own.i = item / blocks % rows;
+        own.begin = item % blocks * BLOCK;
+        own.end = own.begin + BLOCK < columns ? own.begin + BLOCK : columns;
+        own.by_row = entry(own.i - first_row, height, slope_row);
+        for (int t = 0; t < own.end - own.begin; ++t) {
+            const F by_column = entry(own.begin + t - first_column, width, slope_column);
+            own.by_column[t] = by_column;
+            own.entries[t] = own.by_row > by_column ? own.by_row : by_column;
+        }
+        return own;
     }
+    INLINE bool meet(Rays& own, int k) const {
+        const int first = column_place(k).n - 1, last = first + width + 3;
+        own.lo = own.begin > first ? own.begin : first;
+        own.hi = own.end < last ? own.end : last;
+        own.m = own.i - row_place(k).n + 1;
+        return own.m >= 0 && own.m < height + 3 && own.lo < own.hi;
+    }
+    // The field where rays meet slice k, and midway from there to the next.
+    template <class N>
+    INLINE void look(const Rays& own, int k, const N* field, N* values, N* betweens) const {
+        N here[BLOCK + 1], midway[BLOCK + 1];
+        const int size = own.hi - own.lo;
+        const Place<F> c = column_place(k), c_half = column_place(k + 0.5);
+        auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c, F weight) HERE {
+            for (int up = 0; up < 2; ++up) {
+                const int row = own.i - r.n - 1 + up;
+                const int y = row < 0 ? 0 : row < height ? row : height - 1;
+                const N* from = field + cell_row(own.channel, s, y);
+                const F part = weight * (up ? F(1) - r.a : r.a);
+                add_even_row(to, from, own.lo - c.n - 1, size + 1, width, part);
+            }
+        };
+        clear(here, size + 1), clear(midway, size + 1);
+        add_slice(here, k, row_place(k), c, F(1));
+        for (int s = k; k + 1 < slices && s < k + 2; ++s)
+            add_slice(midway, s, row_place(k + 0.5), c_half, F(0.5));
+        INDEPENDENT
+        for (int t = 0; t < size; ++t) {
+            values[t] = c.a * here[t] + (F(1) - c.a) * here[t + 1];
+            betweens[t] = c_half.a * midway[t] + (F(1) - c_half.a) * midway[t + 1];
+        }
+    }
+
     // Cells of one row of slice k, which lie `at` in memory.
     struct Cells {
         int channel, k, row, begin, count;
@@ -101,61 +163,35 @@ template <class F, int BLOCK> struct Shear : Slices {
         return {channel, k, row, begin, count, cell_row(channel, k, row) + begin};
     }
 
-    // The mass on rays, without all but what they pass before a slice, and the correction of that.
+    // The mass on rays (E5.9), and what of it is bounded.
     template <class N>
     INLINE void sum_along_rays(int item, N bound, const N* field, N* masses, N* corrections) const {
         Rays own = rays_of(item);
-        N passed[BLOCK], bends[BLOCK], here[BLOCK + 1], midway[BLOCK + 1], unused[2 * BLOCK];
+        N passed[BLOCK], bends[BLOCK], values[BLOCK], betweens[BLOCK], unused[BLOCK];
         clear(passed, BLOCK), clear(bends, BLOCK);
         for (int k = 0; k < slices; ++k) {
-            const Place<F> r = row_place(k), c = column_place(k);
-            const Place<F> r_half = row_place(k + 0.5), c_half = column_place(k + 0.5);
-            own.meet(c, width);
-            const int lo = own.lo, size = own.hi - lo, m = own.i - r.n + 1;
-            if (own.ray < r.n - 1 || own.ray >= r.n + height + 2 || size <= 0) continue;
-
-            // Rows of slice `s` around the ray, from which columns are interpolated below.
-            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c,
-                                 F weight) HERE {
-                for (int up = 0; up < 2; ++up) {
-                    const int y = own.ray - r.n - 1 + up;
-                    if (y < 0 || y >= height) continue;
-                    const N* from = field + cell_row(own.channel, s, y);
-                    const F part = weight * (up ? F(1) - r.a : r.a);
-                    add_row(to, from, lo - c.n - 1, size + 1, width, part);
-                }
-            };
-            clear(here, size + 1), clear(midway, size + 1);
-            add_slice(here, k, r, c, F(1));
-            if (k + 1 < slices) {
-                add_slice(midway, k, r_half, c_half, F(0.5));
-                add_slice(midway, k + 1, r_half, c_half, F(0.5));
-            }
-
+            if (!meet(own, k)) continue;
+            look(own, k, field, values, betweens);
             // The mass of the slices passed, and of trapezoids over half steps less those over
-            // whole ones. A ghost may not be kept where its ray is.
-            const bool is_kept = m >= 0 && m < height + 3;
-            const long long at = is_kept ? window_row(own.channel, k, m) : 0;
-            N* __restrict mass = is_kept ? masses + at + lo - c.n + 1 : unused;
-            N* __restrict correction =
-                is_kept && corrections ? corrections + at + lo - c.n + 1 : unused + BLOCK;
-            N* __restrict sum = passed + (lo - own.begin);
-            N* __restrict bend = bends + (lo - own.begin);
+            // whole ones.
+            const int first = own.lo - own.begin;
+            const long long at = window_row(own.channel, k, own.m) + own.lo - column_place(k).n + 1;
+            N* __restrict mass = masses + at, * __restrict sum = passed + first;
+            N* __restrict correction = corrections ? corrections + at : unused;
+            N* __restrict bend = bends + first;
+            const F* __restrict entry = own.entries + first;
             const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < slices ? F(1) : F(0);
             INDEPENDENT
-            for (int t = 0; t < size; ++t) {
-                const N value = c.a * here[t] + (F(1) - c.a) * here[t + 1];
-                const N between = c_half.a * midway[t] + (F(1) - c_half.a) * midway[t + 1];
-                const N curved = bend[t] - half * value;
-                const N x = F(0.5) * step * curved;
-                mass[t] = step * sum[t] + bounded(x, bound);
+            for (int t = 0; t < own.hi - own.lo; ++t) {
+                const F u = F(k + 0.5) - entry[t], within = inside(u);
+                const N value = values[t];
+                const N curved = bend[t] - half * inside(u - F(1)) * value;
+                const N x = step * (F(0.5) * curved - (F(1) - within) * value);
+                mass[t] = step * sum[t] + bounded(x, F(0.5) * (F(1) + within) * bound);
                 correction[t] = x;
-                bend[t] = curved + more * (between - F(0.5) * value);
-                sum[t] += value;
+                bend[t] = curved + more * within * (betweens[t] - F(0.5) * value);
+                sum[t] += within * value;
             }
-            if (is_kept && lo == 0 && c.n == 0) masses[at] = mass[0];
-            if (is_kept && own.hi == columns)
-                for (int q = columns - c.n + 1; q < width + 3; ++q) masses[at + q] = mass[size - 1];
         }
     }
 
@@ -216,7 +252,7 @@ template <class F, int BLOCK> struct Shear : Slices {
         if (!varies) return;
         // Slopes along the places of rows and columns.
         typedef Dual<F, 2> N;
-        const Taps<Dual<F>> row_slope(r, rows, own.row == 0);
+        const Taps<Dual<F>> row_slope(r, rows);
         F linear[BLOCK + 3], curved[BLOCK + 3];
         for (int t = 0; t < own.count + 3; ++t) {
             linear[t] = row_slope.linearly(rays + t, window_row_stride).by[0];
@@ -235,10 +271,9 @@ template <class F, int BLOCK> struct Shear : Slices {
             of[ROW][t] = bar[t] * mass.by[ROW];
             of[COLUMN][t] = bar[t] * mass.by[COLUMN];
         };
-        const Taps<N> inner(c, columns, false, COLUMN), first(c, columns, own.begin == 0, COLUMN);
+        const Taps<N> along(c, columns, COLUMN);
         INDEPENDENT
-        for (int t = 1; t < own.count; ++t) change(inner, t);
-        change(first, 0);
+        for (int t = 0; t < own.count; ++t) change(along, t);
         sums += 4 * item;
         sums[0] = -own.k * total(of[ROW], own.count);
         sums[1] = -own.k * total(of[COLUMN], own.count);
@@ -247,88 +282,88 @@ template <class F, int BLOCK> struct Shear : Slices {
 
     // Cotangents of the field on rays, on slices and midway.
     INLINE void sum_back(
-        int item, bool varies, const F* masses, const F* corrections, const F* entered_bar,
-        const F* corrections_bar, F* slices_bar, F* midways_bar, double* sums) const {
+        int item, bool varies, const F* field, const F* masses, const F* corrections,
+        const F* entered_bar, const F* corrections_bar, F* slices_bar, F* midways_bar,
+        double* sums) const {
         Rays own = rays_of(item);
-        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], curved[BLOCK + 6], bar[BLOCK + 3];
-        F of_step[BLOCK], of_bound[BLOCK];
-        clear(passed, BLOCK), clear(bends, BLOCK);
+        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 3], curved[BLOCK + 3], bar[BLOCK];
+        F values[BLOCK], betweens[BLOCK], of_step[BLOCK], of_bound[BLOCK], of_entry[BLOCK];
+        clear(passed, BLOCK), clear(bends, BLOCK), clear(of_entry, BLOCK);
         double by_step = 0, by_bound = 0;
         for (int k = slices - 1; k >= 0; --k) {
+            if (!meet(own, k)) continue;
             const Place<F> r = row_place(k), c = column_place(k);
-            own.meet(c, width);
-            const int lo = own.lo, hi = own.hi, m = own.i - r.n + 1;
-            if (m < 0 || m >= height + 3 || lo >= hi) continue;
-            // With the ghosts beside the outermost rays.
-            const int from = lo == 0 && c.n == 0 ? -1 : lo,
-                      to = hi == columns ? c.n + width + 2 : hi;
-            const long long at = window_row(own.channel, k, m);
-            if (own.is_ghost || from < lo || to > hi)
-                for (int j = from; j < to; ++j)
-                    if (own.is_ghost || j < 0 || j >= columns)
-                        slices_bar[at + j - c.n + 1] = midways_bar[at + j - c.n + 1] = F(0);
-            if (own.is_ghost) continue;
-
             // Of rays, by gathering from cells: rows first, then columns.
             const Taps<F> row(r, rows), column(c, columns);
-            const int size = to - from, left = from - c.n - 2;
+            const int size = own.hi - own.lo, left = own.lo - c.n - 2;
             clear(linear, size + 3), clear(curved, size + 3);
-            auto add_window_row = [&](int m) HERE {
-                for (int t = 0; t < 4; ++t) {
-                    const int y = m - t;
-                    if (y < 0 || y >= height) continue;
-                    const F* whole = entered_bar + cell_row(own.channel, k, y);
-                    const F* part = corrections_bar + cell_row(own.channel, k, y);
-                    add_row(linear, whole, left, size + 3, width, row.linear[t]);
-                    add_row(linear, part, left, size + 3, width, -row.bend[t]);
-                    add_row(curved, part, left, size + 3, width, row.linear[t]);
-                }
-            };
-            if (k > 0) {
-                add_window_row(m);
-                if (own.i == 0 && m == 1) add_window_row(0);
-                if (own.i == rows - 1)
-                    for (int next = m + 1; next < height + 3; ++next) add_window_row(next);
+            for (int t = 0; t < 4; ++t) {
+                const int y = own.m - t;
+                if (y < 0 || y >= height) continue;
+                const F* whole = entered_bar + cell_row(own.channel, k, y);
+                const F* part = corrections_bar + cell_row(own.channel, k, y);
+                add_row(linear, whole, left, size + 3, width, row.linear[t]);
+                add_row(linear, part, left, size + 3, width, -row.bend[t]);
+                add_row(curved, part, left, size + 3, width, row.linear[t]);
             }
             for (int t = 0; t < size; ++t)
                 bar[t] = column.linear[1] * linear[t + 2] + column.linear[2] * linear[t + 1] -
                          column.bend[0] * curved[t + 3] - column.bend[1] * curved[t + 2] -
                          column.bend[2] * curved[t + 1] - column.bend[3] * curved[t];
-            if (from < lo) bar[1] += bar[0];
-            for (int j = hi; j < to; ++j) bar[hi - 1 - from] += bar[j - from];
 
             // Back along the sums.
-            const long long first = at + lo - c.n + 1;
-            const F* __restrict mass = masses + first;
-            const F* __restrict correction = corrections + first;
-            F* __restrict of_slice = slices_bar + first;
-            F* __restrict of_midway = midways_bar + first;
-            F* __restrict sum = passed + (lo - own.begin);
-            F* __restrict bend = bends + (lo - own.begin);
-            const F* __restrict of_mass = bar + (lo - from);
+            const int begin = own.lo - own.begin;
+            const long long at = window_row(own.channel, k, own.m) + own.lo - c.n + 1;
+            const F* __restrict mass = masses + at;
+            const F* __restrict correction = corrections + at;
+            const F* __restrict entry = own.entries + begin;
+            F* __restrict of_slice = slices_bar + at;
+            F* __restrict of_midway = midways_bar + at;
+            F* __restrict sum = passed + begin;
+            F* __restrict bend = bends + begin;
+            const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < slices ? F(0.5) : F(0);
             if (varies) {
-                for (int t = 0; t < hi - lo; ++t) {
-                    const F x = correction[t];
-                    const Bounded<F> part(x, bound);
-                    of_step[t] = of_mass[t] * (mass[t] - part.value + part.by_x * x);
-                    of_bound[t] = of_mass[t] * part.by_bound;
+                look(own, k, field, values, betweens);
+                for (int t = 0; t < size; ++t) {
+                    const F u = F(k + 0.5) - entry[t], within = inside(u), x = correction[t];
+                    const F part = F(0.5) * (F(1) + within), value = values[t];
+                    const Bounded<F> found(x, part * bound);
+                    const F of_bend = bar[t] * found.by_x;
+                    of_step[t] = bar[t] * (mass[t] - found.value + found.by_x * x);
+                    of_bound[t] = bar[t] * found.by_bound * part;
+                    const F of_within = step * value * (sum[t] + of_bend) +
+                                        F(0.5) * bound * bar[t] * found.by_bound +
+                                        more * step * bend[t] * (betweens[t] - F(0.5) * value);
+                    const F of_before = half * F(0.5) * step * (bend[t] + of_bend) * value;
+                    of_entry[begin + t] +=
+                        inside_slope(u - F(1)) * of_before - inside_slope(u) * of_within;
                 }
-                by_step += total(of_step, hi - lo);
-                by_bound += total(of_bound, hi - lo);
+                by_step += total(of_step, size);
+                by_bound += total(of_bound, size);
             }
-            for (int t = 0; t < hi - lo; ++t) {
-                const F of_bend = of_mass[t] * Bounded<F>(correction[t], bound).by_x;
-                // Nothing bends after the last slice.
-                const F bends_on = (k + 1 < slices ? F(2) : F(1)) * bend[t];
-                of_slice[t] = step * sum[t] - F(0.25) * step * (bends_on + of_bend);
-                of_midway[t] = F(0.5) * step * bend[t];
-                sum[t] += of_mass[t];
+            for (int t = 0; t < size; ++t) {
+                const F u = F(k + 0.5) - entry[t], within = inside(u);
+                const F limit = F(0.5) * (F(1) + within) * bound;
+                const F of_bend = bar[t] * Bounded<F>(correction[t], limit).by_x;
+                const F after = more * within * bend[t];
+                const F before = half * inside(u - F(1)) * (bend[t] + of_bend);
+                of_slice[t] = step * (within * sum[t] - F(0.5) * (after + before) -
+                                      (F(1) - within) * of_bend);
+                of_midway[t] = step * after;
+                sum[t] += bar[t];
                 bend[t] += of_bend;
             }
-            if (k == 0)
-                for (int t = 0; t < hi - lo; ++t) of_slice[t] += F(0.25) * step * bend[t];
         }
         if (!varies) return;
+        double by_row = 0, by_column = 0;
+        for (int t = 0; t < own.end - own.begin; ++t) {
+            const F row = own.by_row, column = own.by_column[t];
+            const F part = row > column ? F(1) : row < column ? F(0) : F(0.5);
+            by_row += part * of_entry[t] * entry_slope(row, slope_row);
+            by_column += (F(1) - part) * of_entry[t] * entry_slope(column, slope_column);
+        }
+        sums[4 * item] = by_row;
+        sums[4 * item + 1] = by_column;
         sums[4 * item + 2] = by_step / (double)step;
         sums[4 * item + 3] = by_bound;
     }
@@ -337,36 +372,54 @@ template <class F, int BLOCK> struct Shear : Slices {
     INLINE void look_back(
         int item, bool varies, const F* field, const F* slices_bar, const F* midways_bar,
         F* field_bar, double* sums) const {
+        typedef Dual<F> N;
         const Cells own = cells_of(item);
-        F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];
+        const bool is_first = own.begin == 0, is_last = own.begin + own.count == width;
+        F linear[BLOCK + 5], slopes[BLOCK + 5], of_row[BLOCK], of_column[BLOCK];
         double by_row = 0, by_column = 0;
         F* __restrict out = field_bar + own.at;
-        // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells.
+        // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells,
+        // or have the outermost cells' field beyond these: from one before a cell's taps on.
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
-            typedef Dual<F> N;
             const Place<F> r = row_place(s + shift), c = column_place(s + shift);
             const int up = own.row + r.n - row_place(s).n,
                       left = own.begin + c.n - column_place(s).n;
-            const Taps<N> row(r, height), column(c, width);
-            auto blend = [&](F* to, auto weight_of) HERE {
-                clear(to, own.count + 3);
-                for (int t = 0; t < 4; ++t)
+            Taps<N> row(r, height);
+            row.extend(own.row == 0, own.row == height - 1);
+            auto blend = [&](F* to, F before, F after, auto weight_of) HERE {
+                clear(to, own.count + 5);
+                for (int t = -1; t < 5; ++t)
                     if (up + t >= 0 && up + t < height + 3)
                         add_row(
-                            to, bars + window_row(own.channel, s, up + t), left, own.count + 3,
-                            width + 3, weight * weight_of(row.linear[t]));
+                            to, bars + window_row(own.channel, s, up + t), left - 1, own.count + 5,
+                            width + 3,
+                            weight * (t < 0   ? before
+                                      : t > 3 ? after
+                                              : weight_of(row.linear[t])));
             };
-            blend(linear, [](const N& tap) HERE { return tap.value; });
-            for (int t = 0; t < own.count; ++t)
-                out[t] +=
-                    column.linear[1].value * linear[t + 1] + column.linear[2].value * linear[t + 2];
-            if (!varies) return;
-            blend(slopes, [](const N& tap) HERE { return tap.by[0]; });
+            blend(linear, F(own.row == 0), F(own.row == height - 1), [](const N& tap) HERE {
+                return tap.value;
+            });
+            if (varies) blend(slopes, F(0), F(0), [](const N& tap) HERE { return tap.by[0]; });
             const F* cells = field + own.at;
-            for (int t = 0; t < own.count; ++t) {
-                of_row[t] = cells[t] * column.linearly(slopes + t).value;
-                of_column[t] = cells[t] * column.linearly(linear + t).by[0];
-            }
+            auto add = [&](int begin, int end, bool is_first, bool is_last) HERE {
+                Taps<N> column(c, width);
+                column.extend(is_first, is_last);
+                const F before = F(is_first), after = F(is_last);
+                for (int t = begin; t < end; ++t) {
+                    const N found = column.linearly(linear + t + 1);
+                    out[t] += found.value + before * linear[t] + after * linear[t + 5];
+                    if (!varies) continue;
+                    of_row[t] = cells[t] * (column.linearly(slopes + t + 1).value +
+                                            before * slopes[t] + after * slopes[t + 5]);
+                    of_column[t] = cells[t] * found.by[0];
+                }
+            };
+            const bool is_one = is_first && is_last && own.count == 1;
+            if (is_first) add(0, 1, true, is_one);
+            add(is_first, own.count - is_last, false, false);
+            if (is_last && !is_one) add(own.count - 1, own.count, false, true);
+            if (!varies) return;
             by_row -= (s + shift) * total(of_row, own.count);
             by_column -= (s + shift) * total(of_column, own.count);
         };

@@ -94,7 +94,7 @@ class Shear:
     def launch(self, name: str, given: dict[str, Any], made: dict[str, Any]) -> Tensor:
         """Runs a kernel for all rays, or all cells, of a `field`; the sum of its `sums`, if any."""
         laid, record, varies = given["field"], self.record, given.get("varies", False)
-        lines, length = record["rows"] + 3, record["columns"]
+        lines, length = record["rows"], record["columns"]
         if not name.startswith("sum"):
             lines, length = record["slices"] * record["height"], record["width"]
         items = len(laid) * lines * math.ceil(length / (1 if laid.is_cuda else BLOCK))
@@ -214,8 +214,8 @@ def shear_kernels(bits: int) -> SimpleNamespace:
         "sum_along_rays": "number[3], (const N*)field, (N*)masses, (N*)corrections",
         "carry_to_cells": "number[3], (const N*)masses, (N*)entered",
         "carry_back": "varies, masses, entered_bar, corrections_bar, sums",
-        "sum_back": "varies, masses, corrections, entered_bar, corrections_bar, slices_bar, "
-        "midways_bar, sums",
+        "sum_back": "varies, field, masses, corrections, entered_bar, corrections_bar, "
+        "slices_bar, midways_bar, sums",
         "look_back": "varies, field, slices_bar, midways_bar, field_bar, sums",
     }
     made = {"sum_along_rays": "masses corrections", "carry_to_cells": "entered"}
