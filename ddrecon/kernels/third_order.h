@@ -48,13 +48,6 @@ template <class N> struct Taps {
         UNROLLED
         for (int t = 0; t < 4; ++t) bend[t] = weight * bend[t];
     }
-    // Linearly for the first point of a field, or the last, that is even beyond it: as all from
-    // there on.
-    INLINE void extend(bool is_first, bool is_last) {
-        for (int t = 2; is_first && t >= 0; --t) linear[t] += linear[t + 1];
-        for (int t = 1; is_last && t < 4; ++t)
-            linear[t] = is_first ? linear[0] : linear[t] + linear[t - 1];
-    }
     // Values a `stride` apart, by both: those of plain numbers leave out what counts for nothing.
     template <class M> INLINE auto linearly(const M* value, int stride = 1) const {
         const auto inner = linear[1] * value[stride] + linear[2] * value[2 * stride];

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -29,7 +29,7 @@ from ddrecon.slabs.exchange import add_halo, sum_before
 from ddrecon.slabs.slab import Slab, whole_of
 
 LEAST_SLOPE = 1e-6
-"""Beams of a smaller slope enter through no side."""
+"""A smaller slope counts as this: such beams enter through no side of a grid."""
 MARGIN = 2
 """Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
@@ -141,39 +141,37 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
 class Part:
     """Layers of a grid, in slices, and the rays that meet them.
 
-    These are part of the whole's: from `offset` on in rows and columns. So many slices were `added`
-    before, and so many `after`: where the beam crosses slabs one by one, there is an empty slice at
-    either end, because the field bends there as well.
+    These are part of the whole's: from `offset` on in rows and columns. Beside layers that other
+    ranks go on with is an empty one, as far as interpolation reaches: a `ring`, as of `pad`.
     """
 
     slicing: Slicing
     shear: Shear
     offset: tuple[int, ...] = (0, 0)
-    added: int = 0
-    after: int = 0
+    ring: tuple[int, ...] = (0,) * 6
 
     def of_layers(self, axis: int, begin: int, end: int, count: int) -> Part:
         """Of the whole, in `count` slices, the layers `begin` to `end` along `axis`."""
-        whole, number, added, after = self.shear, 0, 0, 0
-        cut = self.slicing.order.index(1 + axis) - 2
+        whole, cut = self.shear, self.slicing.order.index(1 + axis) - 2
+        ring, number = [0] * 6, 0
+        ring[4 - 2 * axis] = low = int(begin > 0)
+        ring[5 - 2 * axis] = high = int(end < (count if cut < 0 else whole.size[cut]))
+        begin, end = begin - low, end + high
         if cut < 0:
             number = count - end if self.slicing.is_reversed else begin
-            added, after = int(number > 0), int(number + end - begin < count)
-            count = end - begin + added + after
-            number -= added
+            count = end - begin
         # The rays that meet these cells on the first slice, on the last or between.
         lines = []
         for which, slope in enumerate(whole.slope.tolist()):
             low, cells = (begin, end - begin) if which == cut else (0, whole.size[which])
-            faces = tuple(face - low for face in whole.faces[which])
             drifts, start = (slope * number, slope * (number + count - 1)), low + whole.first[which]
             nearest = max(math.floor(start - max(drifts)) - MARGIN, 0)
             farthest = math.ceil(start + cells - min(drifts)) + MARGIN
             rays = min(farthest, whole.lattice[which]) - nearest
-            lines.append((cells, rays, start - nearest, faces, nearest))
+            lines.append((cells, rays, start - nearest, whole.faces[which] - low, nearest))
         size, lattice, first, faces, offset = zip(*lines, strict=True)
         shear = Shear(whole.slope, size, lattice, first, faces, number)
-        return Part(self.slicing, shear, offset, added, after)
+        return Part(self.slicing, shear, offset, tuple(ring))
 
     def cut(self, sums: Tensor) -> Tensor:
         """Those of `sums` [2, K, *lattice] on all rays of the whole that are on these."""
@@ -193,7 +191,7 @@ class Part:
         of rho_k and rho_(k + 1).
         """
         shear = self.shear
-        slices = pad(self.slicing.lay(layers), (0, 0, 0, 0, 0, 0, self.added, self.after))
+        slices = self.slicing.lay(pad(layers, self.ring))
         on_slices = shear.to_rays(slices, 0.0)
         midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
         bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
@@ -202,9 +200,8 @@ class Part:
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
         """`values` [N, K, *lattice] on the rays at the centers of cells, [K, z, y, x]."""
-        shear = replace(self.shear, begin=self.shear.begin + self.added)
-        own = values[self.added : len(values) - self.after]
-        return self.slicing.lift(shear.to_cells(own, third_order))
+        cells = self.slicing.lift(self.shear.to_cells(values, third_order))
+        return pad(cells, [-layers for layers in self.ring])
 
 
 @dataclass(frozen=True)
@@ -212,15 +209,15 @@ class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell. Slices are counted from number `begin` on. The `faces` of the box
-    lie at so many cells, below and above; cells between are of this part or of others.
+    there is a ray for every cell. Slices are counted from number `begin` on. The `faces` by which
+    light enters lie so far from cell 0.
     """
 
     slope: Tensor
     size: tuple[int, ...]
     lattice: tuple[int, ...]
     first: tuple[int, ...]
-    faces: tuple[tuple[float, ...], ...]
+    faces: tuple[float, ...]
     begin: int = 0
 
     @staticmethod
@@ -230,20 +227,20 @@ class Shear:
         more = [math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slopes]
         lattice = tuple(n + own + 3 for n, own in zip(size, more, strict=True))
         first = tuple(1 + own * (s > 0) for own, s in zip(more, slopes, strict=True))
-        return Shear(slope, tuple(size), lattice, first, tuple((-0.5, n - 0.5) for n in size))
+        faces = (-0.5 + n * (s < -LEAST_SLOPE) for n, s in zip(size, slopes, strict=True))
+        return Shear(slope, tuple(size), lattice, first, tuple(faces))
 
     @functools.cached_property
     def entries(self) -> Tensor:
         """On which slice rays enter through a side of the box, [*lattice]."""
-        lines = []
-        for slope, count, first, (low, high) in zip(
-            self.slope, self.lattice, self.first, self.faces, strict=True
-        ):
-            place = torch.arange(count, dtype=slope.dtype, device=slope.device) - first
-            ways = low - place, place - high
-            way = torch.maximum(*ways) if slope == 0 else ways[int(slope < 0)]
-            lines.append(way / slope.abs().clamp(min=LEAST_SLOPE))
-        return torch.maximum(lines[0][:, None], lines[1])
+        steep = torch.where(self.slope.abs() > LEAST_SLOPE, self.slope, LEAST_SLOPE)
+        rows, columns = (
+            (face + first - torch.arange(count, dtype=s.dtype, device=s.device)) / s
+            for s, count, first, face in zip(
+                steep, self.lattice, self.first, self.faces, strict=True
+            )
+        )
+        return torch.maximum(rows[:, None], columns)
 
     def inside(self, like: Tensor) -> Tensor:
         """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].
@@ -256,14 +253,9 @@ class Shear:
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        Beyond faces they are as the outermost cells; beyond a part of the box they fall to zero.
+        Beyond them they are as their outermost cells.
         """
-        (low, high), (left, right) = (
-            (int(low < -0.5), int(high > size - 0.5))
-            for (low, high), size in zip(self.faces, self.size, strict=True)
-        )
-        points = self._points(slices, shift, self.lattice, self.size, 1, (low, left), (high, right))
-        slices = pad(slices, (left, right, low, high))
+        points = self._points(slices, shift, self.lattice, self.size, 1)
         return sample_slices(slices, points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
@@ -282,20 +274,16 @@ class Shear:
         points: tuple[int, ...],
         cells: tuple[int, ...],
         sign: int,
-        before: tuple[int, int] = (0, 0),
-        after: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """Where `points` fall among `cells` and more around these, [N, count, 2] in [-1, 1].
+        """Where `points` fall among `cells`, [N, count, 2] in [-1, 1].
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
         index, lines = self._numbers(like, shift), []
-        rows = zip(self.slope, self.first, points, cells, before, after, strict=True)
-        for slope, first, count, size, low, high in rows:
+        for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
             drift = sign * (index * slope - first)
             position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
-            whole = low + size + high
-            lines.append((2 * (position + low) + 1 - whole) / whole)
+            lines.append((2 * position + 1 - size) / size)
         row, column = lines
         pairs = torch.broadcast_tensors(column[:, None], row[:, :, None])
         return torch.stack(pairs, -1).flatten(1, 2)

@@ -42,7 +42,7 @@ INLINE double less_product(double c, double a, double b) {
 #endif
 }
 
-// Beams of a smaller slope enter through no side.
+// A smaller slope counts as this: such beams enter through no side of a grid.
 constexpr double LEAST_SLOPE = 1e-6;
 
 struct Slices {
@@ -80,13 +80,10 @@ template <class F, int BLOCK> struct Shear : Slices {
 
     // On which slice a ray `place` cells from cell 0 of slice 0 enters through a side of the box.
     static INLINE F entry(int place, int cells, F slope) {
-        const F low = F(-0.5) - place, high = place + F(0.5) - cells,
-                size = slope < 0 ? -slope : slope;
-        const F way = slope > 0 ? low : slope < 0 ? high : low > high ? low : high;
-        return way / (size > F(LEAST_SLOPE) ? size : F(LEAST_SLOPE));
+        return ((slope > 0 ? F(-0.5) : cells - F(0.5)) - place) / slope;
     }
-    static INLINE F entry_slope(F entry, F slope) {
-        return slope > F(LEAST_SLOPE) || slope < -F(LEAST_SLOPE) ? -entry / slope : F(0);
+    static INLINE F steep(F slope) {
+        return slope > F(LEAST_SLOPE) || slope < -F(LEAST_SLOPE) ? slope : F(LEAST_SLOPE);
     }
     // Which part of a step around a place is in the box, half a step less than `u` after entry.
     static INLINE F inside(F u) { return u < F(0) ? F(0) : u > F(1) ? F(1) : u; }
@@ -107,9 +104,9 @@ template <class F, int BLOCK> struct Shear : Slices {
         own.i = item / blocks % rows;
         own.begin = item % blocks * BLOCK;
         own.end = own.begin + BLOCK < columns ? own.begin + BLOCK : columns;
-        own.by_row = entry(own.i - first_row, height, slope_row);
+        own.by_row = entry(own.i - first_row, height, steep(slope_row));
         for (int t = 0; t < own.end - own.begin; ++t) {
-            const F by_column = entry(own.begin + t - first_column, width, slope_column);
+            const F by_column = entry(own.begin + t - first_column, width, steep(slope_column));
             own.by_column[t] = by_column;
             own.entries[t] = own.by_row > by_column ? own.by_row : by_column;
         }
@@ -180,7 +177,7 @@ template <class F, int BLOCK> struct Shear : Slices {
             N* __restrict correction = corrections ? corrections + at : unused;
             N* __restrict bend = bends + first;
             const F* __restrict entry = own.entries + first;
-            const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < slices ? F(1) : F(0);
+            const F half = k > 0 ? F(0.5) : F(0);
             INDEPENDENT
             for (int t = 0; t < own.hi - own.lo; ++t) {
                 const F u = F(k + 0.5) - entry[t], within = inside(u);
@@ -189,7 +186,7 @@ template <class F, int BLOCK> struct Shear : Slices {
                 const N x = step * (F(0.5) * curved - (F(1) - within) * value);
                 mass[t] = step * sum[t] + bounded(x, F(0.5) * (F(1) + within) * bound);
                 correction[t] = x;
-                bend[t] = curved + more * within * (betweens[t] - F(0.5) * value);
+                bend[t] = curved + within * (betweens[t] - F(0.5) * value);
                 sum[t] += within * value;
             }
         }
@@ -321,46 +318,39 @@ template <class F, int BLOCK> struct Shear : Slices {
             F* __restrict of_midway = midways_bar + at;
             F* __restrict sum = passed + begin;
             F* __restrict bend = bends + begin;
-            const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < slices ? F(0.5) : F(0);
-            if (varies) {
-                look(own, k, field, values, betweens);
-                for (int t = 0; t < size; ++t) {
-                    const F u = F(k + 0.5) - entry[t], within = inside(u), x = correction[t];
-                    const F part = F(0.5) * (F(1) + within), value = values[t];
-                    const Bounded<F> found(x, part * bound);
-                    const F of_bend = bar[t] * found.by_x;
+            const F half = k > 0 ? F(0.5) : F(0);
+            if (varies) look(own, k, field, values, betweens);
+            for (int t = 0; t < size; ++t) {
+                const F u = F(k + 0.5) - entry[t], within = inside(u), x = correction[t];
+                const F part = F(0.5) * (F(1) + within), on = F(0.5) * bend[t], value = values[t];
+                const Bounded<F> found(x, part * bound);
+                const F of_bend = bar[t] * found.by_x, back = half * (bend[t] + of_bend);
+                if (varies) {
                     of_step[t] = bar[t] * (mass[t] - found.value + found.by_x * x);
                     of_bound[t] = bar[t] * found.by_bound * part;
-                    const F of_within = step * value * (sum[t] + of_bend) +
-                                        F(0.5) * bound * bar[t] * found.by_bound +
-                                        more * step * bend[t] * (betweens[t] - F(0.5) * value);
-                    const F of_before = half * F(0.5) * step * (bend[t] + of_bend) * value;
-                    of_entry[begin + t] +=
-                        inside_slope(u - F(1)) * of_before - inside_slope(u) * of_within;
+                    const F of_within =
+                        step * (value * (sum[t] + of_bend) + on * (betweens[t] - F(0.5) * value)) +
+                        F(0.5) * bound * bar[t] * found.by_bound;
+                    of_entry[begin + t] += inside_slope(u - F(1)) * F(0.5) * step * back * value -
+                                           inside_slope(u) * of_within;
                 }
-                by_step += total(of_step, size);
-                by_bound += total(of_bound, size);
-            }
-            for (int t = 0; t < size; ++t) {
-                const F u = F(k + 0.5) - entry[t], within = inside(u);
-                const F limit = F(0.5) * (F(1) + within) * bound;
-                const F of_bend = bar[t] * Bounded<F>(correction[t], limit).by_x;
-                const F after = more * within * bend[t];
-                const F before = half * inside(u - F(1)) * (bend[t] + of_bend);
-                of_slice[t] = step * (within * sum[t] - F(0.5) * (after + before) -
-                                      (F(1) - within) * of_bend);
-                of_midway[t] = step * after;
+                of_slice[t] = step * (within * (sum[t] + of_bend - F(0.5) * on) - of_bend -
+                                      F(0.5) * inside(u - F(1)) * back);
+                of_midway[t] = step * within * on;
                 sum[t] += bar[t];
                 bend[t] += of_bend;
             }
+            if (!varies) continue;
+            by_step += total(of_step, size);
+            by_bound += total(of_bound, size);
         }
         if (!varies) return;
         double by_row = 0, by_column = 0;
         for (int t = 0; t < own.end - own.begin; ++t) {
             const F row = own.by_row, column = own.by_column[t];
             const F part = row > column ? F(1) : row < column ? F(0) : F(0.5);
-            by_row += part * of_entry[t] * entry_slope(row, slope_row);
-            by_column += (F(1) - part) * of_entry[t] * entry_slope(column, slope_column);
+            by_row -= part * of_entry[t] * row / steep(slope_row);
+            by_column -= (F(1) - part) * of_entry[t] * column / steep(slope_column);
         }
         sums[4 * item] = by_row;
         sums[4 * item + 1] = by_column;
@@ -372,56 +362,51 @@ template <class F, int BLOCK> struct Shear : Slices {
     INLINE void look_back(
         int item, bool varies, const F* field, const F* slices_bar, const F* midways_bar,
         F* field_bar, double* sums) const {
-        typedef Dual<F> N;
         const Cells own = cells_of(item);
-        const bool is_first = own.begin == 0, is_last = own.begin + own.count == width;
-        F linear[BLOCK + 5], slopes[BLOCK + 5], of_row[BLOCK], of_column[BLOCK];
+        // Cells beyond the outermost ones, whose field is theirs.
+        constexpr int MOST = 3, SIZE = BLOCK + 2 * MOST;
+        const int before = own.begin == 0 ? MOST : 0, above = own.row == 0 ? MOST : 0,
+                  after = own.begin + own.count == width ? MOST : 0,
+                  below = own.row == height - 1 ? MOST : 0;
+        F linear[SIZE + 3], slopes[SIZE + 3], of_row[SIZE], of_column[SIZE];
         double by_row = 0, by_column = 0;
         F* __restrict out = field_bar + own.at;
-        // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells,
-        // or have the outermost cells' field beyond these: from one before a cell's taps on.
+        // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells.
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
+            typedef Dual<F> N;
             const Place<F> r = row_place(s + shift), c = column_place(s + shift);
             const int up = own.row + r.n - row_place(s).n,
                       left = own.begin + c.n - column_place(s).n;
-            Taps<N> row(r, height);
-            row.extend(own.row == 0, own.row == height - 1);
-            auto blend = [&](F* to, F before, F after, auto weight_of) HERE {
-                clear(to, own.count + 5);
-                for (int t = -1; t < 5; ++t)
-                    if (up + t >= 0 && up + t < height + 3)
-                        add_row(
-                            to, bars + window_row(own.channel, s, up + t), left - 1, own.count + 5,
-                            width + 3,
-                            weight * (t < 0   ? before
-                                      : t > 3 ? after
-                                              : weight_of(row.linear[t])));
+            const Taps<N> row(r, height), column(c, width);
+            auto blend = [&](F* to, auto weight_of) HERE {
+                clear(to, SIZE + 3);
+                for (int y = up - above; y <= up + below; ++y)
+                    for (int t = 0; t < 4; ++t)
+                        if (y + t >= 0 && y + t < height + 3)
+                            add_row(
+                                to, bars + window_row(own.channel, s, y + t), left - MOST,
+                                own.count + 2 * MOST + 3, width + 3,
+                                weight * weight_of(row.linear[t]));
             };
-            blend(linear, F(own.row == 0), F(own.row == height - 1), [](const N& tap) HERE {
-                return tap.value;
-            });
-            if (varies) blend(slopes, F(0), F(0), [](const N& tap) HERE { return tap.by[0]; });
-            const F* cells = field + own.at;
-            auto add = [&](int begin, int end, bool is_first, bool is_last) HERE {
-                Taps<N> column(c, width);
-                column.extend(is_first, is_last);
-                const F before = F(is_first), after = F(is_last);
-                for (int t = begin; t < end; ++t) {
-                    const N found = column.linearly(linear + t + 1);
-                    out[t] += found.value + before * linear[t] + after * linear[t + 5];
-                    if (!varies) continue;
-                    of_row[t] = cells[t] * (column.linearly(slopes + t + 1).value +
-                                            before * slopes[t] + after * slopes[t + 5]);
-                    of_column[t] = cells[t] * found.by[0];
-                }
+            auto add = [&](int t, int cell) HERE {
+                const F* rays = linear + t + MOST;
+                out[cell] += column.linear[1].value * rays[1] + column.linear[2].value * rays[2];
             };
-            const bool is_one = is_first && is_last && own.count == 1;
-            if (is_first) add(0, 1, true, is_one);
-            add(is_first, own.count - is_last, false, false);
-            if (is_last && !is_one) add(own.count - 1, own.count, false, true);
+            blend(linear, [](const N& tap) HERE { return tap.value; });
+            for (int t = 0; t < own.count; ++t) add(t, t);
+            for (int t = 1; t <= before; ++t) add(-t, 0);
+            for (int t = 0; t < after; ++t) add(own.count + t, own.count - 1);
             if (!varies) return;
-            by_row -= (s + shift) * total(of_row, own.count);
-            by_column -= (s + shift) * total(of_column, own.count);
+            blend(slopes, [](const N& tap) HERE { return tap.by[0]; });
+            const int size = before + own.count + after;
+            for (int t = 0; t < size; ++t) {
+                const int at = t - before, last = own.count - 1;
+                const F cell = field[own.at + (at < 0 ? 0 : at < last ? at : last)];
+                of_row[t] = cell * column.linearly(slopes + at + MOST).value;
+                of_column[t] = cell * column.linearly(linear + at + MOST).by[0];
+            }
+            by_row -= (s + shift) * total(of_row, size);
+            by_column -= (s + shift) * total(of_column, size);
         };
         gather(slices_bar, own.k, 0, F(1));
         if (own.k + 1 < slices) gather(midways_bar, own.k, 0.5, F(0.5));

@@ -69,22 +69,20 @@ class Shear:
         slice_stride, row_stride = (
             (width, count * width) if is_slices_first else (height * width, width)
         )
-        window = (width + 3, (width + 3) * (count if is_slices_first else height + 3))
-        self.record = {
-            "slices": count,
-            "height": height,
-            "width": width,
-            "rows": rays.lattice[0],
-            "columns": rays.lattice[1],
-            "first_row": rays.first[0],
-            "first_column": rays.first[1],
-            "start": (count - 1) * slice_stride * slicing.is_reversed,
-            "slice_stride": -slice_stride if slicing.is_reversed else slice_stride,
-            "row_stride": row_stride,
-            "window_slice_stride": window[0] if is_slices_first else window[1],
-            "window_row_stride": window[1] if is_slices_first else window[0],
-            "is_slices_first": is_slices_first,
-        }
+        window = (
+            (width + 3) * (1 if is_slices_first else height + 3),
+            (width + 3) * (count if is_slices_first else 1),
+        )
+        start = (count - 1) * slice_stride * slicing.is_reversed
+        slice_stride *= -1 if slicing.is_reversed else 1
+        self.record = dict(
+            zip(
+                _SLICES.split(", "),
+                (count, height, width, *rays.lattice, *rays.first, start, slice_stride)
+                + (row_stride, *window, is_slices_first),
+                strict=True,
+            )
+        )
         self.window = count * (height + 3) * (width + 3)
 
     def turn(self, cells: Tensor) -> Tensor:
