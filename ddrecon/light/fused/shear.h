@@ -113,8 +113,8 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         const N one = entry(own.i - first_row, height, slope_row);
         for (int t = 0; t < own.end - own.begin; ++t) {
             const N other = entry(own.begin + t - first_column, width, slope_column);
-            const F more = value_of(one) - value_of(other);
-            own.entries[t] = more > F(0) ? one : more < F(0) ? other : F(0.5) * (one + other);
+            const F more = value_of(one) - value_of(other), near = KINK<F> * (rows + columns);
+            own.entries[t] = more >= near ? one : more <= -near ? other : F(0.5) * (one + other);
         }
         return own;
     }
