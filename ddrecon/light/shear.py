@@ -243,7 +243,8 @@ class Shear:
         rows, columns = torch.broadcast_tensors(rows[:, None], columns)
         # Through an edge with the mean of both sides' slopes.
         is_edge = (rows - columns).abs() < kink_width(rows, sum(self.lattice))
-        return torch.where(is_edge, 0.5 * (rows + columns), torch.maximum(rows, columns))
+        mean, later = 0.5 * (rows + columns), torch.maximum(rows, columns)
+        return torch.where(is_edge, mean + (later - mean).detach(), later)
 
     def inside(self, like: Tensor) -> Tensor:
         """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].

@@ -114,7 +114,10 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         for (int t = 0; t < own.end - own.begin; ++t) {
             const N other = entry(own.begin + t - first_column, width, slope_column);
             const F more = value_of(one) - value_of(other), near = KINK<F> * (rows + columns);
-            own.entries[t] = more >= near ? one : more <= -near ? other : F(0.5) * (one + other);
+            own.entries[t] = more > F(0) ? one : other;
+            if constexpr (IS_DUAL<N>)
+                if (more < near && more > -near)
+                    own.entries[t].by[0] = F(0.5) * (one.by[0] + other.by[0]);
         }
         return own;
     }
