@@ -181,7 +181,8 @@ def test_each_color_is_a_gray_scene_of_its_own(colored: dict):
     for c in range(3):
         one = {name: color[c : c + 1] for name, color in colored.items()}
         gray = render(make_scene(density, g=0.4, **GRAY | one))[0, 0]
-        torch.testing.assert_close(image[c], gray, rtol=1e-4, atol=0)
+        # Corrections of masses have one bound, by the mean over colors.
+        torch.testing.assert_close(image[c], gray, rtol=5e-4, atol=0)
 
 
 @pytest.mark.parametrize("view", [{}, PARALLEL, INSIDE], ids=str)

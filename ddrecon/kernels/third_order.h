@@ -6,29 +6,28 @@
 namespace ddrecon {
 
 // A place among points on a line, the part a of the way from point n to the next: q = n + a.
-template <class F> struct Place {
+template <class N> struct Place {
     int n;
-    F a;
+    N a;
     double q;
     INLINE explicit Place(double q) : n((int)q), q(q) {
         n -= n > q;
-        a = F(q - n);
+        a = N(q - n);
     }
 };
 
 // What points n - 1 to n + 2 count for at a place: linearly, and in what third order takes off
-// that. As dual numbers they change with the place along `way`: on a point by the mean of both
-// sides' slopes. Where `is_end`, nothing is taken off before point 0.
+// that. As dual numbers they change with the place: on a point by the mean of both sides' slopes.
 template <class N> struct Taps {
+    typedef decltype(value_of(N(0))) F;
     N linear[4], bend[4];
 
-    template <class F>
-    INLINE Taps(const Place<F>& place, int size, bool is_end = false, int way = 0) {
+    INLINE Taps(const Place<N>& place, int size) {
         const int nearest = (int)(place.q + 0.5);
         const double off = place.q - nearest;
         const bool is_kink = (off < 0 ? -off : off) < KINK<F> * size;
-        N a = N(place.a), weight = N(F(0));
-        if constexpr (IS_DUAL<N>) a.by[way] = F(1);
+        const N a = place.a;
+        N weight = N(F(0));
         linear[0] = linear[3] = N(F(0));
         linear[1] = F(1) - a;
         linear[2] = a;
@@ -38,15 +37,9 @@ template <class N> struct Taps {
         bend[1] = F(3) * a - F(2);
         bend[2] = F(1) - F(3) * a;
         bend[3] = a;
-        if constexpr (IS_DUAL<N>) {
-            if (is_kink) {
-                const int center = place.a < F(0.5) ? 1 : 2;
-                UNROLLED
-                for (int t = 0; t < 4; ++t)
-                    linear[t].by[way] = F(0.5) * F((t == center + 1) - (t == center - 1));
-                weight.by[way] = is_end && nearest == 0 ? F(0.25) : F(0);
-            }
-        }
+        if constexpr (IS_DUAL<N>)
+            for (int t = 0, center = a.value < F(0.5) ? 1 : 2; is_kink && t < 4; ++t)
+                linear[t].by[0] = F(0.5) * F((t == center + 1) - (t == center - 1)) * a.by[0];
         UNROLLED
         for (int t = 0; t < 4; ++t) bend[t] = weight * bend[t];
     }

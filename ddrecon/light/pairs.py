@@ -149,7 +149,8 @@ def turn_in_cells(
     # A stack is followed from both its ends: where ranks share cells, each has all of them here.
     fields = [slicing.lay(gather_slabs(field, grid)) for field in (extinction, turned)]
     shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
-    depth, back = (shear.to_rays(field, 0.0) * step for field in fields)
+    path = step * shear.inside(fields[0])
+    depth, back = (shear.to_rays(field, 0.0) * path for field in fields)
 
     # Each layer: what it lets pass and what it turns back, of light from either side. Hyperbolic
     # functions of k over exp(k), in terms that are smooth where a layer is empty.

@@ -10,9 +10,10 @@ before a slab is handed on as sums along rays, which are as few as a slice has c
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,10 +24,12 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
-from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.numerics.third_order import ThirdOrder, kink_width, ramp
 from ddrecon.slabs.exchange import add_halo, sum_before
 from ddrecon.slabs.slab import Slab, whole_of
 
+LEAST_SLOPE = 1e-6
+"""A smaller slope counts as this: such beams enter through no side of a grid."""
 MARGIN = 2
 """Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
@@ -39,12 +42,13 @@ def sum_masses(
     The mass is the integral of `field` along the beam, from the box on. Slices are those across the
     axis along which the beam crosses most cells.
 
-    `field`: [K, z, y, x]; outside the box it falls to zero within half a cell, which keeps the mass
-    of the outer half cells. `directions`: [L, 3], unit, array order, the way light travels.
-    `bound`: 1 over the most by which each of two corrections may change a mass, 0 for no limit.
+    `field`: [K, z, y, x]; up to the faces of the box it is as in the outermost cells. `directions`:
+    [L, 3], unit, array order, the way light travels. `bound`: 1 over the most by which each of two
+    corrections may change a mass, 0 for no limit.
 
     Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
     between slices, and its mass is carried back to cells to third order: the two corrections.
+    Slices' sides let it in as faces do (E5.9).
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
@@ -88,17 +92,18 @@ def _sum_mass(
         # Near the ends of a slab rays are missing: there its neighbors' cells are right.
         rays = rays.of_layers(grid.axis, grid.first, grid.last, count)
         before = rays.cut(before)
-    on_slices, bends = rays.look(field)
+    within, bends, missing = rays.look(field)
     # Trapezoids over half steps are more than those over whole ones by
     # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    curved = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
+    curved = torch.cat([torch.zeros_like(within[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
-    passed = on_slices.cumsum(0) - on_slices
+    passed = within.cumsum(0) - within
     if before is not None:
         passed, curved = passed + before[0], curved + before[1]
-    third_order = ThirdOrder(0, 1, bound)
-    mass = passed * step + third_order.bounded(curved * (0.5 * step))
-    entered = rays.to_cells(mass, third_order)
+    outside = 1 - rays.shear.inside(within)
+    limit = ThirdOrder(0, 1, bound * (1 - 0.5 * outside))
+    mass = passed * step + limit.bounded((0.5 * curved - missing) * step)
+    entered = rays.to_cells(mass, ThirdOrder(0, 1, bound))
     return add_halo(grid.own(entered), grid) if isinstance(grid, Slab) else entered, step
 
 
@@ -108,7 +113,7 @@ def _sum_before(field: Tensor, slab: Slab, rays: Part, count: int, is_upwards: b
     def sums(begin: int, end: int) -> Tensor:
         part = rays.of_layers(slab.axis, begin, end, count)
         layers = field.narrow(slab.axis - 3, begin - slab.first, end - begin)
-        found = torch.stack([each.sum(0) for each in part.look(layers)])
+        found = torch.stack([each.sum(0) for each in part.look(layers)[:2]])
         return part.spread(found, rays.shear.lattice)
 
     begin, end = slab.cuts[slab.rank : slab.rank + 2]
@@ -136,26 +141,25 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
 class Part:
     """Layers of a grid, in slices, and the rays that meet them.
 
-    These are part of the whole's: from `offset` on in rows and columns. So many slices were `added`
-    before, and so many `after`: where the beam crosses slabs one by one, there is an empty slice at
-    either end, because the field bends there as well.
+    These are part of the whole's: from `offset` on in rows and columns. Beside layers that other
+    ranks go on with is an empty one, as far as interpolation reaches: a `ring`, as of `pad`.
     """
 
     slicing: Slicing
     shear: Shear
     offset: tuple[int, ...] = (0, 0)
-    added: int = 0
-    after: int = 0
+    ring: tuple[int, ...] = (0,) * 6
 
     def of_layers(self, axis: int, begin: int, end: int, count: int) -> Part:
         """Of the whole, in `count` slices, the layers `begin` to `end` along `axis`."""
-        whole, number, added, after = self.shear, 0, 0, 0
-        cut = self.slicing.order.index(1 + axis) - 2
+        whole, cut = self.shear, self.slicing.order.index(1 + axis) - 2
+        ring, number = [0] * 6, 0
+        ring[4 - 2 * axis] = low = int(begin > 0)
+        ring[5 - 2 * axis] = high = int(end < (count if cut < 0 else whole.size[cut]))
+        begin, end = begin - low, end + high
         if cut < 0:
             number = count - end if self.slicing.is_reversed else begin
-            added, after = int(number > 0), int(number + end - begin < count)
-            count = end - begin + added + after
-            number -= added
+            count = end - begin
         # The rays that meet these cells on the first slice, on the last or between.
         lines = []
         for which, slope in enumerate(whole.slope.tolist()):
@@ -164,10 +168,10 @@ class Part:
             nearest = max(math.floor(start - max(drifts)) - MARGIN, 0)
             farthest = math.ceil(start + cells - min(drifts)) + MARGIN
             rays = min(farthest, whole.lattice[which]) - nearest
-            lines.append((cells, rays, start - nearest, nearest))
-        size, lattice, first, offset = zip(*lines, strict=True)
-        shear = Shear(whole.slope, size, lattice, first, number)
-        return Part(self.slicing, shear, offset, added, after)
+            lines.append((cells, rays, start - nearest, whole.faces[which] - low, nearest))
+        size, lattice, first, faces, offset = zip(*lines, strict=True)
+        shear = Shear(whole.slope, size, lattice, first, faces, number)
+        return Part(self.slicing, shear, offset, tuple(ring))
 
     def cut(self, sums: Tensor) -> Tensor:
         """Those of `sums` [2, K, *lattice] on all rays of the whole that are on these."""
@@ -179,22 +183,25 @@ class Part:
         (row, column), (rows, columns) = self.offset, self.shear.lattice
         return pad(sums, (column, lattice[1] - column - columns, row, lattice[0] - row - rows))
 
-    def look(self, layers: Tensor) -> tuple[Tensor, Tensor]:
-        """The field on rays: rho_k on slices [N, K, *lattice], and how much it bends between two.
+    def look(self, layers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The field on rays within the box: rho_k on slices [N, K, *lattice], how much it bends
+        between two, and what is missing (E5.9).
 
-        That is rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean of
-        rho_k and rho_(k + 1).
+        It bends by rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean
+        of rho_k and rho_(k + 1).
         """
-        slices = pad(self.slicing.lay(layers), (0, 0, 0, 0, 0, 0, self.added, self.after))
-        on_slices = self.shear.to_rays(slices, 0.0)
-        midway = self.shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
-        return on_slices, midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+        shear = self.shear
+        slices = self.slicing.lay(pad(layers, self.ring))
+        on_slices = shear.to_rays(slices, 0.0)
+        midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+        bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+        inside = shear.inside(on_slices)
+        return on_slices * inside, bends * inside[:-1], on_slices * (1 - inside)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
         """`values` [N, K, *lattice] on the rays at the centers of cells, [K, z, y, x]."""
-        shear = replace(self.shear, begin=self.shear.begin + self.added)
-        own = values[self.added : len(values) - self.after]
-        return self.slicing.lift(shear.to_cells(own, third_order))
+        cells = self.slicing.lift(self.shear.to_cells(values, third_order))
+        return pad(cells, [-layers for layers in self.ring])
 
 
 @dataclass(frozen=True)
@@ -202,37 +209,67 @@ class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell. Slices are counted from number `begin` on.
+    there is a ray for every cell. Slices are counted from number `begin` on. The `faces` by which
+    light enters lie so far from cell 0.
     """
 
     slope: Tensor
     size: tuple[int, ...]
     lattice: tuple[int, ...]
     first: tuple[int, ...]
+    faces: tuple[float, ...]
     begin: int = 0
 
     @staticmethod
     def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
-        """The rays that meet so many `slices` of `size` (height, width)."""
+        """The rays that meet so many `slices` of `size` (height, width), or come near."""
         slopes = slope.tolist()
         more = [math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slopes]
-        lattice = tuple(n + own for n, own in zip(size, more, strict=True))
-        first = tuple(own * (s > 0) for own, s in zip(more, slopes, strict=True))
-        return Shear(slope, tuple(size), lattice, first)
+        lattice = tuple(n + own + 3 for n, own in zip(size, more, strict=True))
+        first = tuple(1 + own * (s > 0) for own, s in zip(more, slopes, strict=True))
+        faces = (-0.5 + n * (s < -LEAST_SLOPE) for n, s in zip(size, slopes, strict=True))
+        return Shear(slope, tuple(size), lattice, first, tuple(faces))
+
+    @functools.cached_property
+    def entries(self) -> Tensor:
+        """On which slice rays enter through a side of the box, [*lattice]."""
+        steep = torch.where(self.slope.abs() > LEAST_SLOPE, self.slope, LEAST_SLOPE)
+        rows, columns = (
+            (face + first - torch.arange(count, dtype=s.dtype, device=s.device)) / s
+            for s, count, first, face in zip(
+                steep, self.lattice, self.first, self.faces, strict=True
+            )
+        )
+        rows, columns = torch.broadcast_tensors(rows[:, None], columns)
+        # Through an edge with the mean of both sides' slopes.
+        is_edge = (rows - columns).abs() < kink_width(rows, sum(self.lattice))
+        mean, later = 0.5 * (rows + columns), torch.maximum(rows, columns)
+        return torch.where(is_edge, mean + (later - mean).detach(), later)
+
+    def inside(self, like: Tensor) -> Tensor:
+        """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].
+
+        There are as many slices as `like` has.
+        """
+        entered = self._numbers(like, 0.5)[:, None, None] - self.entries
+        return ramp(entered, kink_width(entered, self.begin + len(like) + 1))[:, None]
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        They fall to zero one cell beyond their outermost centers.
+        Beyond them they are as their outermost cells.
         """
-        # Around each slice lies a ring of zeros.
-        points = self._points(slices, shift, self.lattice, self.size, 1, ring=1)
-        return sample_slices(pad(slices, (1, 1, 1, 1)), points).unflatten(-1, self.lattice)
+        points = self._points(slices, shift, self.lattice, self.size, 1)
+        return sample_slices(slices, points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
         points = self._points(values, 0.0, self.size, self.lattice, -1)
         return sample_slices(values, points, third_order).unflatten(-1, self.size)
+
+    def _numbers(self, like: Tensor, shift: float) -> Tensor:
+        count = torch.arange(like.shape[0], dtype=like.dtype, device=like.device)
+        return count + (self.begin + shift)
 
     def _points(
         self,
@@ -241,20 +278,16 @@ class Shear:
         points: tuple[int, ...],
         cells: tuple[int, ...],
         sign: int,
-        ring: int = 0,
     ) -> Tensor:
-        """Where `points` fall among `cells` and those of a `ring` around, [N, count, 2] in [-1, 1].
+        """Where `points` fall among `cells`, [N, count, 2] in [-1, 1].
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
-        index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + (
-            self.begin + shift
-        )
-        lines = []
+        index, lines = self._numbers(like, shift), []
         for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
             drift = sign * (index * slope - first)
             position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
-            lines.append((2 * position + 1 - size) / (size + 2 * ring))
-        rows, columns = lines
-        pairs = torch.broadcast_tensors(columns[:, None], rows[:, :, None])
+            lines.append((2 * position + 1 - size) / size)
+        row, column = lines
+        pairs = torch.broadcast_tensors(column[:, None], row[:, :, None])
         return torch.stack(pairs, -1).flatten(1, 2)

@@ -64,8 +64,8 @@ AGREES = [
     *(
         (
             f"Taps<double> taps(Place<double>(10.0 * x), 9); out = taps.{each};",
-            f"typedef Dual<double, 1> N; Taps<N> taps(Place<double>(10.0 * x), 9);"
-            f" out = 10.0 * (taps.{each}).by[0];",
+            f"typedef Dual<double, 1> N; Place<N> at(10.0 * x); at.a.by[0] = 10.0;"
+            f" out = (Taps<N>(at, 9).{each}).by[0];",
         )
         for each in (*(f"linear[{t}]" for t in (1, 2)), *(f"bend[{t}]" for t in range(4)))
     ),

@@ -71,7 +71,8 @@ def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float,
         for bound in (0.0, 1.7):
             given = grid, field, heading, vector(bound).squeeze()
             for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
-                assert_near(found, known, 1e-12)
+                # In one slice all cancels, and rounding is left.
+                torch.testing.assert_close(found, known, rtol=1e-12, atol=5e-13)
 
 
 @pytest.mark.parametrize("along", range(3))

@@ -8,18 +8,24 @@
 // between two rays, and every interpolation is a sum over shifted rows with the same weights.
 //
 // Of each slice k only those rays matter that meet it or are next to one that does: its window of
-// (height + 3) x (width + 3) rays, from ray floor(q) - 1 on. Those that would lie outside the
-// lattice of rays hold the values of its outermost ray.
+// (height + 3) x (width + 3) rays, from ray floor(q) - 1 on.
 
 namespace ddrecon {
 
 // to[t] += weight from[begin + t] for t from 0 to before `count`; `from` has zeros beyond `size`.
 template <class N, class F> INLINE void add_row(
     N* __restrict to, const N* __restrict from, int begin, int count, int size, F weight) {
-    if (weight == F(0)) return;
+    if (!IS_DUAL<F> && value_of(weight) == 0) return;
     const int first = begin < 0 ? -begin : 0;
     const int last = size - begin < count ? size - begin : count;
     for (int t = first; t < last; ++t) to[t] += weight * from[begin + t];
+}
+// The same where `from` is even beyond both its ends.
+template <class N, class F> INLINE void add_even_row(
+    N* __restrict to, const N* __restrict from, int begin, int count, int size, F weight) {
+    add_row(to, from, begin, count, size, weight);
+    for (int t = 0; t < count && begin + t < 0; ++t) to[t] += weight * from[0];
+    for (int t = size > begin ? size - begin : 0; t < count; ++t) to[t] += weight * from[size - 1];
 }
 template <class N> INLINE void clear(N* to, int count) {
     for (int t = 0; t < count; ++t) to[t] = N(0);
@@ -36,6 +42,9 @@ INLINE double less_product(double c, double a, double b) {
 #endif
 }
 
+// A smaller slope counts as this: such beams enter through no side of a grid.
+constexpr double LEAST_SLOPE = 1e-6;
+
 struct Slices {
     int slices, height, width, rows, columns, first_row, first_column, start, slice_stride;
     int row_stride, window_slice_stride, window_row_stride, is_slices_first;
@@ -43,23 +52,24 @@ struct Slices {
 
 // A beam of some slope by rows and by columns, that goes a `step` [u] in a slice; `bound` is that
 // of corrections. An item is a BLOCK of neighbors in a row. N are numbers F, or dual ones.
-template <class F, int BLOCK> struct Shear : Slices {
-    F slope_row, slope_column, step, bound;
+template <class F, int BLOCK, class N> struct Shear : Slices {
+    N slope_row, slope_column, step, bound;
 
-    template <class N> INLINE Shear(const Slices& slices, const N* number)
+    INLINE Shear(const Slices& slices, const N* number)
         : Slices(slices),
-          slope_row(value_of(number[0])),
-          slope_column(value_of(number[1])),
-          step(value_of(number[2])),
-          bound(value_of(number[3])) {}
+          slope_row(number[0]),
+          slope_column(number[1]),
+          step(number[2]),
+          bound(number[3]) {}
 
     // Cell 0 of slice k among rays.
-    INLINE Place<F> row_place(double k) const {
-        return Place<F>(less_product(first_row, k, slope_row));
+    static INLINE Place<N> place(int first, double k, const N& slope) {
+        Place<N> found(less_product(first, k, value_of(slope)));
+        if constexpr (IS_DUAL<N>) found.a.by[0] = F(-k) * slope.by[0];
+        return found;
     }
-    INLINE Place<F> column_place(double k) const {
-        return Place<F>(less_product(first_column, k, slope_column));
-    }
+    INLINE Place<N> row_place(double k) const { return place(first_row, k, slope_row); }
+    INLINE Place<N> column_place(double k) const { return place(first_column, k, slope_column); }
     INLINE long long window_row(int channel, int k, int m) const {
         return (long long)channel * slices * (height + 3) * (width + 3) +
                (long long)k * window_slice_stride + (long long)m * window_row_stride;
@@ -69,23 +79,77 @@ template <class F, int BLOCK> struct Shear : Slices {
                (long long)row * row_stride;
     }
 
-    // Rays of row i, ghosts of the outermost rows included, on all slices. From `lo` to `hi` they
-    // are in a slice's window.
-    struct Rays {
-        int channel, i, ray, begin, end, lo, hi;
-        bool is_ghost;
-        INLINE void meet(const Place<F>& column, int width) {
-            lo = begin > column.n - 1 ? begin : column.n - 1;
-            hi = end < column.n + width + 2 ? end : column.n + width + 2;
+    // On which slice a ray `place` cells from cell 0 of slice 0 enters through a side of the box.
+    static INLINE N entry(int place, int cells, const N& slope) {
+        const F found = value_of(slope);
+        const bool is_steep = found > F(LEAST_SLOPE) || found < -F(LEAST_SLOPE);
+        const F face = is_steep && found < F(0) ? cells - F(0.5) : F(-0.5);
+        return (face - place) / pick(is_steep, slope, N(F(LEAST_SLOPE)));
+    }
+    // Which part of a step around a place is in the box, half a step less than `u` after entry.
+    INLINE N inside(const N& u) const {
+        const F x = value_of(u), held = x < F(0) ? F(0) : x > F(1) ? F(1) : x;
+        if constexpr (IS_DUAL<N>) {
+            const F near = KINK<F> * (slices + 1);
+            const bool is_out = x < -near || x > 1 + near, is_in = x > near && x < 1 - near;
+            return u.chain(held, is_out ? F(0) : is_in ? F(1) : F(0.5));
+        } else {
+            return held;
         }
+    }
+
+    // Rays of row i on all slices. From `lo` to `hi` they are in a slice's window, as row m of it.
+    struct Rays {
+        int channel, i, begin, end, lo, hi, m;
+        N entries[BLOCK];
     };
     INLINE Rays rays_of(int item) const {
-        const int blocks = (columns + BLOCK - 1) / BLOCK, i = item / blocks % (rows + 3) - 1;
-        const int begin = item % blocks * BLOCK;
-        const int end = begin + BLOCK < columns ? begin + BLOCK : columns;
-        const int ray = i < 0 ? 0 : i < rows ? i : rows - 1;
-        return {item / blocks / (rows + 3), i, ray, begin, end, 0, 0, ray != i};
+        const int blocks = (columns + BLOCK - 1) / BLOCK;
+        Rays own;
+        own.channel = item / blocks / rows;
+        own.i = item / blocks % rows;
+        own.begin = item % blocks * BLOCK;
+        own.end = own.begin + BLOCK < columns ? own.begin + BLOCK : columns;
+        const N one = entry(own.i - first_row, height, slope_row);
+        for (int t = 0; t < own.end - own.begin; ++t) {
+            const N other = entry(own.begin + t - first_column, width, slope_column);
+            const F more = value_of(one) - value_of(other), near = KINK<F> * (rows + columns);
+            own.entries[t] = more > F(0) ? one : other;
+            if constexpr (IS_DUAL<N>)
+                if (more < near && more > -near)
+                    own.entries[t].by[0] = F(0.5) * (one.by[0] + other.by[0]);
+        }
+        return own;
     }
+    INLINE bool meet(Rays& own, int k) const {
+        const int first = column_place(k).n - 1, last = first + width + 3;
+        own.lo = own.begin > first ? own.begin : first;
+        own.hi = own.end < last ? own.end : last;
+        own.m = own.i - row_place(k).n + 1;
+        return own.m >= 0 && own.m < height + 3 && own.lo < own.hi;
+    }
+    // The field where rays are a `shift` after slice k: on that, or midway from there to the next.
+    INLINE void look(const Rays& own, int k, double shift, const N* field, N* found) const {
+        const int last = shift > 0 ? k + 1 : k, size = own.hi - own.lo;
+        const Place<N> r = row_place(k + shift), c = column_place(k + shift);
+        const Taps<N> row(r, height), column(c, width);
+        N cells[BLOCK + 3];
+        clear(cells, size + 3);
+        for (int s = k; s <= last && last < slices; ++s)
+            for (int t = 0; t < 4; ++t) {
+                const int y = own.i - r.n + 1 - t, held = y < 0 ? 0 : y < height ? y : height - 1;
+                add_even_row(
+                    cells, field + cell_row(own.channel, s, held), own.lo - c.n - 2, size + 3,
+                    width, (last > k ? F(0.5) : F(1)) * row.linear[t]);
+            }
+        INDEPENDENT
+        for (int t = 0; t < size; ++t) {
+            found[t] = column.linear[1] * cells[t + 2] + column.linear[2] * cells[t + 1];
+            if constexpr (IS_DUAL<N>)
+                found[t] += column.linear[0] * cells[t + 3] + column.linear[3] * cells[t];
+        }
+    }
+
     // Cells of one row of slice k, which lie `at` in memory.
     struct Cells {
         int channel, k, row, begin, count;
@@ -101,281 +165,164 @@ template <class F, int BLOCK> struct Shear : Slices {
         return {channel, k, row, begin, count, cell_row(channel, k, row) + begin};
     }
 
-    // The mass on rays, without all but what they pass before a slice, and the correction of that.
-    template <class N>
-    INLINE void sum_along_rays(int item, N bound, const N* field, N* masses, N* corrections) const {
+    // The mass on rays (E5.9), and what of it is bounded.
+    INLINE void sum_along_rays(int item, const N* field, N* masses, N* corrections) const {
         Rays own = rays_of(item);
-        N passed[BLOCK], bends[BLOCK], here[BLOCK + 1], midway[BLOCK + 1], unused[2 * BLOCK];
+        N passed[BLOCK], bends[BLOCK], values[BLOCK], betweens[BLOCK], unused[BLOCK];
         clear(passed, BLOCK), clear(bends, BLOCK);
         for (int k = 0; k < slices; ++k) {
-            const Place<F> r = row_place(k), c = column_place(k);
-            const Place<F> r_half = row_place(k + 0.5), c_half = column_place(k + 0.5);
-            own.meet(c, width);
-            const int lo = own.lo, size = own.hi - lo, m = own.i - r.n + 1;
-            if (own.ray < r.n - 1 || own.ray >= r.n + height + 2 || size <= 0) continue;
-
-            // Rows of slice `s` around the ray, from which columns are interpolated below.
-            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c,
-                                 F weight) HERE {
-                for (int up = 0; up < 2; ++up) {
-                    const int y = own.ray - r.n - 1 + up;
-                    if (y < 0 || y >= height) continue;
-                    const N* from = field + cell_row(own.channel, s, y);
-                    const F part = weight * (up ? F(1) - r.a : r.a);
-                    add_row(to, from, lo - c.n - 1, size + 1, width, part);
-                }
-            };
-            clear(here, size + 1), clear(midway, size + 1);
-            add_slice(here, k, r, c, F(1));
-            if (k + 1 < slices) {
-                add_slice(midway, k, r_half, c_half, F(0.5));
-                add_slice(midway, k + 1, r_half, c_half, F(0.5));
-            }
-
+            if (!meet(own, k)) continue;
+            look(own, k, 0, field, values), look(own, k, 0.5, field, betweens);
             // The mass of the slices passed, and of trapezoids over half steps less those over
-            // whole ones. A ghost may not be kept where its ray is.
-            const bool is_kept = m >= 0 && m < height + 3;
-            const long long at = is_kept ? window_row(own.channel, k, m) : 0;
-            N* __restrict mass = is_kept ? masses + at + lo - c.n + 1 : unused;
-            N* __restrict correction =
-                is_kept && corrections ? corrections + at + lo - c.n + 1 : unused + BLOCK;
-            N* __restrict sum = passed + (lo - own.begin);
-            N* __restrict bend = bends + (lo - own.begin);
-            const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < slices ? F(1) : F(0);
+            // whole ones.
+            const int first = own.lo - own.begin;
+            const long long at = window_row(own.channel, k, own.m) + own.lo - column_place(k).n + 1;
+            N* __restrict mass = masses + at, * __restrict sum = passed + first;
+            N* __restrict correction = corrections ? corrections + at : unused;
+            N* __restrict bend = bends + first;
+            const N* __restrict entry = own.entries + first;
+            const F half = k > 0 ? F(0.5) : F(0);
             INDEPENDENT
-            for (int t = 0; t < size; ++t) {
-                const N value = c.a * here[t] + (F(1) - c.a) * here[t + 1];
-                const N between = c_half.a * midway[t] + (F(1) - c_half.a) * midway[t + 1];
-                const N curved = bend[t] - half * value;
-                const N x = F(0.5) * step * curved;
-                mass[t] = step * sum[t] + bounded(x, bound);
+            for (int t = 0; t < own.hi - own.lo; ++t) {
+                const N u = F(k + 0.5) - entry[t], within = inside(u), value = values[t];
+                const N curved = bend[t] - half * inside(u - F(1)) * value;
+                const N x = step * (F(0.5) * curved - (F(1) - within) * value);
+                mass[t] = step * sum[t] + bounded(x, F(0.5) * (F(1) + within) * bound);
                 correction[t] = x;
-                bend[t] = curved + more * (between - F(0.5) * value);
-                sum[t] += value;
+                bend[t] = curved + within * (betweens[t] - F(0.5) * value);
+                sum[t] += within * value;
             }
-            if (is_kept && lo == 0 && c.n == 0) masses[at] = mass[0];
-            if (is_kept && own.hi == columns)
-                for (int q = columns - c.n + 1; q < width + 3; ++q) masses[at + q] = mass[size - 1];
         }
     }
 
     // Mass carried from rays to cells: rows of rays around cells are blended, linearly and as third
     // order has it; then four of their columns around a cell.
-    template <class N> struct Blend {
+    struct Blend {
         N linear[BLOCK + 3], curved[BLOCK + 3];
-        INLINE void rows(const Taps<F>& taps, const N* rays, int stride, int count) {
+        INLINE void rows(const Taps<N>& taps, const N* rays, int stride, int count) {
             INDEPENDENT
             for (int t = 0; t < count + 3; ++t) {
                 linear[t] = taps.linearly(rays + t, stride);
                 curved[t] = taps.curved(rays + t, stride);
             }
         }
+        INLINE N correction(const Taps<N>& column, int t) const {
+            return column.linearly(curved + t) + column.curved(linear + t);
+        }
     };
-    template <class T, class N>
-    static INLINE N correction_of(const Taps<T>& column, const N* linear, const N* curved) {
-        return column.linearly(curved) + column.curved(linear);
-    }
-    template <class T, class N> static INLINE N
-    mass_of(const Taps<T>& column, const N* linear, const N* curved, const N& bound) {
-        return column.linearly(linear) - bounded(correction_of(column, linear, curved), bound);
-    }
-    template <class N>
-    INLINE void carry_to_cells(int item, N bound, const N* masses, N* entered) const {
+    INLINE void carry_to_cells(int item, const N* masses, N* entered) const {
         const Cells own = cells_of(item);
         const N* rays = masses + window_row(own.channel, own.k, own.row) + own.begin;
-        const Taps<F> row(row_place(own.k), rows), column(column_place(own.k), columns);
-        Blend<N> blend;
+        const Taps<N> row(row_place(own.k), rows), column(column_place(own.k), columns);
+        Blend blend;
         blend.rows(row, rays, window_row_stride, own.count);
         N* __restrict out = entered + own.at;
         INDEPENDENT
         for (int t = 0; t < own.count; ++t)
-            out[t] = mass_of(column, blend.linear + t, blend.curved + t, bound);
+            out[t] =
+                column.linearly(blend.linear + t) - bounded(blend.correction(column, t), bound);
     }
 
-    // Adjoints gather everything. The correction's cotangent at each cell; and of the numbers, four
-    // in `sums` of each item, what comes by carrying masses back.
+    // Adjoints gather everything: the correction's cotangent at each cell.
     INLINE void carry_back(
-        int item, bool varies, const F* masses, const F* entered_bar, F* corrections_bar,
-        double* sums) const {
+        int item, const F* masses, const F* entered_bar, F* corrections_bar) const {
         const Cells own = cells_of(item);
         const F* rays = masses + window_row(own.channel, own.k, own.row) + own.begin;
-        const Place<F> r = row_place(own.k), c = column_place(own.k);
-        const Taps<F> column(c, columns);
-        Blend<F> blend;
-        blend.rows(Taps<F>(r, rows), rays, window_row_stride, own.count);
+        const Taps<N> row(row_place(own.k), rows), column(column_place(own.k), columns);
+        Blend blend;
+        blend.rows(row, rays, window_row_stride, own.count);
         const F* __restrict bar = entered_bar + own.at;
         F* __restrict out = corrections_bar + own.at;
-        enum { ROW, COLUMN, LIMIT };
-        F of[3][BLOCK];
-        for (int t = 0; t < own.count; ++t) {
-            const F x = correction_of(column, blend.linear + t, blend.curved + t);
-            const Bounded<F> part(x, bound);
-            out[t] = bar[t] * part.by_x;
-            of[LIMIT][t] = -bar[t] * part.by_bound;
-        }
-        if (!varies) return;
-        // Slopes along the places of rows and columns.
-        typedef Dual<F, 2> N;
-        const Taps<Dual<F>> row_slope(r, rows, own.row == 0);
-        F linear[BLOCK + 3], curved[BLOCK + 3];
-        for (int t = 0; t < own.count + 3; ++t) {
-            linear[t] = row_slope.linearly(rays + t, window_row_stride).by[0];
-            curved[t] = row_slope.curved(rays + t, window_row_stride).by[0];
-        }
-        auto change = [&](const Taps<N>& column, int t) HERE {
-            N l[4], b[4];
-            UNROLLED
-            for (int u = 0; u < 4; ++u) {
-                l[u] = N(blend.linear[t + u]);
-                b[u] = N(blend.curved[t + u]);
-                l[u].by[ROW] = linear[t + u];
-                b[u].by[ROW] = curved[t + u];
-            }
-            const N mass = mass_of(column, l, b, N(bound));
-            of[ROW][t] = bar[t] * mass.by[ROW];
-            of[COLUMN][t] = bar[t] * mass.by[COLUMN];
-        };
-        const Taps<N> inner(c, columns, false, COLUMN), first(c, columns, own.begin == 0, COLUMN);
         INDEPENDENT
-        for (int t = 1; t < own.count; ++t) change(inner, t);
-        change(first, 0);
-        sums += 4 * item;
-        sums[0] = -own.k * total(of[ROW], own.count);
-        sums[1] = -own.k * total(of[COLUMN], own.count);
-        sums[3] = total(of[LIMIT], own.count);
+        for (int t = 0; t < own.count; ++t)
+            out[t] = bar[t] * Bounded<F>(blend.correction(column, t), bound).by_x;
     }
 
     // Cotangents of the field on rays, on slices and midway.
     INLINE void sum_back(
-        int item, bool varies, const F* masses, const F* corrections, const F* entered_bar,
-        const F* corrections_bar, F* slices_bar, F* midways_bar, double* sums) const {
+        int item, const F* corrections, const F* entered_bar, const F* corrections_bar,
+        F* slices_bar, F* midways_bar) const {
         Rays own = rays_of(item);
-        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], curved[BLOCK + 6], bar[BLOCK + 3];
-        F of_step[BLOCK], of_bound[BLOCK];
+        F passed[BLOCK], bends[BLOCK], linear[BLOCK + 3], curved[BLOCK + 3], bar[BLOCK];
         clear(passed, BLOCK), clear(bends, BLOCK);
-        double by_step = 0, by_bound = 0;
         for (int k = slices - 1; k >= 0; --k) {
+            if (!meet(own, k)) continue;
             const Place<F> r = row_place(k), c = column_place(k);
-            own.meet(c, width);
-            const int lo = own.lo, hi = own.hi, m = own.i - r.n + 1;
-            if (m < 0 || m >= height + 3 || lo >= hi) continue;
-            // With the ghosts beside the outermost rays.
-            const int from = lo == 0 && c.n == 0 ? -1 : lo,
-                      to = hi == columns ? c.n + width + 2 : hi;
-            const long long at = window_row(own.channel, k, m);
-            if (own.is_ghost || from < lo || to > hi)
-                for (int j = from; j < to; ++j)
-                    if (own.is_ghost || j < 0 || j >= columns)
-                        slices_bar[at + j - c.n + 1] = midways_bar[at + j - c.n + 1] = F(0);
-            if (own.is_ghost) continue;
-
             // Of rays, by gathering from cells: rows first, then columns.
             const Taps<F> row(r, rows), column(c, columns);
-            const int size = to - from, left = from - c.n - 2;
+            const int size = own.hi - own.lo, left = own.lo - c.n - 2;
             clear(linear, size + 3), clear(curved, size + 3);
-            auto add_window_row = [&](int m) HERE {
-                for (int t = 0; t < 4; ++t) {
-                    const int y = m - t;
-                    if (y < 0 || y >= height) continue;
-                    const F* whole = entered_bar + cell_row(own.channel, k, y);
-                    const F* part = corrections_bar + cell_row(own.channel, k, y);
-                    add_row(linear, whole, left, size + 3, width, row.linear[t]);
-                    add_row(linear, part, left, size + 3, width, -row.bend[t]);
-                    add_row(curved, part, left, size + 3, width, row.linear[t]);
-                }
-            };
-            if (k > 0) {
-                add_window_row(m);
-                if (own.i == 0 && m == 1) add_window_row(0);
-                if (own.i == rows - 1)
-                    for (int next = m + 1; next < height + 3; ++next) add_window_row(next);
+            for (int t = 0; t < 4; ++t) {
+                const int y = own.m - t;
+                if (y < 0 || y >= height) continue;
+                const F* whole = entered_bar + cell_row(own.channel, k, y);
+                const F* part = corrections_bar + cell_row(own.channel, k, y);
+                add_row(linear, whole, left, size + 3, width, row.linear[t]);
+                add_row(linear, part, left, size + 3, width, -row.bend[t]);
+                add_row(curved, part, left, size + 3, width, row.linear[t]);
             }
             for (int t = 0; t < size; ++t)
                 bar[t] = column.linear[1] * linear[t + 2] + column.linear[2] * linear[t + 1] -
                          column.bend[0] * curved[t + 3] - column.bend[1] * curved[t + 2] -
                          column.bend[2] * curved[t + 1] - column.bend[3] * curved[t];
-            if (from < lo) bar[1] += bar[0];
-            for (int j = hi; j < to; ++j) bar[hi - 1 - from] += bar[j - from];
 
             // Back along the sums.
-            const long long first = at + lo - c.n + 1;
-            const F* __restrict mass = masses + first;
-            const F* __restrict correction = corrections + first;
-            F* __restrict of_slice = slices_bar + first;
-            F* __restrict of_midway = midways_bar + first;
-            F* __restrict sum = passed + (lo - own.begin);
-            F* __restrict bend = bends + (lo - own.begin);
-            const F* __restrict of_mass = bar + (lo - from);
-            if (varies) {
-                for (int t = 0; t < hi - lo; ++t) {
-                    const F x = correction[t];
-                    const Bounded<F> part(x, bound);
-                    of_step[t] = of_mass[t] * (mass[t] - part.value + part.by_x * x);
-                    of_bound[t] = of_mass[t] * part.by_bound;
-                }
-                by_step += total(of_step, hi - lo);
-                by_bound += total(of_bound, hi - lo);
-            }
-            for (int t = 0; t < hi - lo; ++t) {
-                const F of_bend = of_mass[t] * Bounded<F>(correction[t], bound).by_x;
-                // Nothing bends after the last slice.
-                const F bends_on = (k + 1 < slices ? F(2) : F(1)) * bend[t];
-                of_slice[t] = step * sum[t] - F(0.25) * step * (bends_on + of_bend);
-                of_midway[t] = F(0.5) * step * bend[t];
-                sum[t] += of_mass[t];
+            const int begin = own.lo - own.begin;
+            const long long at = window_row(own.channel, k, own.m) + own.lo - c.n + 1;
+            const F* __restrict correction = corrections + at;
+            const F* __restrict entry = own.entries + begin;
+            F* __restrict of_slice = slices_bar + at;
+            F* __restrict of_midway = midways_bar + at;
+            F* __restrict sum = passed + begin;
+            F* __restrict bend = bends + begin;
+            const F half = k > 0 ? F(0.5) : F(0);
+            INDEPENDENT
+            for (int t = 0; t < size; ++t) {
+                const F u = F(k + 0.5) - entry[t], within = inside(u), on = F(0.5) * bend[t];
+                const F limit = F(0.5) * (F(1) + within) * bound;
+                const F of_bend = bar[t] * Bounded<F>(correction[t], limit).by_x;
+                const F back = half * inside(u - F(1)) * (bend[t] + of_bend);
+                of_slice[t] =
+                    step * (within * (sum[t] + of_bend - F(0.5) * on) - of_bend - F(0.5) * back);
+                of_midway[t] = step * within * on;
+                sum[t] += bar[t];
                 bend[t] += of_bend;
             }
-            if (k == 0)
-                for (int t = 0; t < hi - lo; ++t) of_slice[t] += F(0.25) * step * bend[t];
         }
-        if (!varies) return;
-        sums[4 * item + 2] = by_step / (double)step;
-        sums[4 * item + 3] = by_bound;
     }
 
     // Adds those of the field's cells, from what `sum_back` has left on rays.
-    INLINE void look_back(
-        int item, bool varies, const F* field, const F* slices_bar, const F* midways_bar,
-        F* field_bar, double* sums) const {
+    INLINE void look_back(int item, const F* slices_bar, const F* midways_bar, F* field_bar) const {
         const Cells own = cells_of(item);
-        F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];
-        double by_row = 0, by_column = 0;
+        // Cells beyond the outermost ones, whose field is theirs.
+        constexpr int MOST = 3;
+        const int above = own.row == 0 ? MOST : 0, below = own.row == height - 1 ? MOST : 0;
+        F linear[BLOCK + 2 * MOST + 3];
         F* __restrict out = field_bar + own.at;
         // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells.
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
-            typedef Dual<F> N;
             const Place<F> r = row_place(s + shift), c = column_place(s + shift);
             const int up = own.row + r.n - row_place(s).n,
                       left = own.begin + c.n - column_place(s).n;
-            const Taps<N> row(r, height), column(c, width);
-            auto blend = [&](F* to, auto weight_of) HERE {
-                clear(to, own.count + 3);
+            const Taps<F> row(r, height), column(c, width);
+            clear(linear, own.count + 2 * MOST + 3);
+            for (int y = up - above; y <= up + below; ++y)
                 for (int t = 0; t < 4; ++t)
-                    if (up + t >= 0 && up + t < height + 3)
+                    if (y + t >= 0 && y + t < height + 3)
                         add_row(
-                            to, bars + window_row(own.channel, s, up + t), left, own.count + 3,
-                            width + 3, weight * weight_of(row.linear[t]));
+                            linear, bars + window_row(own.channel, s, y + t), left - MOST,
+                            own.count + 2 * MOST + 3, width + 3, weight * row.linear[t]);
+            auto add = [&](int t, int cell) HERE {
+                out[cell] += column.linearly(linear + t + MOST);
             };
-            blend(linear, [](const N& tap) HERE { return tap.value; });
-            for (int t = 0; t < own.count; ++t)
-                out[t] +=
-                    column.linear[1].value * linear[t + 1] + column.linear[2].value * linear[t + 2];
-            if (!varies) return;
-            blend(slopes, [](const N& tap) HERE { return tap.by[0]; });
-            const F* cells = field + own.at;
-            for (int t = 0; t < own.count; ++t) {
-                of_row[t] = cells[t] * column.linearly(slopes + t).value;
-                of_column[t] = cells[t] * column.linearly(linear + t).by[0];
-            }
-            by_row -= (s + shift) * total(of_row, own.count);
-            by_column -= (s + shift) * total(of_column, own.count);
+            for (int t = 0; t < own.count; ++t) add(t, t);
+            for (int t = 1; own.begin == 0 && t <= MOST; ++t) add(-t, 0);
+            for (int t = 0; own.begin + own.count == width && t < MOST; ++t)
+                add(own.count + t, own.count - 1);
         };
         gather(slices_bar, own.k, 0, F(1));
         if (own.k + 1 < slices) gather(midways_bar, own.k, 0.5, F(0.5));
         if (own.k > 0) gather(midways_bar, own.k - 1, 0.5, F(0.5));
-        if (!varies) return;
-        sums[4 * item] = by_row;
-        sums[4 * item + 1] = by_column;
     }
 };
 

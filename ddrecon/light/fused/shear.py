@@ -36,9 +36,9 @@ def sum_masses(
     """
     shears, numbers = _cross(grid, directions)
     bounds = torch.as_tensor(bound).to(numbers).expand(len(numbers), 1)
-    numbers = torch.cat([numbers, bounds], 1)
-    has_adjoint = torch.is_grad_enabled() and (field.requires_grad or numbers.requires_grad)
-    entered, *_ = _Masses.apply(shears, has_adjoint, field, numbers)
+    varied = field.requires_grad or numbers.requires_grad or bounds.requires_grad
+    has_adjoint = torch.is_grad_enabled() and varied
+    entered, *_ = _Masses.apply(shears, has_adjoint, field, numbers, bounds)
     return entered, numbers[:, 2]
 
 
@@ -69,54 +69,44 @@ class Shear:
         slice_stride, row_stride = (
             (width, count * width) if is_slices_first else (height * width, width)
         )
-        window = (width + 3, (width + 3) * (count if is_slices_first else height + 3))
-        self.record = {
-            "slices": count,
-            "height": height,
-            "width": width,
-            "rows": rays.lattice[0],
-            "columns": rays.lattice[1],
-            "first_row": rays.first[0],
-            "first_column": rays.first[1],
-            "start": (count - 1) * slice_stride * slicing.is_reversed,
-            "slice_stride": -slice_stride if slicing.is_reversed else slice_stride,
-            "row_stride": row_stride,
-            "window_slice_stride": window[0] if is_slices_first else window[1],
-            "window_row_stride": window[1] if is_slices_first else window[0],
-            "is_slices_first": is_slices_first,
-        }
+        window = (
+            (width + 3) * (1 if is_slices_first else height + 3),
+            (width + 3) * (count if is_slices_first else 1),
+        )
+        start = (count - 1) * slice_stride * slicing.is_reversed
+        slice_stride *= -1 if slicing.is_reversed else 1
+        sizes = count, height, width, *rays.lattice, *rays.first
+        strides = start, slice_stride, row_stride, *window, is_slices_first
+        self.record = dict(zip(_SLICES.split(", "), (*sizes, *strides), strict=True))
         self.window = count * (height + 3) * (width + 3)
 
     def turn(self, cells: Tensor) -> Tensor:
         """`cells` [K, z, y, x, ...] as kernels read and write them, and these as cells again."""
         return cells.transpose(2, 3).contiguous() if self.is_across_x else cells.contiguous()
 
-    def launch(self, name: str, given: dict[str, Any], made: dict[str, Any]) -> Tensor:
-        """Runs a kernel for all rays, or all cells, of a `field`; the sum of its `sums`, if any."""
-        laid, record, varies = given["field"], self.record, given.get("varies", False)
-        lines, length = record["rows"] + 3, record["columns"]
+    def launch(self, name: str, given: dict[str, Any], made: dict[str, Any]) -> None:
+        """Runs a kernel for all rays, or all cells, of a `field`."""
+        laid, record = given["field"], self.record
+        lines, length = record["rows"], record["columns"]
         if not name.startswith("sum"):
             lines, length = record["slices"] * record["height"], record["width"]
         items = len(laid) * lines * math.ceil(length / (1 if laid.is_cuda else BLOCK))
-        sums = laid.new_zeros(items * varies, 4, dtype=torch.float64)
-        made = made | ({"sums": sums} if "varies" in given else {})
         getattr(shear_kernels(laid.element_size() * 8), name).launch(items, record | given, made)
-        return sums.sum(0)
 
 
 class _Masses(torch.autograd.Function):
     """The mass, and where it `has_adjoint` what that needs.
 
-    Row l of `numbers` [L, 4] holds the slope of beam l by rows and by columns, its path in a slice
-    [u] and the bound of corrections.
+    Row l of `numbers` [L, 3] holds the slope of beam l by rows and by columns, and its path in a
+    slice [u]; `bounds` [L, 1] are those of corrections.
     """
 
     @staticmethod
     def forward(
-        shears: Sequence[Shear], has_adjoint: bool, field: Tensor, numbers: Tensor
+        shears: Sequence[Shear], has_adjoint: bool, field: Tensor, numbers: Tensor, bounds: Tensor
     ) -> tuple[Tensor, ...]:
         entered, laid = field.new_empty(len(shears), *field.shape), _lay(shears, field)
-        kept = []
+        kept, numbers = [], torch.cat([numbers, bounds], 1)
         for light, shear in enumerate(shears):
             given = {"light": light, "numbers": numbers, "field": laid[shear.is_across_x]}
             windows = field.new_empty(1 + has_adjoint, len(field) * shear.window)
@@ -138,46 +128,63 @@ class _Masses(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, entered_bar: Tensor, *_: Tensor) -> tuple[Any, ...]:
-        field, numbers, *kept = ctx.saved_tensors
-        laid, varies = _lay(ctx.shears, field), ctx.needs_input_grad[3]
+        field, numbers, bounds, *kept = ctx.saved_tensors
+        laid, both = _lay(ctx.shears, field), torch.cat([numbers, bounds], 1)
         bars = {key: torch.zeros_like(one) for key, one in laid.items()}
-        numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         most = max(shear.window for shear in ctx.shears)
         on_rays = field.new_empty(2, len(field) * most)
         for light, (shear, windows) in enumerate(zip(ctx.shears, kept, strict=True)):
             key, bar = shear.is_across_x, shear.turn(entered_bar[light])
-            given = {"light": light, "numbers": numbers, "field": laid[key]}
-            given |= {"varies": varies, "entered_bar": bar}
+            given = {"light": light, "numbers": both, "field": laid[key], "entered_bar": bar}
             given |= {"masses": windows[0], "corrections": windows[1]}
             made = {"slices_bar": on_rays[0], "midways_bar": on_rays[1], "field_bar": bars[key]}
             made["corrections_bar"] = torch.empty_like(bar)
             for name in ("carry_back", "sum_back", "look_back"):
-                numbers_bar[light] += shear.launch(name, given, made)
+                shear.launch(name, given, made)
         field_bar = functools.reduce(
             torch.add, (bar.transpose(2, 3) if key else bar for key, bar in bars.items())
         )
-        return None, None, field_bar, numbers_bar.to(numbers) if varies else None
+        # Of numbers, which are few, by the tangents of each.
+        both_bar = torch.zeros_like(both)
+        _, _, _, *needs = ctx.needs_input_grad
+        for one in [*range(3)] * needs[0] + [3] * needs[1]:
+            d_both = torch.zeros_like(both)
+            d_both[:, one] = 1
+            d_entered = _change(ctx.shears, field, both, None, d_both)
+            both_bar[:, one] = (d_entered * entered_bar).flatten(1).sum(1, dtype=torch.float64)
+        return None, None, field_bar, *both_bar.split([3, 1], 1)
 
     @staticmethod
-    def jvp(
-        ctx: Any, _: None, _has: None, d_field: Tensor | None, d_numbers: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
+    def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
         def change(*tensors: Any) -> Tensor:
-            (field, numbers), (d_field, d_numbers) = tensors[:2], tensors[-2:]
-            pairs, numbers = _with_change(field, d_field), _with_change(numbers, d_numbers)
-            laid, d_entered = _lay(ctx.shears, pairs), []
-            for light, shear in enumerate(ctx.shears):
-                given: dict[str, Any] = {"light": light, "numbers": numbers}
-                given["field"] = laid[shear.is_across_x]
-                made = {"masses": field.new_empty(2 * len(field) * shear.window)}
-                shear.launch("sum_along_rays_tangent", given, made)
-                entered = torch.empty_like(given["field"])
-                shear.launch("carry_to_cells_tangent", given | made, {"entered": entered})
-                d_entered.append(shear.turn(entered[..., 1]))
-            return torch.stack(d_entered)
+            (field, *both), (d_field, *d_both) = tensors[:3], tensors[-3:]
+            pairs = zip(both, d_both, strict=True)
+            d_both = [torch.zeros_like(one) if d_one is None else d_one for one, d_one in pairs]
+            return _change(ctx.shears, field, torch.cat(both, 1), d_field, torch.cat(d_both, 1))
 
-        d_entered: Tensor = run_plainly(change, *ctx.saved_tensors, d_field, d_numbers)
-        return d_entered, *[None] * (len(ctx.saved_tensors) - 2)
+        d_entered: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_entered, *[None] * (len(ctx.saved_tensors) - 3)
+
+
+def _change(
+    shears: Sequence[Shear],
+    field: Tensor,
+    numbers: Tensor,
+    d_field: Tensor | None,
+    d_numbers: Tensor,
+) -> Tensor:
+    """The change of the mass with those of the field and of all `numbers` [L, 4]."""
+    laid = _lay(shears, _with_change(field, d_field))
+    numbers, d_entered = _with_change(numbers, d_numbers), []
+    for light, shear in enumerate(shears):
+        given: dict[str, Any] = {"light": light, "numbers": numbers}
+        given["field"] = laid[shear.is_across_x]
+        made = {"masses": field.new_empty(2 * len(field) * shear.window)}
+        shear.launch("sum_along_rays_tangent", given, made)
+        entered = torch.empty_like(given["field"])
+        shear.launch("carry_to_cells_tangent", given | made, {"entered": entered})
+        d_entered.append(shear.turn(entered[..., 1]))
+    return torch.stack(d_entered)
 
 
 def _lay(shears: Sequence[Shear], cells: Tensor) -> dict[bool, Tensor]:
@@ -197,10 +204,10 @@ _SLICES = (
 )
 """Members of `Slices`, and of a shear's record."""
 _GIVEN = f"""
-int {_SLICES}, light, varies; F *numbers, *field, *entered, *masses, *corrections;
-F *entered_bar, *corrections_bar, *slices_bar, *midways_bar, *field_bar; double *sums
+int {_SLICES}, light; F *numbers, *field, *entered, *masses, *corrections;
+F *entered_bar, *corrections_bar, *slices_bar, *midways_bar, *field_bar
 """
-_RETURNED = "corrections_bar slices_bar midways_bar field_bar sums"
+_RETURNED = "corrections_bar slices_bar midways_bar field_bar"
 """What one adjoint after the other writes, and the next reads."""
 
 
@@ -211,12 +218,11 @@ def shear_kernels(bits: int) -> SimpleNamespace:
     Tangents are given dual numbers in place of numbers.
     """
     calls = {
-        "sum_along_rays": "number[3], (const N*)field, (N*)masses, (N*)corrections",
-        "carry_to_cells": "number[3], (const N*)masses, (N*)entered",
-        "carry_back": "varies, masses, entered_bar, corrections_bar, sums",
-        "sum_back": "varies, masses, corrections, entered_bar, corrections_bar, slices_bar, "
-        "midways_bar, sums",
-        "look_back": "varies, field, slices_bar, midways_bar, field_bar, sums",
+        "sum_along_rays": "(const N*)field, (N*)masses, (N*)corrections",
+        "carry_to_cells": "(const N*)masses, (N*)entered",
+        "carry_back": "masses, entered_bar, corrections_bar",
+        "sum_back": "corrections, entered_bar, corrections_bar, slices_bar, midways_bar",
+        "look_back": "slices_bar, midways_bar, field_bar",
     }
     made = {"sum_along_rays": "masses corrections", "carry_to_cells": "entered"}
 
@@ -224,7 +230,7 @@ def shear_kernels(bits: int) -> SimpleNamespace:
         text = f"""
             typedef {number} N;
             const N* const number = (const N*)numbers + 4 * light;
-            const Shear<F, IS_GPU ? 1 : {BLOCK}> shear({{{_SLICES}}}, number);
+            const Shear<F, IS_GPU ? 1 : {BLOCK}, N> shear({{{_SLICES}}}, number);
             shear.{name}(item, {call});
         """
         writes = made.get(name, _RETURNED)
