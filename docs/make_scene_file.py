@@ -524,7 +524,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and emission, of whose logarithm it is (E11.3), and 0 for others."
+                " density and emission, of whose logarithm it is (E11.3), three times that for an"
+                " emission that is the only field, and 0 for others."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

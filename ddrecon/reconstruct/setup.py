@@ -219,4 +219,6 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         others = [other for other in parameters if other.is_field and other is not parameter]
         if has_levels or not others or (parameter.is_field and not scene.lights):
             parameter.release = 0.0
+        if not others and settings.parameters[parameter.name].tv is None:
+            parameter.tv *= kind_of(parameter.name).alone
     return parameters

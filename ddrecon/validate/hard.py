@@ -157,9 +157,9 @@ CASES: dict[str, HardCase] = {
 
 SINGLE_FROM_DOUBLE = 1e-4
 """Relative RMS error of images, and of gradients, in float32 against float64."""
-OPAQUE = 800.0
+OPAQUE = 400.0
 """Optical depths of a box beyond which errors may grow as these do: light is then seen where it
-comes in, and float32 knows that place to 1e-7 of the box.
+comes in, and float32 knows that place to two roundings, 2e-7 of the box.
 """
 ROUNDINGS = 8
 """Residuals may exceed the tolerance by so many times what rounding the solution makes of them."""

@@ -143,10 +143,11 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
     the names of a vector's entries, which change one at a time. `is_direction`: only the way a
     vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, taken of what `losses.compress` makes of one that `is_compressed`;
-    `difference_steps` are those of finite differences. `release` is the part of a run after which
-    the variable begins to move where other fields are optimized: a lamp would learn wrong things
-    while they are empty, and emission, where lights shine, stand for what is lit. Its rate rises
+    variation, taken of what `losses.compress` makes of one that `is_compressed`, and `alone` times
+    that where no other field is sought: then it only suppresses noise. `difference_steps` are those
+    of finite differences. `release` is the part of a run after which the variable begins to move
+    where other fields are optimized: a lamp would learn wrong things while they are empty, and
+    emission, where lights shine, stand for what is lit. Its rate rises
     over a warm-up by the power `rise`.
     """
 
@@ -158,6 +159,7 @@ class Kind:
     components: tuple[str, ...] = ()
     is_direction: bool = False
     tv: float = 0.0
+    alone: float = 1.0
     is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
     release: float = 0.0
@@ -188,6 +190,7 @@ KINDS: Mapping[str, Kind] = {
         is_color=True,
         is_cellwise=True,
         tv=3e-3,
+        alone=3.0,
         is_compressed=True,
         # A first step lights all cells, and they shine together: it must not outshine the pictures.
         rise=3.0,
