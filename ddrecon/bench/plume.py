@@ -13,6 +13,7 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene, View
 
@@ -47,7 +48,11 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
     density = plume_density(x, y / 1.5, z).expand(grid.shape).contiguous().to(device, dtype)
     tensor = density.new_tensor
     volume = Volume(
-        grid, density, tensor([SIGMA_T * (1 - ALBEDO)]), tensor([SIGMA_T * ALBEDO]), tensor(0.0)
+        grid,
+        density,
+        tensor([SIGMA_T * (1 - ALBEDO)]),
+        tensor([SIGMA_T * ALBEDO]),
+        HenyeyGreenstein(tensor(0.0)),
     )
     pose = look_at(tensor([0.0, 0.3, 3.2]), tensor([0.0, 0.0, 0.0]), tensor([0.0, 1.0, 0.0]))
     camera = Camera(pose, (pixels, pixels), math.tan(math.radians(15)))

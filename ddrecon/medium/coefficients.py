@@ -27,7 +27,7 @@ P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
 
 
-@dataclass(eq=False, init=False, repr=False)
+@dataclass(eq=False, repr=False)
 class Volume(Displayed):
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
@@ -53,23 +53,9 @@ class Volume(Displayed):
     black_body: Tensor | None = None
     index: float = 1.0
 
-    def __init__(
-        self,
-        grid: Grid,
-        density: Tensor,
-        sigma_a: Tensor,
-        sigma_s: Tensor,
-        phase: PhaseFunction | Tensor,
-        media: Mapping[str, Volume] | None = None,
-        support: Tensor | None = None,
-        emission: Tensor | None = None,
-        black_body: Tensor | None = None,
-        index: float = 1.0,
-    ):
-        self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
-        self.media, self.support = media, support
-        self.emission, self.black_body, self.index = emission, black_body, index
-        self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
+    def __post_init__(self) -> None:
+        if isinstance(self.phase, Tensor):
+            self.phase = HenyeyGreenstein(self.phase)
 
     @property
     def g(self) -> Tensor:

@@ -27,6 +27,7 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.progress import Progress
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
@@ -90,7 +91,7 @@ class HardCase:
             self.density(self.shape).to(device, dtype),
             tensor([sigma_t * (1 - self.albedo)]),
             tensor([sigma_t * self.albedo]),
-            tensor(self.g),
+            HenyeyGreenstein(tensor(self.g)),
         )
         lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([3.0]))]
         if self.ambient:

@@ -147,8 +147,8 @@ class Kind:
     that where no other field is sought: then it only suppresses noise. `difference_steps` are those
     of finite differences. `release` is the part of a run after which the variable begins to move
     where other fields are optimized: a lamp would learn wrong things while they are empty, and
-    emission, where lights shine, stand for what is lit. Its rate rises
-    over a warm-up by the power `rise`.
+    emission, where lights shine, stand for what is lit. Its rate rises over a warm-up by the power
+    `rise`.
     """
 
     rate: Rate
