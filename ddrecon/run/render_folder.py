@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -71,10 +71,7 @@ def render_to_folder(
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
                 quality[view.name] = float(target.psnr_of(images[""]))
-    solves = [
-        {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
-        for r in memory.records
-    ]
+    solves = [{**asdict(r), "residual": float(r.residual)} for r in memory.records]
     report: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
         "solves": solves,
@@ -84,7 +81,7 @@ def render_to_folder(
         "psnr": quality,
     }
     if rounds := [r for r in memory.records if r.kind == "rounds"]:
-        report["rounds"] = {"count": rounds[-1].iterations, "residual": rounds[-1].residual}
+        report["rounds"] = {"count": rounds[-1].iterations, "residual": float(rounds[-1].residual)}
     if fluence_files:
         report["fluence"] = fluence_files
     if parameter is not None:
