@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import math
 from copy import copy
+from dataclasses import replace
 from functools import partial
 
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Medium, Volume, put_volume
-from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume
+from ddrecon.medium.mixture import remix
 from ddrecon.numerics.periods import Unrolled
 
 
 def volume_at_level(volume: Volume, grid: Grid) -> Volume:
     """`volume` on a coarser `grid`, each medium by itself."""
-    if volume.media is not None:
-        return mix_media(
-            {name: volume_at_level(medium, grid) for name, medium in volume.media.items()}
-        )
     support, volume = volume.support, copy(volume)
     if support is not None:
-        volume.density, volume.support = volume.density * support, None
-        volume.emission = None if volume.emission is None else volume.emission * support
-    return put_volume(volume, grid, partial(resample, grid=grid))
+        volume.support = None
+        if volume.emission is not None:
+            volume.emission = for_cells(volume.emission) * support
+        if volume.media is None:
+            volume.density = volume.density * support
+        else:
+            parts = volume.media.items()
+            volume.media = {n: replace(one, density=one.density * support) for n, one in parts}
+    coarse = put_volume(volume, grid, partial(resample, grid=grid))
+    if volume.media is None:
+        return coarse
+    return remix(coarse, {n: volume_at_level(one, grid) for n, one in volume.media.items()})
 
 
 def refine_medium(medium: Medium, times: int, along: str = "xyz") -> Medium:
