@@ -238,6 +238,9 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
     g = _mean_cosine(volume.phase)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
+    by_cell = sigma_s[0].numel() > 1 and not is_varied(sigma_s)
+    if by_cell and not is_any_nonzero(volume.sigma_s):
+        sigma_s = sigma_s[:, :1, :1, :1]  # nothing scatters, whatever the cell
     find = _find_coefficients
     if max(sigma_a[0].numel(), sigma_s[0].numel()) > 1:
         # Of what varies from cell to cell nothing is kept that is made on the way.
