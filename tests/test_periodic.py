@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,20 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
     known = fluence(one)
     twofold = torch.cat([known, known], 1).roll(shift, (1, 3))
     assert_near(fluence(two), twofold, close)
+
+
+@pytest.mark.parametrize("cells", [4, 8])
+def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_begins(
+    cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Moved by half a period, which is whole cells of both grids."""
+    monkeypatch.setattr("ddrecon.renderer.MOST_CELLS", cells)
+    shape, shift = (6, 5, 12), (3, 6)
+    one, moved = (repeated(half_empty(*shape), by, **KINDS["ground"]) for by in ((0, 0), shift))
+    for scene in (one, moved):  # so flat that no light crosses cells sideways fastest
+        scene.volume.grid = replace(scene.volume.grid, upper=(CELL * 6, 0.06, CELL * 12))
+    assert_near(render(moved), render(one), 1e-12)
+    assert_near(fluence(moved), fluence(one).roll(shift, (1, 3)), 1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
