@@ -16,6 +16,7 @@ from ddrecon import renderer
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, require_plain_autograd
+from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
 from ddrecon.variables.values import require_legal, value_of, with_values
 
@@ -28,16 +29,21 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
     Raises UsageError where `require_legal` does.
     """
-    require_plain_autograd()
-    require_legal(scene)
+    _look_at(scene)
     return renderer.render(scene, view, memory)
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
     """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
+    _look_at(scene)
+    return renderer.fluence(scene, memory)
+
+
+def _look_at(scene: Scene) -> None:
+    """Raises for a `scene` that cannot be rendered, and notices what changed in it."""
     require_plain_autograd()
     require_legal(scene)
-    return renderer.fluence(scene, memory)
+    forget_changed()
 
 
 class VolumeRenderer(torch.nn.Module):

@@ -2,19 +2,25 @@
 
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from media import make_scene, random_values
+from media import make_scene, random_values, tensor
 from torch import Tensor
 
 import ddrecon
 from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.light.ground import Ground, Plane
+from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
+from ddrecon.scene import Scene
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
+from ddrecon.variables.values import value_of, variable_names, with_values
 
 SHAPE = (5, 4, 6)
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
@@ -39,6 +45,39 @@ def test_function_transforms_agree_with_backward(name: str) -> None:
     (gradient,) = torch.autograd.grad((image(leaf) * weight).sum(), leaf)
     one, other = (tangent * weight).sum(), (gradient * change).sum()
     assert abs(one - other) <= 1e-10 * max(abs(one), abs((tangent * weight).abs().sum()) * 1e-2)
+
+
+def lit_scene() -> Scene:
+    """A glowing volume with a light of each kind, over a ground."""
+    scene = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,), transport_rounds=1, degree=3)
+    scene.volume.emission = tensor(0.1, 0.2, 0.3)
+    scene.lights += [
+        PointLight(tensor(1.0, 2.0, 1.0), tensor(3.0)),
+        BeamLight(tensor(0.1, 2.0, 0.0), tensor(0.1, -1.0, 0.2), tensor(2.0), tensor(0.2)[0]),
+        EnvironmentLight(random_values(1, 4, 6), tensor(0.5)[0], tensor(10.0)[0], directions=4),
+    ]
+    scene.ground = Ground(tensor(0.4), Plane(-1.0, 1))
+    return scene
+
+
+CHANGES: dict[str, Callable[[Tensor], object]] = {
+    "NumPy": lambda value: np.copyto(value.numpy(), value.lerp(torch.ones_like(value), 0.3)),
+    "data": lambda value: value.data.lerp_(torch.ones_like(value), 0.3),
+}
+
+
+@pytest.mark.usefixtures("few_directions")
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_tensor_that_changed_unseen_is_as_a_new_one(change: Callable[[Tensor], object]) -> None:
+    """No picture depends on what was rendered before, however a scene's numbers have changed."""
+    scene = lit_scene()
+    before = render(scene)
+    for name in variable_names(scene):
+        if not name.startswith("views.") and name not in EXTINCTION_AND_ALBEDO:
+            change(value_of(scene, name))
+    after = render(scene)
+    assert not torch.equal(after, before)
+    assert torch.equal(after, render(deepcopy(scene)))
 
 
 def small_layer(dtype: torch.dtype = torch.float64, **kind: object) -> VolumeRenderer:

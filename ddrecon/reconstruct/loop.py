@@ -19,6 +19,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import current_engine
 from ddrecon.errors import RanksError, SolveError
+from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import cells_are_shared, from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
@@ -61,6 +62,7 @@ class Reconstruction:
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
+        forget_changed()
         self.problem = Problem.of(scene, iterations)
         settings, train = self.problem.settings, self.problem.train
         self.parameters = start_parameters(scene, settings)
