@@ -45,6 +45,12 @@ class View:
     step: float = 0.0
     noise: Noise | None = None
 
+    @property
+    def seen(self) -> Tensor:
+        """Its image, black where pixels do not count."""
+        assert self.image is not None
+        return self.image if self.mask is None else self.image * self.mask
+
 
 @dataclass(eq=False, repr=False)
 class Scene(Displayed):
