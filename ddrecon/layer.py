@@ -43,6 +43,7 @@ def _look_at(scene: Scene) -> None:
     """Raises for a `scene` that cannot be rendered, and notices what changed in it."""
     require_plain_autograd()
     require_legal(scene)
+    scene.settle()
     forget_changed()
 
 
