@@ -13,19 +13,19 @@ from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.values import with_values
 
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
-SMALL = ["optimize=null", "volume.resolution=[3, 2, 3]", "volume.density=1"]
+SMALL = ["optimize=null", "volume.resolution=[3, 2, 3]", "volume.density=1", "volume.sigma_s=1"]
 SMALL += [
     "diffusion.tolerance=0.1",
     "views=[{name: front, camera: {type: perspective, origin: [0, 0.2, 3], target: [0, 0, 0],"
-    " fov: 30, resolution: [4, 4]}}]",
+    " fov: 30, resolution: [2, 2]}}]",
 ]
 MEDIA = (
     "volume={bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}, resolution: [3, 2, 2], media:"
-    " {smoke: {density: 9, sigma_a: 1, sigma_s: 3, g: 0.5},"
+    " {smoke: {density: 1, sigma_a: 1, sigma_s: 3, g: 0.5},"
     " air: {density: 1, sigma_a: 0, sigma_s: 1, phase: {type: rayleigh}}}}"
 )
 KINDS = {
-    "thick cells": ["volume.sigma_s=20"],
+    "thick cells": ["volume.sigma_s=4"],
     "a strong forward peak": ["volume.g=0.85"],
     "a glow": ["volume.density=0.1", "volume.emission=1"],
     "periods": ["volume.periodic=[x]"],

@@ -57,13 +57,13 @@ def test_what_a_file_may_not_say_python_may_not(
 def test_a_camera_below_a_ground_is_refused() -> None:
     scene = scene_of({}, height=-0.7)
     scene.views[0].camera.pose[1, 3] = -0.8
-    with pytest.raises(UsageError, match=r"ground.height: the camera of view 'view' is not above"):
+    with pytest.raises(UsageError, match=r"ground\.height: the camera of view 'view' is not above"):
         render(scene)
 
 
 @pytest.mark.parametrize("axes", [(0, 0), (0, 1, 2)])
 def test_a_grid_repeats_along_two_axes_at_most(axes: tuple[int, ...]) -> None:
-    with pytest.raises(UsageError, match="volume.periodic: name one axis or two"):
+    with pytest.raises(UsageError, match=r"volume\.periodic: name one axis or two"):
         Grid(SHAPE, (0.0,) * 3, (1.0,) * 3, periodic=axes)
 
 

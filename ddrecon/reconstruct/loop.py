@@ -32,7 +32,7 @@ from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import require_scene, with_values
 
 
 def optimize(
@@ -62,6 +62,7 @@ class Reconstruction:
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
+        require_scene(scene)
         forget_changed()
         self.problem = Problem.of(scene, iterations)
         settings, train = self.problem.settings, self.problem.train

@@ -68,12 +68,6 @@ def load_scene(
     Raises SceneError with one line per problem of the scene, FormatError for a file it names that
     cannot be used, or UsageError for another `dtype` than `DTYPES` and a `device` that is not here.
     """
-    if dtype not in DTYPES:
-        raise UsageError(f"dtype {dtype}: light is computed in float32 or float64")
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(f"device {device}: {error}") from None
     return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
 
 
@@ -81,6 +75,12 @@ def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
     """The scene of a file, of a film the first frame, as tensors; raises what `load_scene` does."""
+    if dtype not in DTYPES:
+        raise UsageError(f"dtype {dtype}: light is computed in float32 or float64")
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"device {device}: {error}") from None
     if scene_file.tree.frames is not None:
         scene_file = at_frame(scene_file, scene_file.tree.frames.first)
     place, tree = torch.device(device), scene_file.tree
