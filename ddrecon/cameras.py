@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,6 +42,10 @@ class Camera:
     pixel_aspect: float = 1.0
     lens: str | None = None
     distortion: Tensor | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        is_plain = name in ("size", "principal_point") and not isinstance(value, Tensor)
+        super().__setattr__(name, tuple(value) if is_plain else value)  # lists cannot be hashed
 
     @property
     def tensors(self) -> list[Tensor]:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from ddrecon.errors import UsageError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -28,6 +30,14 @@ class Grid:
     lower: Triple
     upper: Triple
     periodic: tuple[int, ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        for name in ("shape", "lower", "upper", "periodic"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # lists cannot be hashed
+        if len({*self.periodic}) < len(self.periodic) or len(self.periodic) > 2:
+            raise UsageError(
+                "volume.periodic: name one axis or two, each once; by a face light must leave"
+            )
 
     @staticmethod
     def from_xyz(

@@ -16,8 +16,16 @@ from ddrecon import renderer
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, require_plain_autograd
+from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
-from ddrecon.variables.values import require_legal, value_of, with_values
+from ddrecon.supported import require_above
+from ddrecon.variables.values import (
+    is_real,
+    require_legal,
+    require_scene,
+    value_of,
+    with_values,
+)
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""
@@ -28,16 +36,25 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
     Raises UsageError where `require_legal` does.
     """
-    require_plain_autograd()
-    require_legal(scene)
+    _look_at(scene, view)
     return renderer.render(scene, view, memory)
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
     """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
-    require_plain_autograd()
-    require_legal(scene)
+    _look_at(scene, None)
     return renderer.fluence(scene, memory)
+
+
+def _look_at(scene: Scene, view: str | None) -> None:
+    """Raises where a `view` of `scene` cannot be rendered, and notices what changed in it."""
+    require_plain_autograd()
+    require_scene(scene)
+    require_legal(scene, view)
+    if scene.volume.density.is_cpu:
+        require_above(scene)
+    scene.settle()
+    forget_changed()
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -50,6 +67,7 @@ class VolumeRenderer(torch.nn.Module):
 
     def __init__(self, scene: Scene):
         super().__init__()
+        require_scene(scene)
         self.scene = scene
         self.memories: list[SolveMemory] = []
 
@@ -78,10 +96,12 @@ class VolumeRenderer(torch.nn.Module):
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         given = {name: value for name, value in named.items() if value is not None}
+        if twice := given.keys() & (values or {}):
+            raise UsageError(f"{min(twice)}: given twice, by its own name and in values")
         given |= values or {}
         own = self.scene.volume.density
-        with torch.autocast(own.device.type, enabled=False):
-            given = {n: v.to(own.dtype) if isinstance(v, Tensor) else v for n, v in given.items()}
+        with torch.autocast("cpu" if own.is_meta else own.device.type, enabled=False):
+            given = {n: v.to(own.dtype) if is_real(v) else v for n, v in given.items()}
             counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
             if len(set(counts.values())) > 1 or 0 in counts.values():
                 raise UsageError(f"batches differ in size, or hold nothing: {counts}")
@@ -97,10 +117,12 @@ class VolumeRenderer(torch.nn.Module):
 
     def _is_batch(self, name: str, value: Tensor) -> bool:
         """Whether `value` has an axis of entries in front of what the variable `name` has."""
+        if not isinstance(value, Tensor):
+            return False
         if name in ("sigma_a", "sigma_s", "sigma_t", "albedo"):
             return value.ndim in (2, 5)
         with torch.no_grad():
-            return isinstance(value, Tensor) and value.ndim == value_of(self.scene, name).ndim + 1
+            return value.ndim == value_of(self.scene, name).ndim + 1
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What torch calls to move a module: the scene's tensors are moved as well."""

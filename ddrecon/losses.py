@@ -90,7 +90,8 @@ class Target:
 
     `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
     numbers that do; `scale`: the root of their mean square. `on` is the scale on which quality is
-    told, `compared` the image on it and `slope` its derivative there; `peak` is its largest value.
+    told, `compared` the image on it and `slope` its derivative there; `peak` is its largest value
+    that counts.
     """
 
     loss: str
@@ -119,9 +120,8 @@ class Target:
         scale = (square.sum() / count).sqrt().clamp(min=tiny**0.25)
         on = scale_of(loss, image, noise)
         compared = on.values(image)
-        peak = (
-            compared.max().clamp(min=tiny**0.25) if on.peak is None else scale.new_tensor(on.peak)
-        )
+        largest = (compared if mask is None else torch.where(mask > 0, compared, 0)).max()
+        peak = largest.clamp(min=tiny**0.25) if on.peak is None else scale.new_tensor(on.peak)
         return Target(loss, image, mask, count, scale, on, compared, on.slope(image), peak)
 
     def loss_of(self, image: Tensor) -> Tensor:
@@ -155,10 +155,8 @@ class Target:
 
     def ssim_of(self, image: Tensor) -> Tensor:
         """The structural similarity of `image` [3, h, w], as it is compared; at most 1."""
-        compared = self.on.values(image)
-        if self.seen is not None:
-            compared = torch.where(self.seen > 0, compared, self.compared)
-        return self._mean(structural_similarity(compared, self.compared, self.peak))
+        images = self.on.values(image), self.compared
+        return self._mean(structural_similarity(*images, self.peak, self.seen))
 
     def _mean(self, values: Tensor) -> Tensor:
         """The mean of `values` [3, h, w] over the numbers that count."""

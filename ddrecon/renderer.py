@@ -31,7 +31,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import Plane, light_from_below, stay_above
-from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towards, sum_turned
 from ddrecon.light.pairs import TurnedBeam
@@ -63,7 +63,8 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import Slab, own_slab, whole_of
+from ddrecon.slabs.slab import whole_of
+from ddrecon.supported import require_supported
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
@@ -169,26 +170,6 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     sent = reflect(lit, medium, render_settings)
     light_field = _find_light(volume, sources, settings, memory, from_below(*sent))
     return replace(light_field, ground=replace(lit, sent=sent))
-
-
-def require_supported(scene: Scene) -> None:
-    """Raises UsageError for what is not computed where ranks share out cells, or faces refract.
-
-    Its line begins with the key.
-    """
-    settings, is_cut = scene.diffusion, isinstance(own_slab(scene.volume.grid), Slab)
-    neither = {
-        "ground": scene.ground is not None,
-        "diffusion.scheme: printed": settings.scheme == "printed",
-        "diffusion.model: flux_limited": settings.model == "flux_limited",
-    }
-    in_slabs = neither | {"diffusion.refine: above 1": settings.times > 1}
-    has_points = any(isinstance(light, PointLight) for light in scene.lights)
-    refracted = neither | {"point lights": has_points, "--share cells": is_cut}
-    for what in [name for name, is_so in in_slabs.items() if is_so and is_cut]:
-        raise UsageError(f"{what}: not where processes share out cells; leave --share cells out")
-    for what in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
-        raise UsageError(f"volume.index: there is none with {what}")
 
 
 def exchange_grid(grid: Grid) -> Grid:

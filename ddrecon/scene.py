@@ -6,16 +6,19 @@ in a file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera
+from ddrecon.defaults import choose_diffusion
 from ddrecon.display import Displayed
 from ddrecon.errors import UsageError
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import Light
+from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
@@ -45,14 +48,21 @@ class View:
     step: float = 0.0
     noise: Noise | None = None
 
+    @property
+    def seen(self) -> Tensor:
+        """Its image, black where pixels do not count."""
+        assert self.image is not None
+        return self.image if self.mask is None else self.image * self.mask
+
 
 @dataclass(eq=False, repr=False)
 class Scene(Displayed):
-    """A loaded scene.
+    """A scene, of a file or made in Python.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
-    optimized parameter starts from; `ground` lies under the volume, where there is any. `reason`:
-    which settings of `diffusion` its file leaves out, and what of the medium decides them.
+    optimized parameter starts from; `ground` lies under the volume, where there is any. What
+    `render` and `diffusion` leave out is chosen by the medium when the scene is made, and stays
+    when the medium changes. `reason`: which settings of `diffusion` these are, and why.
     """
 
     volume: Volume
@@ -65,6 +75,23 @@ class Scene(Displayed):
     path: Path | None = None
     ground: Ground | None = None
     reason: str = ""
+
+    def __post_init__(self) -> None:
+        self.settle()
+
+    def settle(self) -> None:
+        """Has what settings leave out become what the medium deserves, in files and in Python."""
+        volume, optimized = self.volume, self.optimize.parameters if self.optimize else ()
+        media = [*volume.media.values()] if volume.media else [volume]
+        numbers = [number for one in media for number in (one.density, one.sigma_a, one.sigma_s)]
+        if not all(isinstance(one, Tensor) for one in numbers):
+            return  # it cannot be rendered, which `render` says
+        with torch.no_grad():
+            self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
+            if self.render.steps_per_voxel is None:
+                steps = choose_steps(volume, self.diffusion.times)
+                self.render = replace(self.render, steps_per_voxel=steps)
+        self.reason = reason or self.reason
 
     def view(self, name: str) -> View:
         """The view called `name`; raises UsageError with the known names."""

@@ -90,9 +90,10 @@ def make_scene(
     lights += [AmbientLight(tensor(ambient))] if ambient else []
     camera = camera or make_camera(dtype=density.dtype)
     tolerance = 1e-13 if density.dtype == torch.float64 else 1e-6
-    diffusion = {"tolerance": tolerance, "transport_rounds": 0} | diffusion
+    plain = {"transport_rounds": 0, "degree": 3, "refine": 1}
+    diffusion = {"tolerance": tolerance} | plain | diffusion
     volume = Volume(grid, density, sigma_a, sigma_s, tensor(g), emission=emission)
-    settings = RenderSettings(), DiffusionSettings(**diffusion)
+    settings = RenderSettings(steps_per_voxel=1), DiffusionSettings(**diffusion)
     return Scene(volume, lights, [View("view", camera)], *settings)
 
 

@@ -1,20 +1,27 @@
 """The renderer as a layer: networks train through it, and so do torch's function transforms."""
 
 import math
+import re
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from media import make_scene, random_values
+from media import make_scene, random_values, tensor
 from torch import Tensor
 
 import ddrecon
 from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.light.ground import Ground, Plane
+from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
+from ddrecon.scene import Scene
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
+from ddrecon.variables.values import value_of, variable_names, with_values
 
 SHAPE = (5, 4, 6)
 BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
@@ -39,6 +46,39 @@ def test_function_transforms_agree_with_backward(name: str) -> None:
     (gradient,) = torch.autograd.grad((image(leaf) * weight).sum(), leaf)
     one, other = (tangent * weight).sum(), (gradient * change).sum()
     assert abs(one - other) <= 1e-10 * max(abs(one), abs((tangent * weight).abs().sum()) * 1e-2)
+
+
+def lit_scene() -> Scene:
+    """A glowing volume with a light of each kind, over a ground."""
+    scene = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,), transport_rounds=1, degree=3)
+    scene.volume.emission = tensor(0.1, 0.2, 0.3)
+    scene.lights += [
+        PointLight(tensor(1.0, 2.0, 1.0), tensor(3.0)),
+        BeamLight(tensor(0.1, 2.0, 0.0), tensor(0.1, -1.0, 0.2), tensor(2.0), tensor(0.2)[0]),
+        EnvironmentLight(random_values(1, 4, 6), tensor(0.5)[0], tensor(10.0)[0], directions=4),
+    ]
+    scene.ground = Ground(tensor(0.4), Plane(-1.0, 1))
+    return scene
+
+
+CHANGES: dict[str, Callable[[Tensor], object]] = {
+    "NumPy": lambda value: np.copyto(value.numpy(), value.lerp(torch.ones_like(value), 0.3)),
+    "data": lambda value: value.data.lerp_(torch.ones_like(value), 0.3),
+}
+
+
+@pytest.mark.usefixtures("few_directions")
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_tensor_that_changed_unseen_is_as_a_new_one(change: Callable[[Tensor], object]) -> None:
+    """No picture depends on what was rendered before, however a scene's numbers have changed."""
+    scene = lit_scene()
+    before = render(scene)
+    for name in variable_names(scene):
+        if not name.startswith("views.") and name not in EXTINCTION_AND_ALBEDO:
+            change(value_of(scene, name))
+    after = render(scene)
+    assert not torch.equal(after, before)
+    assert torch.equal(after, render(deepcopy(scene)))
 
 
 def small_layer(dtype: torch.dtype = torch.float64, **kind: object) -> VolumeRenderer:
@@ -147,21 +187,122 @@ def test_what_no_scene_file_may_say_is_refused(name: str, value: Any, problem: s
             render(layer.scene)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: ddrecon.load_scene("none.yaml"),
-        lambda: ddrecon.load_scene(BALL, dtype=torch.float16),
-        lambda: ddrecon.load_scene(BALL, device="nowhere"),
-        lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"),
+CALLS: dict[str, tuple[Callable[[], object], str]] = {
+    "no file": (lambda: ddrecon.load_scene("none.yaml"), "none.yaml"),
+    "half": (lambda: ddrecon.load_scene(BALL, dtype=torch.float16), "dtype torch.float16: light"),
+    "device": (lambda: ddrecon.load_scene(BALL, device="nowhere"), "device nowhere: "),
+    "no path": (lambda: ddrecon.load_scene(small_layer().scene), "path: expected that of a scene"),
+    "one override": (
+        lambda: ddrecon.load_scene(BALL, overrides="a=b"),
+        "overrides: expected a list, [\"key.path=value\"], found 'a=b'",
+    ),
+    "a film's override": (
+        lambda: next(ddrecon.optimize_sequence(BALL, overrides="a=b")),
+        "overrides: expected a list, [\"key.path=value\"], found 'a=b'",
+    ),
+    "no overrides": (lambda: ddrecon.load_scene(BALL, overrides=None), "overrides: expected a li"),
+    "iterations": (lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"), "iterations: exp"),
+    "no views": (
         lambda: ddrecon.render(replace(small_layer().scene, views=[])),
-        lambda: small_layer()(density=torch.ones(0, *SHAPE)),
-        lambda: ddrecon.use_engine("steam"),
-    ],
-)
-def test_all_that_a_user_can_cause_is_an_error_of_ours(call: Callable[[], object]) -> None:
-    with pytest.raises(ddrecon.DdreconError):
+        "there is no view",
+    ),
+    "nothing": (lambda: small_layer()(density=torch.ones(0, *SHAPE)), "or hold nothing"),
+    "engine": (lambda: ddrecon.use_engine("steam"), "engine steam: no such engine"),
+    "a path to render": (lambda: ddrecon.render("a.yaml"), "expected a Scene, found str; ddrecon."),
+    "a path's fluence": (lambda: ddrecon.fluence("a.yaml"), "expected a Scene, found str; ddrec"),
+    "a path as a layer": (
+        lambda: VolumeRenderer("a.yaml"),
+        "expected a Scene, found str; ddrecon.",
+    ),
+    "a path to optimize": (lambda: ddrecon.optimize("a.yaml"), "expected a Scene, found str; ddr"),
+    "a number": (lambda: small_layer()(sigma_s=9.0), "sigma_s: expected a tensor, found float"),
+    "another number": (lambda: small_layer()(g=0.3), "g: expected a tensor, found float"),
+    "twice": (
+        lambda: small_layer()(density=torch.ones(SHAPE), values={"density": torch.ones(SHAPE)}),
+        "density: given twice, by its own name and in values",
+    ),
+    "two pairs": (
+        lambda: small_layer()(sigma_a=torch.ones(1), values={"sigma_t": torch.ones(1)}),
+        "sigma_a: give sigma_a and sigma_s, or sigma_t and albedo",
+    ),
+    "every view": (
+        lambda: small_layer()(values={"views.*.camera": torch.zeros(6)}),
+        "each view has camera, focal, principal_point, exposure, offset, as in views.view.camera",
+    ),
+    "no glow": (
+        lambda: small_layer()(values={"emission": torch.zeros(1)}),
+        "a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)",
+    ),
+    "sparse": (
+        lambda: small_layer()(torch.ones(SHAPE).to_sparse()),
+        "density: is torch.float32, t",
+    ),
+    "complex": (
+        lambda: small_layer()(torch.ones(SHAPE) * 1j),
+        "density: is torch.complex64, torch",
+    ),
+    "nowhere": (lambda: small_layer().to("meta")(), "density: has no numbers on the device meta"),
+}
+
+
+@pytest.mark.parametrize(("call", "problem"), CALLS.values(), ids=CALLS)
+def test_all_that_a_user_can_cause_is_an_error_of_ours(
+    call: Callable[[], object], problem: str
+) -> None:
+    with pytest.raises(ddrecon.DdreconError, match=re.escape(problem)) as caught:
         call()
+    assert "\n" not in str(caught.value)
+
+
+VIEWS: list[tuple[str, object, str]] = [
+    ("exposure", [-1.0], "views.view.exposure: must be at least 0.001, found -1"),
+    ("exposure", [0.0], "views.view.exposure: must be at least 0.001, found 0"),
+    ("exposure", [math.nan], "views.view.exposure: must be finite, found nan"),
+    ("offset", [1.0, math.inf, 0.0], "views.view.offset: must be finite, found "),
+    ("camera", [math.nan] * 6, "views.view.camera: must be finite, found nan"),
+    ("principal_point", [0.5, math.nan], "views.view.principal_point: must be finite"),
+    ("distortion", [math.inf] * 6, "views.view.distortion: must be finite"),
+    ("focal", 0.0, "views.view.camera: half_width, 1 / (2 focal), must be above 0 and finite"),
+    ("focal", -1.0, "views.view.camera: half_width, 1 / (2 focal), must be above 0 and finite"),
+    ("focal", math.nan, "views.view.camera: half_width, 1 / (2 focal), must be above 0 and finite"),
+]
+
+
+@pytest.mark.parametrize(("part", "value", "problem"), VIEWS)
+def test_a_view_that_cannot_be_is_refused(part: str, value: object, problem: str) -> None:
+    """A pose that training has lost would be seen as an empty picture."""
+    layer = small_layer()
+    zero = torch.zeros(6, **DOUBLE)
+    layer.scene.views[0].camera = replace(
+        layer.scene.views[0].camera, lens="opencv", distortion=zero
+    )
+    layer()
+    with pytest.raises(UsageError, match=re.escape(problem)):
+        layer(values={f"views.view.{part}": torch.tensor(value, **DOUBLE)})
+
+
+RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    ({"exposure": 2.0}, {}, "views.view.exposure: expected a tensor, found float"),
+    ({"offset": torch.zeros(2, **DOUBLE)}, {}, "views.view.offset: has shape [2]; expected [1] or"),
+    ({"background": torch.full((1, 1, 1), math.nan)}, {}, "views.view.background: must be finite"),
+    ({}, {"size": (0, 4)}, "views.view.camera: expected a size (height, width), found (0, 4)"),
+    ({}, {"half_width": 0.0}, "must be above 0 and finite, found 0"),
+    (
+        {},
+        {"pose": torch.eye(4, **DOUBLE)},
+        "views.view.camera: expected a pose [3, 4], found [4, 4",
+    ),
+    ({}, {"principal_point": [0.5]}, "principal_point: has shape [1]; expected [2]"),
+]
+
+
+@pytest.mark.parametrize(("view", "camera", "problem"), RECORDS)
+def test_so_is_one_made_in_python(view: dict[str, Any], camera: dict[str, Any], problem: str):
+    scene = small_layer().scene
+    known = scene.views[0]
+    scene.views = [replace(known, camera=replace(known.camera, **camera), **view)]
+    with pytest.raises(UsageError, match=re.escape(problem)):
+        render(scene)
 
 
 def test_one_precision_and_a_known_view() -> None:

@@ -107,6 +107,22 @@ def test_masked_pixels_do_not_count(loss: str) -> None:
     assert one == other
 
 
+@pytest.mark.parametrize("loss", ["l2", "relative_l2", "photon", "display"])
+def test_quality_within_a_mask_is_that_of_what_it_leaves(loss: str) -> None:
+    """A mask that leaves a rectangle crops, whatever a lamp beside that does."""
+    image, target, mask = torch.rand(3, 14, 18), torch.rand(3, 14, 18), torch.zeros(14, 18)
+    left = slice(None), slice(2, 14), slice(5, 16)
+    mask[left[1:]], noise = 1, Noise(0.01, 0.0)
+    target = torch.where(mask > 0, target, 1000)
+    masked, cropped = (
+        Target.of(target, mask, loss, noise),
+        Target.of(target[left], None, loss, noise),
+    )
+    assert float(masked.psnr_of(image)) == pytest.approx(float(cropped.psnr_of(image[left])))
+    expected = pytest.approx(float(cropped.ssim_of(image[left])), abs=1e-5)
+    assert float(masked.ssim_of(image)) == expected
+
+
 def test_what_counts_is_averaged() -> None:
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
     kept = mask.bool()

@@ -171,12 +171,12 @@ def test_a_period_is_the_middle_of_many():
 
 LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
 REFUSED = [
-    ("[x,y,z]", "", "volume: periodic: name one axis or two"),
-    ("[x,x]", "", "volume: periodic: name one axis or two"),
+    ("[x,y,z]", "", "volume.periodic: name one axis or two"),
+    ("[x,x]", "", "volume.periodic: name one axis or two"),
     ("[w]", "", "volume.periodic.0: expected one of x, y, z"),
     ("[x]", "diffusion.model=flux_limited", "diffusion: volume.periodic is"),
     ("[x]", "diffusion.scheme=printed", "diffusion: volume.periodic is"),
-    ("[x]", LAMP, "lights: 0: a light of type point does not repeat"),
+    ("[x]", LAMP, "lights.0: a PointLight does not repeat"),
     ("[y]", "ground={height: -2, albedo: 0.3}", "ground: lies across y, along which the volume"),
 ]
 

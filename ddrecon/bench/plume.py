@@ -16,6 +16,7 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene, View
+from ddrecon.settings import DiffusionSettings, RenderSettings
 
 SIGMA_T, ALBEDO = 30.0, 0.95
 """About 8 optical depths across the plume where it is densest."""
@@ -60,6 +61,8 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
         volume,
         [DirectionalLight(tensor([-2.0, -1.2, -0.5]), tensor([math.pi]))],
         [View("front", camera)],
+        RenderSettings(steps_per_voxel=1),
+        DiffusionSettings(transport_rounds=1, degree=3, refine=1),
     )
 
 

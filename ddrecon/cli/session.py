@@ -75,7 +75,7 @@ class Session:
         join_ranks(has_gpu, self.share == "cells")
         log = logging.getLogger(LOG)
         log.handlers = [_AboveBars()]
-        log.setLevel(logging.WARNING if self.is_quiet else logging.INFO)
+        log.setLevel(logging.ERROR if self.is_quiet else logging.INFO)
         use_engine(self.engine or current_engine())
         self.place = torch.device("cuda" if has_gpu else "cpu")
         if has_gpu and rank_count() > 1:

@@ -6,10 +6,10 @@ what they would launch and do nothing, and what kernels would make is zero.
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from threading import Timer
 from time import perf_counter
 from typing import Any
 
@@ -21,9 +21,15 @@ from ddrecon import engine
 
 LOG = logging.getLogger(engine.LOG)
 COMPILED = 0.5
-"""A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
-_compiled: list[float] = []
-"""How long each took to load [s]; a line says so of the first."""
+"""A kernel that takes longer to load [s] is being compiled; others come from Warp's cache."""
+PAUSE = 5.0
+"""A line says how far that is, no more often than this [s]."""
+_compiled: list[str] = []
+"""The names of those that were."""
+_loaded: set[tuple[Any, str]] = set()
+"""Kernels that this process has, by their devices."""
+_last_line = -PAUSE
+"""When the last line was written."""
 _rehearsed: dict[tuple[Any, str], None] | None = None
 """Kernels that a rehearsal came to, with their devices, in that order; None while there is none."""
 
@@ -34,7 +40,7 @@ def compile_rehearsed(computation: Callable[[], object]) -> None:
     They are compiled in as many threads as torch has. `computation` is called in rehearsal, so it
     is to work on what nobody else reads.
     """
-    if load.cache_info().currsize:
+    if _loaded:
         return
     global _rehearsed
     kernels = _rehearsed = {}
@@ -49,7 +55,7 @@ def compile_rehearsed(computation: Callable[[], object]) -> None:
     pool = ThreadPoolExecutor(torch.get_num_threads(), "compiling")
     try:
         # Adjoints, which come last, take longest.
-        list(pool.map(lambda each: load(*each), reversed(kernels)))
+        list(pool.map(lambda each: load(*each, len(kernels)), reversed(kernels)))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
@@ -69,12 +75,32 @@ def clear_in_rehearsal(arrays: Iterable[Any]) -> None:
                 array.zero_()
 
 
-@functools.cache
-def load(kernel: Any, device: str) -> None:
-    """Has `kernel` compiled where Warp's cache has it not; a line says so of the first."""
+def load(kernel: Any, device: str, count: int = 0) -> None:
+    """Has `kernel` compiled where Warp's cache has it not, one of `count` where these are known."""
+    if (kernel, device) in _loaded:
+        return
     start = perf_counter()
-    wp.load_module(kernel.module, device=device)
-    if (seconds := perf_counter() - start) > COMPILED:
-        if not _compiled:
-            LOG.info("compiling kernels, once: %.1f s for the first of them", seconds)
-        _compiled.append(seconds)
+    line = Timer(COMPILED, _tell, (kernel.key, count))
+    line.daemon = True
+    line.start()
+    try:
+        wp.load_module(kernel.module, device=device)
+    finally:
+        line.cancel()
+    _loaded.add((kernel, device))
+    if perf_counter() - start > COMPILED:
+        _compiled.append(kernel.key)
+
+
+def _tell(name: str, count: int) -> None:
+    """Writes a line while the kernel `name` is compiled, unless there was one just now."""
+    global _last_line
+    if perf_counter() - _last_line < PAUSE:
+        return
+    is_first, _last_line = _last_line < 0, perf_counter()
+    if is_first:
+        where = f"they stay in {wp.config.kernel_cache_dir}"
+        LOG.warning("compiling kernels, which takes a minute or two, once: %s", where)
+    else:
+        of = f" of at most {count}" if count else ""
+        LOG.warning("compiling kernels: %d%s done, now %s", len(_compiled), of, name)

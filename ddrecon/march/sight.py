@@ -13,7 +13,6 @@ from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import Way, choose_way
-from ddrecon.numerics.autodiff import is_steady
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
@@ -52,18 +51,11 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
 
 
 def parts_of(camera: Camera) -> list[Any]:
-    """By what `camera` is known again, and then its fields."""
-    values = [getattr(camera, part.name) for part in fields(camera)]
-    # The numbers themselves where an array of NumPy has the same memory: nobody counts its changes.
-    shared = tuple(
-        tensor.detach().numpy().tobytes()
-        for tensor in camera.tensors
-        if is_steady(tensor) and not tensor.untyped_storage().resizable()
-    )
-    return [shared, *values]
+    """Its fields, in their order."""
+    return [getattr(camera, part.name) for part in fields(camera)]
 
 
 @remember
-def _look(grid: Grid, settings: RenderSettings, _: object, *values: Any) -> Sight:
+def _look(grid: Grid, settings: RenderSettings, *values: Any) -> Sight:
     camera, offsets = Camera(*values), subpixel_offsets(settings.samples_per_pixel)
     return look_along(grid, cast_rays(camera, *offsets), settings)

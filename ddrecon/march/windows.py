@@ -51,7 +51,7 @@ def look_inside(
 
 @remember
 def _look(
-    grid: Grid, index: float, settings: RenderSettings, _: object, *values: Any
+    grid: Grid, index: float, settings: RenderSettings, *values: Any
 ) -> tuple[Rays, tuple[Window, ...]]:
     rays = cast_rays(Camera(*values), *subpixel_offsets(settings.samples_per_pixel))
     return rays, _open(rays, grid, index, replace(settings, tolerance=0.0))

@@ -12,10 +12,13 @@ K1, K2 = 0.01, 0.03
 """Parts of the peak that keep quotients finite in flat places."""
 
 
-def structural_similarity(image: Tensor, other: Tensor, peak: Tensor) -> Tensor:
+def structural_similarity(
+    image: Tensor, other: Tensor, peak: Tensor, seen: Tensor | None = None
+) -> Tensor:
     """The structural similarity [c, h, w] of two images [c, h, w] whose largest value is `peak`.
 
-    Wang et al. 2004, doi:10.1109/TIP.2003.819861, with their window; at an edge it is cut off.
+    Wang et al. 2004, doi:10.1109/TIP.2003.819861, with their window. At an edge it is cut off, and
+    where `seen` [h, w] is 0.
     """
     place = torch.arange(-RADIUS, RADIUS + 1).to(image)
     window = torch.exp(-0.5 * (place / DEVIATION) ** 2)
@@ -24,10 +27,11 @@ def structural_similarity(image: Tensor, other: Tensor, peak: Tensor) -> Tensor:
         padded = pad(values[:, None], (RADIUS,) * 4)
         return conv2d(conv2d(padded, window.view(1, 1, -1, 1)), window.view(1, 1, 1, -1))[:, 0]
 
-    weight = blur(torch.ones_like(image[:1]))
+    seen = torch.ones_like(image[0]) if seen is None else seen
+    weight = blur(seen[None]).clamp(min=torch.finfo(seen.dtype).tiny)
 
     def mean(values: Tensor) -> Tensor:
-        return blur(values) / weight
+        return blur(values * seen) / weight
 
     first, second = mean(image), mean(other)
     contrast = mean(image * image) - first**2 + mean(other * other) - second**2

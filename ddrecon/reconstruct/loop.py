@@ -19,6 +19,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import current_engine
 from ddrecon.errors import RanksError, SolveError
+from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import cells_are_shared, from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
@@ -31,7 +32,7 @@ from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import require_scene, with_values
 
 
 def optimize(
@@ -61,6 +62,8 @@ class Reconstruction:
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
+        require_scene(scene)
+        forget_changed()
         self.problem = Problem.of(scene, iterations)
         settings, train = self.problem.settings, self.problem.train
         self.parameters = start_parameters(scene, settings)

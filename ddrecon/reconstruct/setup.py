@@ -113,8 +113,7 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
         raise SceneError(
             "views: none has split: train and an image; there is nothing to reconstruct from"
         )
-    counted = (target_of(v) * (1 if v.mask is None else v.mask) for v in train.views)
-    if not any(bool(picture.any()) for picture in counted):
+    if not any(bool(view.seen.any()) for view in train.views):
         raise FormatError(
             "views",
             "no training picture shows anything where its pixels count; masks are white there",

@@ -8,14 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ddrecon.defaults import choose_diffusion, count_colors
 from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, suggestion
-from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -27,16 +26,12 @@ from ddrecon.light.lights import (
     Light,
     PointLight,
 )
-from ddrecon.march.samplers import choose_steps, greatest_depth
 from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
-from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, count_threads, make_room
 from ddrecon.numerics.harmonics import count_harmonics
-from ddrecon.ranks import cells_are_shared
-from ddrecon.renderer import require_supported
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
@@ -49,44 +44,14 @@ from ddrecon.scene_file.schema import (
     DirectionalSection,
     LightSection,
     PointSection,
-    SceneTree,
 )
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
+from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import component_names, name_each, value_of, variable_names
 
-MOST_ROUNDS = 16
-"""Rounds until light comes to rest; in all cases measured it has by then."""
-MORE_ROUNDS = 0.3, 0.6
-"""A second moment of the phase function above one of these deserves a round more: by about so much
-a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
-"""
-FEW_ANGLES = 0.1
-"""A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
-THICK = 4.0
-"""With degree 5 there is a round more, and two where a cell has more optical depths: theta of E7.2
-is less than 1 then. Measured on half-spaces and slabs (docs/accuracy.md).
-"""
-FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
-"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
-in a flat medium has more than the second, and there are no more cells then. Measured on blocks,
-half-spaces and merged balls (docs/accuracy.md). Where there were more, cells stay as wide as they
-are along axes along which nothing varies and the box is so many times as long as along another;
-gray light may have as many then as three colors have numbers.
-"""
-SOFT = 3.0
-"""Where no face is dense and a cell has more optical depths, one round: later ones darken soft
-edges. Measured on merged balls (docs/accuracy.md).
-"""
-FLAT, BACKWARD = 0.5, 0.2
-"""A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
-side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
-that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
-"""
 START_OF_EMISSION = 0.1
 """Emission optimized from nothing shows so many times the pictures' brightness."""
-OPTIMIZED = 0.31
-"""The second moment that stands for a phase function which is optimized: two rounds."""
 
 
 def load_scene(
@@ -103,12 +68,6 @@ def load_scene(
     Raises SceneError with one line per problem of the scene, FormatError for a file it names that
     cannot be used, or UsageError for another `dtype` than `DTYPES` and a `device` that is not here.
     """
-    if dtype not in DTYPES:
-        raise UsageError(f"dtype {dtype}: light is computed in float32 or float64")
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(f"device {device}: {error}") from None
     return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
 
 
@@ -116,17 +75,21 @@ def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
     """The scene of a file, of a film the first frame, as tensors; raises what `load_scene` does."""
+    if dtype not in DTYPES:
+        raise UsageError(f"dtype {dtype}: light is computed in float32 or float64")
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"device {device}: {error}") from None
     if scene_file.tree.frames is not None:
         scene_file = at_frame(scene_file, scene_file.tree.frames.first)
     place, tree = torch.device(device), scene_file.tree
     media, views, lights, ground = _build_parts(scene_file, dtype, place)
-    grid, optimize = next(iter(media.values())).grid, tree.optimize
+    whole, optimize = _whole_of(media), tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    depth = sum(map(greatest_depth, media.values()))
-    is_flat, colors = _is_flat(media.values()), _count_colors(media)
-    chosen_by = grid, depth, is_flat, colors, _axes_that_vary(media.values())
-    diffusion, _ = choose_diffusion(tree, _phase_of(media), *chosen_by)
+    parameters = optimize.parameters if optimize else ()
+    diffusion, _ = choose_diffusion(tree.diffusion, whole, [*media.values()], parameters)
     needs = needs_of_scene(media, views, lights, diffusion, optimize)
     if too_much := make_room(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
@@ -135,25 +98,21 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
-    diffusion, reason = choose_diffusion(tree, volume.phase, *chosen_by)
-    render = tree.render
-    if render.steps_per_voxel is None:
-        render = replace(render, steps_per_voxel=choose_steps(volume, diffusion.times))
     scene = Scene(
         volume,
         lights,
         views,
-        render,
-        diffusion,
+        tree.render,
+        tree.diffusion,
         optimize,
         path=scene_file.path,
         ground=ground,
-        reason=reason,
     )
     try:
         require_supported(scene)
+        require_above(scene)
         for view in views if volume.index != 1 else ():
-            look_inside(view.camera, grid, volume.index, render)
+            look_inside(view.camera, whole.grid, volume.index, scene.render)
     except UsageError as error:
         key, _, what = str(error).partition(": ")
         raise scene_file.refused(key, what) from None
@@ -183,7 +142,7 @@ def _build_parts(
     ground = None
     if media and tree.ground is not None:
         with problems.collecting():
-            ground = _build_ground(scene_file, grid, views, dtype, place)
+            ground = _build_ground(scene_file, dtype, place)
     for name, settings in tree.optimize.parameters.items() if tree.optimize else ():
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
@@ -229,27 +188,10 @@ def _map_of(scene_file: SceneFile, name: str, pixels: np.ndarray) -> Tensor:
     return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
 
 
-def _build_ground(
-    scene_file: SceneFile,
-    grid: Grid,
-    views: Sequence[View],
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Ground:
+def _build_ground(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Ground:
     tree = scene_file.tree
     section, axis = tree.ground, "zyx".index(tree.volume.up)
     assert section is not None
-    if section.height > grid.lower[axis]:
-        raise scene_file.refused(
-            "ground.height",
-            f"{section.height:g} is above the bottom of the box, {grid.lower[axis]:g} along "
-            f"{tree.volume.up}; a ground lies there or below",
-        )
-    for view in views:
-        if float(view.camera.pose[2 - axis, 3]) <= section.height:
-            what = f"the camera of view {view.name!r} is not above it along {tree.volume.up}"
-            what += "; volume.up says which axis is up"
-            raise scene_file.refused("ground.height", what)
     if isinstance(section.albedo, FieldFile):
         file = section.albedo.file
         pixels = read_referenced(scene_file, "ground.albedo.file", file, _read_albedo)
@@ -285,11 +227,11 @@ def _read_map(path: Path) -> np.ndarray:
     return pixels.clip(min=0)
 
 
-def _phase_of(media: Mapping[str, Volume]) -> PhaseFunction:
-    """The phase function of `media`, of two a blend of both."""
+def _whole_of(media: Mapping[str, Volume]) -> Volume:
+    """The first of `media`, with the phase function of all: of two a blend of both."""
     first, *others = media.values()
     half = first.density.new_tensor(0.5)
-    return Blend(first.phase, others[0].phase, half) if others else first.phase
+    return replace(first, phase=Blend(first.phase, others[0].phase, half)) if others else first
 
 
 def needs_of_scene(
@@ -303,16 +245,15 @@ def needs_of_scene(
 
     Of one medium that is alone its name is "". Derivatives count where something is optimized.
     """
-    phase, parameters = _phase_of(media), optimize.parameters if optimize else {}
-    first = next(iter(media.values()))
-    colors = _count_colors(media)
-    is_directed = "g" in parameters or bool((phase.moments(3)[:, 1:] != 0).any())
+    whole, parameters = _whole_of(media), optimize.parameters if optimize else {}
+    colors = count_colors(whole, media.values())
+    is_directed = "g" in parameters or bool((whole.phase.moments(3)[:, 1:] != 0).any())
     varied = [_varied(name, one, media, colors) for name, one in parameters.items()]
-    z, y, x = first.grid.shape
+    z, y, x = whole.grid.shape
     return Needs(
         (x, y, z),
         colors,
-        first.density.element_size(),
+        whole.density.element_size(),
         pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
         has_flux=is_directed,
         has_rounds=diffusion.rounds > 0,
@@ -320,16 +261,10 @@ def needs_of_scene(
         is_limited=diffusion.model == "flux_limited",
         varied=sum(varied) if varied else None,
         lights=len(lights),
-        threads=count_threads(first.density.device),
+        threads=count_threads(whole.density.device),
         times=diffusion.times,
         along=diffusion.refine_along,
     )
-
-
-def _count_colors(media: Mapping[str, Volume]) -> int:
-    first = next(iter(media.values()))
-    glows = [len(one) for one in (first.emission, first.black_body) if one is not None]
-    return max(_phase_of(media).colors, *(len(one.sigma_a) for one in media.values()), *glows)
 
 
 def _varied(
@@ -350,132 +285,6 @@ def _varied(
     is_given = isinstance(settings.init, FieldFile) or has_cells
     is_field = is_given if settings.field is None else settings.field
     return is_field * (colors if kind.is_color else 1)
-
-
-def choose_diffusion(
-    tree: SceneTree,
-    phase: PhaseFunction,
-    grid: Grid,
-    depth: float,
-    is_flat: bool,
-    colors: int,
-    varies: str,
-) -> tuple[DiffusionSettings, str]:
-    """The diffusion settings of `tree`, where it leaves any out as a medium deserves; and why.
-
-    By its `phase` function: one that is optimized may become any, and starts as one of strong peaks
-    does. If its density is not optimized, also by the `depth` of its thickest cell on `grid`, and
-    whether it goes up to a face of the box, `is_flat`. Cells of so many `colors` are divided along
-    all axes if there are not too many then, else along those of which it `varies` along any.
-    """
-    settings = tree.diffusion
-    if not settings.rounds:
-        return settings, ""
-    left = float(phase.moments(3)[:, 2].abs().max())
-    optimized = tree.optimize.parameters if tree.optimize else {}
-    if any(name == "g" or name.startswith(PHASE) for name in optimized):
-        left = max(left, OPTIMIZED)
-    reasons = [f"a second moment of {left:.2g} of the phase function"]
-    if any(name.endswith("density") for name in optimized):
-        depth, is_flat = 0.0, False
-    thin = FINER_FLAT if is_flat else FINER
-    times, along = _choose_cells(settings, grid, depth / thin, colors, varies)
-    if depth > thin:
-        reasons.append(f"cells of {depth:.2g} optical depths")
-    rounds, degree, causes = _choose_rounds(tree, phase, left, depth / times, is_flat)
-    reasons += causes
-    if settings.transport_tolerance is not None:
-        rounds = MOST_ROUNDS
-    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
-    left_out: dict[str, Any] = {
-        key: value for key, value in chosen.items() if getattr(settings, key) is None
-    }
-    if settings.refine is None and times > 1 and along != settings.refine_along:
-        reasons.append("too many cells to divide all")
-        left_out["refine_along"] = along
-    words = ", ".join(f"{key} {value}" for key, value in left_out.items())
-    return replace(settings, **left_out), f"{words}: {', '.join(reasons)}" if words else ""
-
-
-def _choose_cells(
-    settings: DiffusionSettings, grid: Grid, excess: float, colors: int, varies: str
-) -> tuple[int, str]:
-    """How many times as narrow cells are, and along which axes, as of `choose_diffusion`.
-
-    Cells have `excess` times as many optical depths as are thin.
-    """
-    times, along, most = settings.times, settings.refine_along, MOST_CELLS
-    if along != varies and along == "xyz" and grid.refine(3).cells > most:
-        along, most = varies, 3 * MOST_CELLS // colors
-    may_refine = settings.refine is None and not cells_are_shared()
-    while may_refine and times < 9 and excess > times:
-        if grid.refine(3 * times, along).cells > most:
-            break
-        times *= 3
-    return times, along
-
-
-def _choose_rounds(
-    tree: SceneTree, phase: PhaseFunction, left: float, depth: float, is_flat: bool
-) -> tuple[int, int, list[str]]:
-    """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
-    reasons = list[str]()
-    rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    if is_flat or _turns_back(phase):
-        reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
-        rounds, degree = rounds + 1 + (depth > THICK), 5
-    elif depth > SOFT:
-        rounds = 1
-    elif tree.glows:
-        # Around a small bright core diffusion is far too bright, and a single round too dark.
-        reasons.append("emission")
-        rounds = max(rounds, 2)
-    if tree.volume.periodic:
-        # With fewer directions too much light goes exactly along the axes that repeat.
-        reasons.append("a volume that repeats")
-        rounds, degree = max(rounds, 2), 5
-    if getattr(tree.volume, "index", 1) != 1:
-        # What faces reflect comes back again and again.
-        reasons.append("faces that reflect light")
-        rounds = max(rounds, 4)
-    return rounds, degree, reasons
-
-
-def _turns_back(phase: PhaseFunction) -> bool:
-    return float(phase.backward_tail(3, 1).max()) > BACKWARD
-
-
-def _axes_that_vary(media: Iterable[Volume]) -> str:
-    """The axes but those along which `media` are even in a box that is long: light hardly varies
-    along these.
-    """
-    fields, axes = list[Tensor](), ""
-    for one in media:
-        each = one.density, one.sigma_a, one.sigma_s, one.emission, one.black_body, one.phase.cells
-        fields += [field for field in each if field is not None and field.ndim > 2]
-        extent = one.grid.extent
-    for axis in range(3):
-        is_long = extent[axis] > LONG * min(extent)
-        if not is_long or any(_varies(field, axis) for field in fields):
-            axes = "zyx"[axis] + axes
-    return axes
-
-
-def _varies(field: Tensor, axis: int) -> bool:
-    if not field.stride(axis - 3):
-        return False
-    return not bool((field == field.narrow(axis - 3, 0, 1)).all())
-
-
-def _is_flat(media: Iterable[Volume]) -> bool:
-    """Whether `media`, all together, go up to a face of the box."""
-    faces, whole = np.zeros(6), 0.0
-    for one in media:
-        size, density = float(one.sigma_a.mean() + one.sigma_s.mean()), one.density
-        ends = (density.select(axis, end) for axis in range(3) for end in (0, -1))
-        faces += [size * float(face.mean()) for face in ends]
-        whole += size * float(density.mean())
-    return bool(faces.max() > FLAT * whole)
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import DataWarning, FormatError, Problems
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
@@ -238,7 +238,10 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
     problems.raise_any()
     size = next(size for size in sizes.values() if size is not None)
     low, high = next(box for box in boxes.values() if box is not None).tolist()
-    return Grid.from_xyz(size, tuple(low), tuple(high), "".join(section.periodic))
+    try:
+        return Grid.from_xyz(size, tuple(low), tuple(high), "".join(section.periodic))
+    except UsageError as error:
+        raise scene_file.refused(*str(error).split(": ", 1)) from None
 
 
 def _show(value: np.ndarray) -> str:

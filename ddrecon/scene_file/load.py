@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from ddrecon.errors import FormatError, Problems, SceneError, suggestion
+from ddrecon.errors import FormatError, Problems, SceneError, UsageError, suggestion
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
@@ -62,8 +62,12 @@ class SceneFile:
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
     """The scene file at `path` with `overrides` (`key.path=value`) put in, its box in numbers.
 
-    Raises SceneError with one line per problem.
+    Raises SceneError with one line per problem, UsageError for arguments that are none.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise UsageError(f"path: expected that of a scene file, found {type(path).__name__}")
+    if isinstance(overrides, str) or not isinstance(overrides, Iterable):
+        raise UsageError(f'overrides: expected a list, ["key.path=value"], found {overrides!r}')
     path, problems = Path(path), Problems()
     found = None
     with problems.collecting():

@@ -546,10 +546,6 @@ class SceneTree:
             has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
             if last == "phase.g" and has_one:
                 yield "optimize", f"parameters.{name} is called {medium}g here"
-        if self.ground is not None and self.diffusion.scheme == "printed":
-            yield "ground", "the printed scheme has none; leave diffusion.scheme out"
-        if self.volume.periodic:
-            yield from self._cannot_repeat()
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]
         if counted and self.frames is None:
@@ -557,24 +553,3 @@ class SceneTree:
         films = [name for name in named if name.lower().endswith(tuple(FILMS))]
         if self.frames is not None and not counted and not films:
             yield "frames", "no picture changes: name films, or put {frame:04d} into names"
-
-    def _cannot_repeat(self) -> Iterator[Violation]:
-        """What there is not in a volume that is periodic."""
-        axes = self.volume.periodic
-        if len(set(axes)) < len(axes) or len(axes) > 2:
-            yield "volume", "periodic: name one axis or two, each once; by a face light must leave"
-        if self.diffusion.scheme == "printed" or self.diffusion.model == "flux_limited":
-            yield "diffusion", "volume.periodic is for model p1 with scheme conservative, or none"
-        for index, light in enumerate(self.lights):
-            if isinstance(light, PointSection | BeamSection):
-                what = "does not repeat as the volume does; leave volume.periodic out"
-                yield "lights", f"{index}: a light of type {light.type} {what}"
-        if self.ground is not None and self.volume.up in self.volume.periodic:
-            yield "ground", f"lies across {self.volume.up}, along which the volume is periodic"
-        if self.ground is not None and isinstance(self.ground.albedo, FieldFile):
-            yield "ground", "albedo: a map does not repeat as the volume does: give a number"
-        if self.volume.periodic and getattr(self.volume, "index", 1) != 1:
-            yield "volume", "index: faces that repeat refract nothing: leave index or periodic out"
-        settings = self.optimize.parameters.values() if self.optimize else ()
-        if any(one.support is not None for one in settings):
-            yield "optimize", "support is for volumes that do not repeat: leave support out"

@@ -98,9 +98,10 @@ class HardCase:
             lights.append(AmbientLight(tensor([self.ambient])))
         pose = look_at(tensor(self.eye), tensor(self.target), tensor((0.0, 1.0, 0.0)))
         views = [View("view", Camera(pose, (16, 16), self.half_width, self.is_perspective))]
-        return Scene(
-            volume, lights, views, RenderSettings(), DiffusionSettings(tolerance=TOLERANCE[dtype])
+        diffusion = DiffusionSettings(
+            tolerance=TOLERANCE[dtype], transport_rounds=1, degree=3, refine=1
         )
+        return Scene(volume, lights, views, RenderSettings(steps_per_voxel=1), diffusion)
 
 
 SLAB = 1 / 24

@@ -83,8 +83,8 @@ def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
 
 def offset_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the root mean square of the view's picture, or of 1 where there is none."""
-    image = _view_of(scene, name).image
-    return OFFSET_STEP * (1.0 if image is None else float(image.square().mean().sqrt()))
+    view = _view_of(scene, name)
+    return OFFSET_STEP * (1.0 if view.image is None else float(view.seen.square().mean().sqrt()))
 
 
 def unit_of(scene: Scene, name: str) -> float:
@@ -114,7 +114,7 @@ def shown_emission(scene: Scene) -> float:
     That is the mean of the training views' pictures, weighted by themselves, so that black around
     what shines does not count; 1 where there are none.
     """
-    shown = [view.image for view in scene.views if view.image is not None and not view.is_test]
+    shown = [view.seen for view in scene.views if view.image is not None and not view.is_test]
     total = sum(float(image.mean()) for image in shown)
     squares = sum(float(image.square().mean()) for image in shown)
     return (squares / total if total > 0 else 1.0) / _side(scene)

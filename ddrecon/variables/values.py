@@ -116,14 +116,23 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     return replace(scene, volume=volume, lights=lights, views=views, ground=ground)
 
 
-def require_legal(scene: Scene, *, waits: bool = False) -> None:
+def require_scene(scene: object) -> None:
+    """Raises UsageError unless `scene` is one."""
+    if not isinstance(scene, Scene):
+        kind = type(scene).__name__
+        raise UsageError(f"expected a Scene, found {kind}; ddrecon.load_scene(path) reads one")
+
+
+def require_legal(scene: Scene, view: str | None = None, *, waits: bool = False) -> None:
     """Raises UsageError where a number of `scene` is none that a scene file may have.
 
-    That is one of its volume or lights of a wrong shape, precision or device, one that is not
-    finite, or out of range, such as a density below 0. Of those on a GPU it looks at the range only
-    if it `waits` for it.
+    That is one of its volume, its lights or its views (of the one named `view`, or all) of a wrong
+    shape, precision or device, one that is not finite, or out of range, such as a density below 0.
+    Of those on a GPU it looks at the range only if it `waits` for it.
     """
     cells, density = scene.volume.grid.shape, scene.volume.density
+    if isinstance(density, Tensor) and density.is_meta:
+        raise UsageError("density: has no numbers on the device meta")
     numbers = {
         name: _volume_value(scene.volume, name)
         for name in _volume_names(scene.volume)
@@ -133,10 +142,41 @@ def require_legal(scene: Scene, *, waits: bool = False) -> None:
         numbers |= {f"lights.{index}.{name}": getattr(light, name) for name in _tensors(light)}
     if scene.ground is not None:
         numbers["ground.albedo"] = scene.ground.albedo
+    for item in scene.views if view is None else [scene.view(view)]:
+        numbers |= _view_numbers(item)
     for name, value in numbers.items():
         require_form(name, value, value, density, cells)
-        if waits or value.device.type == "cpu":
+        if waits or value.is_cpu:
             require_range(name, value)
+
+
+def _view_numbers(view: View) -> dict[str, Tensor]:
+    """What is varied of `view`, by name; raises UsageError where the rest of it is none."""
+    owner, camera, behind = f"views.{view.name}.", view.camera, view.background
+    pose, half = camera.pose, camera.half_width
+    is_seen = not isinstance(half, Tensor) or half.is_cpu
+    if not isinstance(pose, Tensor) or pose.shape != (3, 4):
+        raise UsageError(f"{owner}camera: expected a pose [3, 4], found {_shape_of(pose)}")
+    if len(camera.size) != 2 or not all(isinstance(n, int) and n > 0 for n in camera.size):
+        raise UsageError(f"{owner}camera: expected a size (height, width), found {camera.size}")
+    if is_seen and not 0 < float(half) < math.inf:
+        what = "half_width, 1 / (2 focal), must be above 0 and finite"
+        raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
+    if behind is not None and behind.is_cpu and not bool(behind.isfinite().all()):
+        raise UsageError(f"{owner}background: must be finite")
+    parts = {part: getattr(view, part) for part in RESPONSE}
+    parts |= {"camera": pose, "distortion": camera.distortion}
+    parts["principal_point"] = _view_value(view, "principal_point")
+    return {owner + part: value for part, value in parts.items() if value is not None}
+
+
+def _shape_of(value: object) -> str:
+    return str(list(value.shape)) if isinstance(value, Tensor) else type(value).__name__
+
+
+def is_real(value: object) -> bool:
+    """Whether `value` is a tensor of real numbers, each in its place."""
+    return isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex()
 
 
 def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict[str, Settings]:
@@ -165,6 +205,8 @@ def require_form(
     """
     if not isinstance(value, Tensor):
         raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
+    if not is_real(value):
+        raise UsageError(f"{name}: is {value.dtype}, {value.layout}; expected real and strided")
     if (value.dtype, value.device) != (like.dtype, like.device):
         raise UsageError(
             f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
@@ -186,8 +228,8 @@ def require_range(name: str, value: Tensor) -> None:
     if kind.high == STEEPEST_G and not -1 < least <= most < 1:
         # A scene may scatter further forward than a run makes it.
         raise UsageError(f"{name}: must be above -1 and below 1, {found}")
-    if kind.low == 0 and not 0 <= least <= most <= kind.high:
-        bounds = "at least 0" if kind.high == math.inf else f"from 0 to {kind.high:g}"
+    if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
+        bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
         raise UsageError(f"{name}: must be {bounds}, {found}")
     if kind.is_direction and least == most == 0:
         raise UsageError(f"{name}: must not be zero")
@@ -205,12 +247,20 @@ def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tup
         return [(color, *tail) for tail in tails for color in (1, 3)]
     if kind.is_cellwise:
         return [(), cells, (1, *cells)]
-    return [(3,)] if kind.components == XYZ else [now]
+    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [now]
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
     names = [known for known in variable_names(scene) if not known.startswith("views.")]
-    return UsageError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
+    hints = [f"besides views, the scene has {', '.join(names)}"]
+    if scene.views:
+        view = scene.views[0]
+        hints.append(
+            f"each view has {', '.join(_view_parts(view))}, as in views.{view.name}.camera"
+        )
+    if name == "emission":
+        hints = ["a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"]
+    return UsageError(f"no variable {name!r}; {'; '.join(hints)}")
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:
@@ -304,6 +354,8 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         require_form(name, value, now, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
+        if both := values.keys() & CROSS_SECTIONS:
+            raise UsageError(f"{min(both)}: give sigma_a and sigma_s, or sigma_t and albedo")
         sigma_t, albedo = (
             values[name] if name in values else _volume_value(volume, name)
             for name in EXTINCTION_AND_ALBEDO

@@ -128,7 +128,7 @@ def test_a_compilation_is_announced_once(
     describe = check.describe
 
     def compile_and_describe(*scene: Any) -> object:
-        LOG.info("compiling kernels, once: %.1f s", 2.5)
+        LOG.warning("compiling kernels, once: %.1f s", 2.5)
         return describe(*scene)
 
     monkeypatch.setattr(check, "describe", compile_and_describe)

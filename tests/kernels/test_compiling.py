@@ -1,6 +1,7 @@
 """A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
 
 import logging
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +25,7 @@ class Loads(list[object]):
     """Kernels made ready; `unload` has the process forget those it had."""
 
     def unload(self) -> None:
-        compiling.load.cache_clear()
+        compiling._loaded.clear()
         self.clear()
 
 
@@ -38,7 +39,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loads]:
     )
     seen.unload()
     yield seen
-    compiling.load.cache_clear()
+    compiling._loaded.clear()
 
 
 def first_iteration() -> torch.Tensor:
@@ -92,3 +93,28 @@ def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.Mon
     # Where a process has kernels, nothing is rehearsed.
     compiling.compile_rehearsed(lambda: found.append("again"))
     assert "again" not in found
+
+
+def test_while_kernels_are_compiled_lines_say_how_far_that_is(
+    loads: Loads, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Before the first is done, at a level that Python shows unasked, and not of what is cached."""
+    use_engine("warp")
+    kernels = fill_kernels()
+    is_told = threading.Semaphore(0)
+    monkeypatch.setattr(compiling, "COMPILED", 0.0)
+    monkeypatch.setattr(compiling, "PAUSE", 0.0)
+    monkeypatch.setattr(compiling, "_last_line", -1.0)
+    monkeypatch.setattr(compiling, "_compiled", [])
+    monkeypatch.setattr(compiling.wp, "load_module", lambda *_, **__: is_told.acquire(timeout=60))
+    real = compiling._tell
+    monkeypatch.setattr(compiling, "_tell", lambda *of: (real(*of), is_told.release()))
+    with caplog.at_level(logging.WARNING, LOG):
+        for kernel in kernels:
+            compiling.load(kernel.kernel, "cpu", len(kernels))
+        lines = [record.getMessage() for record in caplog.records]
+        assert len(lines) == 3 and "once" in lines[0] and "fill_2" in lines[2]
+        assert "2 of at most 3 done" in lines[2]
+        for kernel in kernels:
+            compiling.load(kernel.kernel, "cpu")
+    assert len(caplog.records) == 3

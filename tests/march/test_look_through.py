@@ -37,6 +37,10 @@ def shift_in_numpy(camera: Camera) -> None:
     camera.pose.numpy()[:, 3] += 0.1
 
 
+def shift_data(camera: Camera) -> None:
+    camera.pose.data[:, 3] += 0.1
+
+
 def narrow(camera: Camera) -> None:
     camera.half_width *= 0.5
 
@@ -49,7 +53,7 @@ def turn(camera: Camera) -> None:
     camera.pose = make_camera(eye=(1.0, 0.5, 2.0)).pose
 
 
-@pytest.mark.parametrize("change", [shift, shift_in_numpy, narrow, enlarge, turn])
+@pytest.mark.parametrize("change", [shift, shift_in_numpy, shift_data, narrow, enlarge, turn])
 def test_a_camera_that_changed_sees_what_a_new_one_sees(change):
     camera = camera_of()
     render(scene_of(camera))

@@ -3,12 +3,14 @@
 import gc
 from weakref import ref
 
+import numpy as np
 import pytest
 import torch
+from far_device import FAR
 from torch import Tensor
 
 from ddrecon.numerics import remember as module
-from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.numerics.remember import forget_changed, is_any_nonzero, remember
 
 
 @pytest.fixture
@@ -31,13 +33,45 @@ def test_the_same_arguments_are_computed_once(doubled):
     assert calls == [2, 3]
 
 
-def test_what_was_changed_in_place_is_computed_again(doubled):
+CHANGES = {
+    "in place": lambda values: values.add_(1),
+    "by data": lambda values: values.data.add_(1),
+    "as data": lambda values: setattr(values, "data", values + 1),
+    "in NumPy": lambda values: np.add(values.numpy(), 1, out=values.numpy()),
+    "of another kind": lambda values: setattr(values, "data", values.double() + 1),
+}
+
+
+@pytest.mark.parametrize("count", [1, 3, 5000])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_what_was_changed_is_computed_again(doubled, change, count):
+    double, calls = doubled
+    values = torch.ones(count)
+    double(values)
+    change(values)
+    assert torch.equal(double(values), torch.full_like(values, 4.0))
+    assert len(calls) == 2
+
+
+def test_what_follows_from_a_result_follows_its_changes(doubled):
     double, calls = doubled
     values = torch.ones(3)
-    double(values)
-    values += 1
-    assert torch.equal(double(values), torch.full((3,), 4.0))
-    assert len(calls) == 2
+    assert double(double(values)) is double(double(values))
+    values.data.add_(1)
+    assert torch.equal(double(double(values)), torch.full((3,), 8.0))
+    assert len(calls) == 4
+
+
+def test_on_a_gpu_one_look_finds_what_changed(doubled):
+    """There each call would wait for the device, so those who are given tensors look first."""
+    double, calls = doubled
+    tensors = [torch.ones(3).to(FAR), torch.ones(2, 2).double().to(FAR)]
+    for change, count in ((0, 2), (1, 4)):
+        tensors[1].near.add_(change)  # what nobody counts
+        forget_changed()
+        for values in tensors:
+            assert double(values).tolist() == (2 * values.near).tolist()
+        assert len(calls) == count
 
 
 def test_other_tensors_of_the_same_numbers_are_others(doubled):

@@ -4,13 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from media import make_scene
 
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.kinds import KINDS, pattern_of
+from ddrecon.variables.kinds import KINDS, kind_of, pattern_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
@@ -110,3 +111,15 @@ def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -
         field = torch.full((*([3] if kind.is_color else []), *cells), 0.5, dtype=torch.float64)
         changed = with_values(scene, {name: field})
         torch.testing.assert_close(value_of(changed, name), field, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("name", ["emission", "views.front.offset"])
+def test_what_masked_pixels_hold_changes_no_rate(name: str) -> None:
+    rates = []
+    for lamp in (0.0, 1000.0):
+        scene = make_scene(torch.ones(2, 2, 2), emission=torch.zeros(1))
+        image, mask = torch.full((3, 4, 5), 0.2), torch.ones(4, 5)
+        image[:, 1, 2], mask[1, 2] = lamp, 0
+        scene.views = [View("front", scene.views[0].camera, image, mask)]
+        rates.append(float(kind_of(name).rate(scene, name, torch.zeros(1))))
+    assert rates[0] == rates[1] > 0

@@ -1,0 +1,178 @@
+"""What a scene gets whose settings leave something out, as its medium deserves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ddrecon.march.samplers import greatest_depth
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.ranks import cells_are_shared
+from ddrecon.settings import DiffusionSettings
+
+MOST_ROUNDS = 16
+"""Rounds until light comes to rest; in all cases measured it has by then."""
+MORE_ROUNDS = 0.3, 0.6
+"""A second moment of the phase function above one of these deserves a round more: by about so much
+a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
+"""
+FEW_ANGLES = 0.1
+"""A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
+THICK = 4.0
+"""With degree 5 there is a round more, and two where a cell has more optical depths: theta of E7.2
+is less than 1 then. Measured on half-spaces and slabs (docs/accuracy.md).
+"""
+FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
+"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
+in a flat medium has more than the second, and there are no more cells then. Measured on blocks,
+half-spaces and merged balls (docs/accuracy.md). Where there were more, cells stay as wide as they
+are along axes along which nothing varies and the box is so many times as long as along another;
+gray light may have as many then as three colors have numbers.
+"""
+SOFT = 3.0
+"""Where no face is dense and a cell has more optical depths, one round: later ones darken soft
+edges. Measured on merged balls (docs/accuracy.md).
+"""
+FLAT, BACKWARD = 0.5, 0.2
+"""A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
+side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
+that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
+"""
+OPTIMIZED = 0.31
+"""The second moment that stands for a phase function which is optimized: two rounds."""
+
+
+def choose_diffusion(
+    settings: DiffusionSettings, volume: Volume, media: Sequence[Volume], optimized: Collection[str]
+) -> tuple[DiffusionSettings, str]:
+    """`settings`, and what they leave out as the `media` of `volume` deserve; and why.
+
+    By its phase function: one that is `optimized` may become any, and starts as one of strong peaks
+    does. If its density is not optimized, also by the depth of its thickest cell, and whether it
+    goes up to a face of the box. Cells are divided along all axes if there are not too many then,
+    else along those of which the media vary along any.
+    """
+    left_out = None in (settings.transport_rounds, settings.degree, settings.refine)
+    if not settings.rounds or not left_out:
+        return settings, ""
+    left = float(volume.phase.moments(3)[:, 2].abs().max())
+    if any(name.partition(".")[0] in ("g", "phase") for name in optimized):
+        left = max(left, OPTIMIZED)
+    reasons = [f"a second moment of {left:.2g} of the phase function"]
+    depth, is_flat = sum(map(greatest_depth, media)), _is_flat(media)
+    if any(name.endswith("density") for name in optimized):
+        depth, is_flat = 0.0, False
+    thin = FINER_FLAT if is_flat else FINER
+    times, along = _choose_cells(settings, volume, media, depth / thin)
+    if depth > thin:
+        reasons.append(f"cells of {depth:.2g} optical depths")
+    rounds, degree, causes = _choose_rounds(volume, optimized, left, depth / times, is_flat)
+    reasons += causes
+    if settings.transport_tolerance is not None:
+        rounds = MOST_ROUNDS
+    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    added: dict[str, Any] = {
+        key: value for key, value in chosen.items() if getattr(settings, key) is None
+    }
+    if settings.refine is None and times > 1 and along != settings.refine_along:
+        reasons.append("too many cells to divide all")
+        added["refine_along"] = along
+    words = ", ".join(f"{key} {value}" for key, value in added.items())
+    return replace(settings, **added), f"{words}: {', '.join(reasons)}"
+
+
+def _choose_cells(
+    settings: DiffusionSettings, volume: Volume, media: Sequence[Volume], excess: float
+) -> tuple[int, str]:
+    """How many times as narrow cells are, and along which axes, as of `choose_diffusion`.
+
+    Cells have `excess` times as many optical depths as are thin.
+    """
+    times, along, most = settings.times, settings.refine_along, MOST_CELLS
+    grid, varies = volume.grid, _axes_that_vary(media)
+    if along != varies and along == "xyz" and grid.refine(3).cells > most:
+        along, most = varies, 3 * MOST_CELLS // count_colors(volume, media)
+    may_refine = settings.refine is None and not cells_are_shared()
+    while may_refine and times < 9 and excess > times:
+        if grid.refine(3 * times, along).cells > most:
+            break
+        times *= 3
+    return times, along
+
+
+def _choose_rounds(
+    volume: Volume, optimized: Collection[str], left: float, depth: float, is_flat: bool
+) -> tuple[int, int, list[str]]:
+    """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
+    reasons = list[str]()
+    rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
+    if is_flat or _turns_back(volume.phase):
+        reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
+        rounds, degree = rounds + 1 + (depth > THICK), 5
+    elif depth > SOFT:
+        rounds = 1
+    elif _glows(volume) or "emission" in optimized:
+        # Around a small bright core diffusion is far too bright, and a single round too dark.
+        reasons.append("emission")
+        rounds = max(rounds, 2)
+    if volume.grid.periodic:
+        # With fewer directions too much light goes exactly along the axes that repeat.
+        reasons.append("a volume that repeats")
+        rounds, degree = max(rounds, 2), 5
+    if volume.index != 1:
+        # What faces reflect comes back again and again.
+        reasons.append("faces that reflect light")
+        rounds = max(rounds, 4)
+    return rounds, degree, reasons
+
+
+def _glows(volume: Volume) -> bool:
+    return any(one is not None and bool(one.any()) for one in (volume.emission, volume.black_body))
+
+
+def _turns_back(phase: PhaseFunction) -> bool:
+    return float(phase.backward_tail(3, 1).max()) > BACKWARD
+
+
+def _axes_that_vary(media: Iterable[Volume]) -> str:
+    """The axes but those along which `media` are even in a box that is long: light hardly varies
+    along these.
+    """
+    fields, axes = list[Tensor](), ""
+    for one in media:
+        each = one.density, one.sigma_a, one.sigma_s, one.emission, one.black_body, one.phase.cells
+        fields += [field for field in each if field is not None and field.ndim > 2]
+        extent = one.grid.extent
+    for axis in range(3):
+        is_long = extent[axis] > LONG * min(extent)
+        if not is_long or any(_varies(field, axis) for field in fields):
+            axes = "zyx"[axis] + axes
+    return axes
+
+
+def _varies(field: Tensor, axis: int) -> bool:
+    if not field.stride(axis - 3):
+        return False
+    return not bool((field == field.narrow(axis - 3, 0, 1)).all())
+
+
+def _is_flat(media: Iterable[Volume]) -> bool:
+    """Whether `media`, all together, go up to a face of the box."""
+    faces, whole = np.zeros(6), 0.0
+    for one in media:
+        size, density = float(one.sigma_a.mean() + one.sigma_s.mean()), one.density
+        ends = (density.select(axis, end) for axis in range(3) for end in (0, -1))
+        faces += [size * float(face.mean()) for face in ends]
+        whole += size * float(density.mean())
+    return bool(faces.max() > FLAT * whole)
+
+
+def count_colors(volume: Volume, media: Iterable[Volume]) -> int:
+    """How many colors light has in `volume`, of these `media`."""
+    glows = [len(one) for one in (volume.emission, volume.black_body) if one is not None]
+    return max(volume.phase.colors, *(len(one.sigma_a) for one in media), *glows)

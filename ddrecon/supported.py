@@ -1,0 +1,80 @@
+"""What is not computed together: one rule for scenes of files and of Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ddrecon.errors import UsageError
+from ddrecon.light.lights import BeamLight, PointLight
+from ddrecon.scene import Scene
+from ddrecon.slabs.slab import Slab, own_slab
+
+
+def require_supported(scene: Scene) -> None:
+    """Raises UsageError for what is not computed of `scene`; its line begins with the key."""
+    for problem in _unsupported(scene):
+        raise UsageError(problem)
+
+
+def require_above(scene: Scene) -> None:
+    """Raises UsageError where a camera of `scene` is not above its ground."""
+    if scene.ground is None:
+        return
+    height, up = scene.ground.plane.height, 2 - scene.ground.plane.axis
+    for view in scene.views:
+        if float(view.camera.pose[up, 3]) <= height:
+            raise UsageError(
+                f"ground.height: the camera of view {view.name!r} is not above it along "
+                f"{'xyz'[up]}; volume.up says which axis is up"
+            )
+
+
+def _unsupported(scene: Scene) -> Iterator[str]:
+    settings, grid = scene.diffusion, scene.volume.grid
+    if settings.model != "none":  # whose rounds nobody makes
+        yield from (f"diffusion.{key}: {what}" for key, what in settings.violations())
+    if scene.ground is not None and settings.scheme == "printed":
+        yield "ground: the printed scheme has none; leave diffusion.scheme out"
+    if scene.ground is not None and scene.ground.plane.height > grid.lower[scene.ground.plane.axis]:
+        plane, bottom = scene.ground.plane, grid.lower[scene.ground.plane.axis]
+        yield (
+            f"ground.height: {plane.height:g} is above the bottom of the box, {bottom:g} along "
+            f"{'zyx'[plane.axis]}; a ground lies there or below"
+        )
+    if grid.periodic:
+        yield from _cannot_repeat(scene)
+    neither = {
+        "ground": scene.ground is not None,
+        "diffusion.scheme: printed": settings.scheme == "printed",
+        "diffusion.model: flux_limited": settings.model == "flux_limited",
+    }
+    is_cut = isinstance(own_slab(grid), Slab)
+    in_slabs = neither | {"diffusion.refine: above 1": settings.times > 1}
+    has_points = any(isinstance(light, PointLight) for light in scene.lights)
+    refracted = neither | {"point lights": has_points, "--share cells": is_cut}
+    for what in [name for name, is_so in in_slabs.items() if is_so and is_cut]:
+        yield f"{what}: not where processes share out cells; leave --share cells out"
+    for what in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
+        yield f"volume.index: there is none with {what}"
+
+
+def _cannot_repeat(scene: Scene) -> Iterator[str]:
+    """What there is not in a volume that is periodic."""
+    settings, axes = scene.diffusion, scene.volume.grid.periodic
+    if settings.scheme == "printed" or settings.model == "flux_limited":
+        yield "diffusion: volume.periodic is for model p1 with scheme conservative, or none"
+    for index, light in enumerate(scene.lights):
+        if isinstance(light, PointLight | BeamLight):
+            kind, what = type(light).__name__, "does not repeat as the volume does"
+            yield f"lights.{index}: a {kind} {what}; leave volume.periodic out"
+    if scene.ground is not None and scene.ground.plane.axis in axes:
+        name = "zyx"[scene.ground.plane.axis]
+        yield f"ground: lies across {name}, along which the volume is periodic"
+    if scene.ground is not None and scene.ground.albedo.ndim > 1:
+        yield "ground.albedo: a map does not repeat as the volume does: give a number"
+    if scene.volume.index != 1:
+        yield "volume.index: faces that repeat refract nothing: leave index or periodic out"
+    for name, parameter in scene.optimize.parameters.items() if scene.optimize else ():
+        if parameter.support is not None:
+            key = f"optimize.parameters.{name}.support"
+            yield f"{key}: is for volumes that do not repeat: leave it out"
