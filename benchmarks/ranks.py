@@ -1,6 +1,6 @@
 """What it brings that ranks share a scene: an iteration by one of them and by all.
 
-    torchrun --nproc-per-node 2 benchmarks/ranks.py SCENE [--share views|cells] [-D key=value]...
+    torchrun --nproc-per-node 2 benchmarks/ranks.py SCENE [-D key=value]...
 
 An iteration differentiates the images of all views by what the scene optimizes, or by density. Each
 is the shortest of three. Work is processor time of the busiest rank.
@@ -62,11 +62,10 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--share", choices=("views", "cells"), default="views")
     parser.add_argument("-D", dest="overrides", action="append", default=[])
     given = parser.parse_args()
     torch.set_num_threads(1)
-    join_ranks(has_gpu=False, has_slabs=given.share == "cells")
+    join_ranks(has_gpu=False)
     scene = load_scene(given.scene, overrides=given.overrides)
     names = scene.optimize.parameters if scene.optimize else density_names(scene)
     values = {name: value_of(scene, name).detach().requires_grad_() for name in names}

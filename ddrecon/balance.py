@@ -278,7 +278,7 @@ class _Box:
             for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
                 scatters = torch.tensordot(rows[number], moments, 1)
                 ends = None if mirror is None else mirror.entering(number)
-                _, _, out = radiance_along(cells, scatters, rise, inflow, direction, ends=ends)
+                _, out = radiance_along(cells, scatters, rise, inflow, direction, ends)
                 if mirror is not None:
                     mirror.left.append(out)
                     out = mirror.released(number)

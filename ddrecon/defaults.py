@@ -12,7 +12,6 @@ from torch import Tensor
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import PhaseFunction
-from ddrecon.ranks import cells_are_shared
 from ddrecon.settings import DiffusionSettings
 
 MOST_ROUNDS = 16
@@ -97,8 +96,7 @@ def _choose_cells(
     grid, varies = volume.grid, _axes_that_vary(media)
     if along != varies and along == "xyz" and grid.refine(3).cells > most:
         along, most = varies, 3 * MOST_CELLS // count_colors(volume, media)
-    may_refine = settings.refine is None and not cells_are_shared()
-    while may_refine and times < 9 and excess > times:
+    while settings.refine is None and times < 9 and excess > times:
         if grid.refine(3 * times, along).cells > most:
             break
         times *= 3

@@ -60,14 +60,12 @@ def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
     return dict.fromkeys(PARTS, current_engine()) | dict.fromkeys(in_torch, "torch")
 
 
-def has_kernels(part: str, is_on_gpu: bool, has_slabs: bool = False) -> bool:
-    """Whether warp has kernels for `part` on such a device, of whole grids or in slabs.
+def has_kernels(part: str, is_on_gpu: bool) -> bool:
+    """Whether warp has kernels for `part` on such a device.
 
-    Multigrid and sweeps go through rows, on a processor; sweeps go through whole grids alone.
+    Multigrid and sweeps go through rows, on a processor.
     """
-    if part == "transport rounds":
-        return not (is_on_gpu or has_slabs)
-    return not (is_on_gpu and part == "diffusion")
+    return not (is_on_gpu and part in ("diffusion", "transport rounds"))
 
 
 def name_engines(engines: Mapping[str, str]) -> str:

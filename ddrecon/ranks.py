@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from ddrecon.errors import RanksError, UsageError, one_line
 
@@ -34,13 +34,11 @@ T = TypeVar("T")
 class _Group:
     """This process's place among `count` ranks.
 
-    `has_slabs`: they share out the cells of a scene, not its views. `bytes` were handed to
-    exchanges so far, which took `seconds`. One rank exchanges nothing.
+    `bytes` were handed to exchanges so far, which took `seconds`. One rank exchanges nothing.
     """
 
     rank: int = 0
     count: int = 1
-    has_slabs: bool = False
     bytes: int = 0
     seconds: float = 0.0
 
@@ -49,12 +47,12 @@ _group = _Group()
 """Of this process; it is alone until it has joined others."""
 
 
-def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
+def join_ranks(has_gpu: bool) -> None:
     """Meets the other ranks where torchrun has started several; nothing happens elsewhere.
 
-    With `has_gpu`, exchanges of tensors on a GPU go by NCCL; all else goes by gloo. With
-    `has_slabs`, ranks share out the cells of a scene instead of its views. Raises RanksError
-    where the others cannot be reached, UsageError for an environment that torchrun does not make.
+    With `has_gpu`, exchanges of tensors on a GPU go by NCCL; all else goes by gloo. Raises
+    RanksError where the others cannot be reached, UsageError for an environment that torchrun does
+    not make.
     """
     global _group
     if _group.count > 1 or int(os.environ.get("WORLD_SIZE", 1)) < 2 or "RANK" not in os.environ:
@@ -94,7 +92,7 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
             f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
             "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
         ) from error
-    _group = _Group(rank, count, has_slabs)
+    _group = _Group(rank, count)
 
 
 def leave_ranks() -> None:
@@ -115,11 +113,6 @@ def rank_count() -> int:
 def own_rank() -> int:
     """The number of this rank, from 0."""
     return _group.rank
-
-
-def cells_are_shared() -> bool:
-    """Whether ranks share out the cells of a scene, instead of its views."""
-    return _group.has_slabs
 
 
 def is_first() -> bool:
@@ -159,40 +152,6 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
             torch.cuda.synchronize(flat.device)
     parts = flat.split([tensor.numel() for tensor in tensors])
     return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
-
-
-def trade_with_ranks(parts: Tensor) -> Tensor:
-    """What each rank has for this one, by rank; for each of them this one has one of `parts`."""
-    import torch
-
-    parts = parts.contiguous()
-    got = torch.empty_like(parts)
-    with _exchange(parts.nbytes):
-        torch.distributed.all_to_all_single(got, parts)
-    return got
-
-
-def swap_with_neighbors(
-    before: Tensor | None, after: Tensor | None
-) -> tuple[Tensor | None, Tensor | None]:
-    """What the ranks before and after this one hand to it, who get `before` and `after`.
-
-    That is of the shape of what they get; the first rank has none before it, the last none after.
-    """
-    import torch.distributed as dist
-
-    got: list[Tensor | None] = []
-    jobs: list[Any] = []
-    for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
-        got.append(None)
-        if tensor is not None:
-            own, others = tensor.detach().contiguous(), tensor.new_empty(tensor.shape)
-            got[-1] = others
-            jobs += [dist.P2POp(dist.isend, own, other), dist.P2POp(dist.irecv, others, other)]
-    with _exchange(sum(tensor.nbytes for tensor in got if tensor is not None)):
-        for job in dist.batch_isend_irecv(jobs):
-            job.wait()
-    return got[0], got[1]
 
 
 def sum_numbers(numbers: Sequence[float]) -> list[float]:

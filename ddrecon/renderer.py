@@ -52,7 +52,7 @@ from ddrecon.march.integral import march
 from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.march.windows import look_inside, see_through
-from ddrecon.medium.coefficients import Medium, Volume, cut_volume, keep_medium, scale_medium
+from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_medium
 from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.levels import refine_medium, resample, volume_at_level
 from ddrecon.medium.remaining import remaining_moments
@@ -62,8 +62,6 @@ from ddrecon.numerics.periods import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
-from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import whole_of
 from ddrecon.supported import require_supported
 
 MOST_CELLS = 32
@@ -151,7 +149,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     Reduced light alone where nothing scatters twice. With a ground, whose light is another source,
     it begins with light that goes to and fro on a coarse grid (E5.4).
     """
-    volume, sources, settings = cut_volume(scene.volume), scene_sources(scene), scene.diffusion
+    volume, sources, settings = scene.volume, scene_sources(scene), scene.diffusion
     require_supported(scene)
     if scene.ground is None:
         return _find_light(volume, sources, settings, memory)
@@ -257,7 +255,7 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 
 
 def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
-    """The fluence [C, z, y, x] >= 0, averaged over each cell of the medium, in slabs of all."""
+    """The fluence [C, z, y, x] >= 0, averaged over each cell of the medium."""
     medium = light_field.medium
     mean = light_field.diffuse.mean + light_field.received.mean
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
@@ -265,7 +263,7 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     if medium.emission is not None and not multiply_scatters(medium, settings):
         cells, directions = average_cells(medium), DIRECTIONS[settings.angles]
         mean = mean + sweep_emission(cells, directions, face_mirror(cells, directions)).mean
-    return gather_slabs(4 * math.pi * mean.clamp(min=0), medium.grid)
+    return 4 * math.pi * mean.clamp(min=0)
 
 
 def _glow(
@@ -430,7 +428,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         return given
 
     if medium.index == 1:
-        sight = look_through(camera, whole_of(medium.grid), scene.render)
+        sight = look_through(camera, medium.grid, scene.render)
         behind = look_behind(sight.rays, given)
         if light_field.ground is not None:
             behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)

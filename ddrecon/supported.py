@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from ddrecon.errors import UsageError
 from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.scene import Scene
-from ddrecon.slabs.slab import Slab, own_slab
 
 
 def require_supported(scene: Scene) -> None:
@@ -43,17 +42,13 @@ def _unsupported(scene: Scene) -> Iterator[str]:
         )
     if grid.periodic:
         yield from _cannot_repeat(scene)
-    neither = {
+    has_points = any(isinstance(light, PointLight) for light in scene.lights)
+    refracted = {
         "ground": scene.ground is not None,
         "diffusion.scheme: printed": settings.scheme == "printed",
         "diffusion.model: flux_limited": settings.model == "flux_limited",
+        "point lights": has_points,
     }
-    is_cut = isinstance(own_slab(grid), Slab)
-    in_slabs = neither | {"diffusion.refine: above 1": settings.times > 1}
-    has_points = any(isinstance(light, PointLight) for light in scene.lights)
-    refracted = neither | {"point lights": has_points, "--share cells": is_cut}
-    for what in [name for name, is_so in in_slabs.items() if is_so and is_cut]:
-        yield f"{what}: not where processes share out cells; leave --share cells out"
     for what in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
         yield f"volume.index: there is none with {what}"
 

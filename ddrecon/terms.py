@@ -48,17 +48,17 @@ def needed_terms(scene: Scene) -> list[str]:
     ]
 
 
-def engine_of_scene(scene: Scene, has_slabs: bool) -> dict[str, str]:
+def engine_of_scene(scene: Scene) -> dict[str, str]:
     """The engine that runs each part of rendering `scene`."""
-    return engine_of_parts(parts_in_torch(scene, has_slabs, scene.volume.density.is_cuda))
+    return engine_of_parts(parts_in_torch(scene, scene.volume.density.is_cuda))
 
 
-def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str, ...]:
+def parts_in_torch(scene: Scene, is_on_gpu: bool) -> tuple[str, ...]:
     """The parts that are torch's with every engine, for what `scene` asks of them.
 
-    `has_slabs`: ranks share out its cells. Of diffusion in a volume that repeats that is the solve.
-    Of point lights that is all but the mass on the way to
-    them; of phase functions by cell, what light and rounds are at cells: view rays look them up.
+    Of diffusion in a volume that repeats that is the solve. Of point lights that is all but the
+    mass on the way to them; of phase functions by cell, what light and rounds are at cells: view
+    rays look them up.
     """
     settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
@@ -67,14 +67,9 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
     is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
     repeats = bool(scene.volume.grid.periodic)
     parts = {
-        "diffusion": not is_fused or ((has_slabs or repeats) and is_diffuse),
+        "diffusion": not is_fused or (repeats and is_diffuse),
         "transport rounds": has_rounds
-        and (
-            repeats
-            or scene.volume.index != 1
-            or not has_kernels("transport rounds", is_on_gpu, has_slabs)
-        ),
-        "beams": has_slabs and (has_skies or _has_beams(scene)),
+        and (repeats or scene.volume.index != 1 or not has_kernels("transport rounds", is_on_gpu)),
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),
         "pairs of beams": is_diffuse and _has_pairs(medium, scene),
         "phases by cell": medium.is_cellwise,

@@ -52,12 +52,12 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
 
 
 def describe(
-    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = (), has_slabs: bool = False
+    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = ()
 ) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
-    that are not at their default; `has_slabs`: ranks are to share out its cells.
+    that are not at their default.
     """
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
@@ -86,7 +86,7 @@ def describe(
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
         "support": describe_support(supports, grid),
-        "engine": engine_of_scene(scene, has_slabs),
+        "engine": engine_of_scene(scene),
         "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),

@@ -58,13 +58,6 @@ SHARED = ("optimize", "render", "uncertainty")
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
 )
-SHARE = click.option(
-    "--share",
-    type=click.Choice(["views", "cells"]),
-    default="views",
-    show_default=True,
-    help="What the processes of torchrun share out; cells where a volume is too large for one.",
-)
 SCENE_SUFFIXES = (".yaml", ".yml")
 REPORT = click.option(
     "--json",

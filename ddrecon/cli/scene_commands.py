@@ -16,7 +16,7 @@ from warnings import warn
 
 import click
 
-from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
+from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_session
 from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ EXPORTED = click.Choice(["vdb", "vti", "npz"])
 @SCENE
 @DTYPE
 @REPORT
-@SHARE
 @in_session
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
@@ -43,7 +42,7 @@ def check(session: Session, scene: Path) -> None:
     scenes = map(session.build, each_frame(scene_file))
     first = next(scenes)
     supports = supports_of(chain([first], scenes))
-    report = describe(first, expert, supports, session.share == "cells")
+    report = describe(first, expert, supports)
     session.show(report, lines(report))
 
 
@@ -96,7 +95,6 @@ def balance(session: Session, scene: Path) -> None:
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
 @click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
 @click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
-@SHARE
 @DTYPE
 @REPORT
 @in_session
@@ -213,7 +211,6 @@ def _render(
     type=EXPORTED,
     help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
 )
-@SHARE
 @DTYPE
 @REPORT
 @in_session
@@ -257,7 +254,7 @@ def optimize(
 
     built, environment = session.build(scene_file), session.environment()
     if not is_first():
-        follow_run(built, scene_file, resume=resume, preview_every=preview_every)
+        follow_run(built, scene_file, resume=resume)
         return
     choice = {"may_exist": overwrite, "resume": resume}
     with open_run(built, scene_file, output, environment, **choice) as (run, folder):

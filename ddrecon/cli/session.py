@@ -50,7 +50,6 @@ class Session:
     verbose: bool = False
     dtype: str = "float64"
     report: Path | None = None
-    share: str = "views"
     place: torch.device | None = None
 
     def start(self) -> torch.device:
@@ -72,7 +71,7 @@ class Session:
                 "leave --device out, or install a CUDA build of torch"
             )
         has_gpu = has_gpu and self.device != "cpu"
-        join_ranks(has_gpu, self.share == "cells")
+        join_ranks(has_gpu)
         log = logging.getLogger(LOG)
         log.handlers = [_AboveBars()]
         log.setLevel(logging.ERROR if self.is_quiet else logging.INFO)

@@ -10,13 +10,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.third_order import second_difference
-from ddrecon.slabs.exchange import add_halo
-from ddrecon.slabs.slab import Slab
 
 THIN = 1.5
 """Optical depths of a cell up to which light is as good as straight in it."""
@@ -27,11 +24,7 @@ def average_cells(medium: Medium) -> Medium:
 
     Beyond the outermost centers they stay as they are there.
     """
-    return medium.mapped(lambda field: _average(field, medium.grid), "emission")
-
-
-def _average(field: Tensor, grid: Grid) -> Tensor:
-    return _whole(apply_around(average, field, grid), grid)
+    return medium.mapped(lambda field: apply_around(average, field, medium.grid), "emission")
 
 
 def average(field: Tensor) -> Tensor:
@@ -60,13 +53,13 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
         given = "diffusion/fused/sharp.h", "Sharp", 1, numbers
         bends = apply_around(bend, means, grid)
         (light,) = apply_cell(*given, means, bends, extinction.field)
-        return _whole(light, grid)
+        return light
 
     def find() -> Tensor:
         share = for_channels(thinness(grid, extinction.value, THIN) / 8, len(means))
         return (means - share * apply_around(bend, means, grid)).clamp(min=0)
 
-    return _whole(recompute(find), grid)
+    return recompute(find)
 
 
 def bend(means: Tensor) -> Tensor:
@@ -81,8 +74,3 @@ def bend(means: Tensor) -> Tensor:
             within = means.shape[axis] - 2
             bends.narrow(axis, 1, within).add_(means.diff(2, axis))
     return bends
-
-
-def _whole(field: Tensor, grid: Grid) -> Tensor:
-    """`field`, right in the halo of a slab as well, where it was made of half of what is around."""
-    return add_halo(grid.own(field), grid) if isinstance(grid, Slab) else field

@@ -19,8 +19,6 @@ from torch.nn.functional import adaptive_avg_pool3d, interpolate
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.settings import FLOOR
-from ddrecon.slabs.exchange import gather_own
-from ddrecon.slabs.slab import Slab, whole_of
 
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
@@ -46,7 +44,7 @@ def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Te
 
 def least_extinction(grid: Grid, floor: float) -> float:
     """kappa_tr [1/u] that `smooth` gives empty space."""
-    return floor / min(whole_of(grid).extent)
+    return floor / min(grid.extent)
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -72,42 +70,27 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     1 / (distance to its center), exactly: Newton's shell theorem. Where the box repeats without end
     all matter is infinitely far in the mean: the distance is that of gaps, as thick as the box.
     """
-    whole = whole_of(grid)
     if grid.periodic:
         sides = (side for axis, side in enumerate(grid.extent) if axis not in grid.periodic)
         return weight[0].field.new_full((1, *grid.shape), 1 / (GAP * min(sides)))
-    coarse, even = coarse_grid(whole), haze(whole)
-    masses = [(term.scale, _coarse_mean(term.field, grid)) for term in weight]
+    coarse, even = coarse_grid(grid), haze(grid)
+    masses = [(term.scale, adaptive_avg_pool3d(term.field, coarse.shape)) for term in weight]
     like = masses[0][1]
     potentials = even * _even_potential(coarse, like.dtype, like.device)
     total = like.new_tensor(even * coarse.cells)
     for scale, mass in masses:
         potentials = potentials + scale * potential(mass, coarse)
         total = total + scale * mass.sum((1, 2, 3), keepdim=True)
-    z, y, x = (_weights(axis, grid, few, like) for axis, few in enumerate(coarse.shape))
-    return (z @ (y @ (potentials / total)).flatten(2)).unflatten(2, (len(y), -1)) @ x.mT
-
-
-def _coarse_mean(field: Tensor, grid: Grid) -> Tensor:
-    """The mean of `field` in the cells of the coarse grid; in slabs of all ranks' together."""
-    coarse = coarse_grid(whole_of(grid))
-    if isinstance(grid, Slab):
-        z, y, x = (grid.size if axis == grid.axis else n for axis, n in enumerate(coarse.shape))
-        field = gather_own(adaptive_avg_pool3d(grid.own(field), (z, y, x)), grid)
-    return adaptive_avg_pool3d(field, coarse.shape)
-
-
-def _weights(axis: int, grid: Grid, few: int, like: Tensor) -> Tensor:
-    """The matrix [cells, few] that interpolates linearly to the cells of `grid` along `axis`."""
-    weights = _all_weights(whole_of(grid).shape[axis], few, like.dtype, like.device)
-    return (
-        weights[grid.first : grid.last] if isinstance(grid, Slab) and grid.axis == axis else weights
+    z, y, x = (
+        _weights(grid.shape[axis], few, like.dtype, like.device)
+        for axis, few in enumerate(coarse.shape)
     )
+    return (z @ (y @ (potentials / total)).flatten(2)).unflatten(2, (len(y), -1)) @ x.mT
 
 
 @functools.lru_cache(maxsize=32)
 @torch.inference_mode(False)
-def _all_weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     unit = torch.eye(few, dtype=torch.float64)[None]
     return interpolate(unit, size=cells, mode="linear")[0].mT.to(device, dtype)
 

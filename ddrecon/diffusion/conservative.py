@@ -7,7 +7,7 @@ a time: memory is what limits the size of a volume.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from torch import Tensor
@@ -27,9 +27,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.periods import Unrolled, unroll
-from ddrecon.slabs.exchange import add_halo
-from ddrecon.slabs.ghosts import Ghosts
-from ddrecon.slabs.slab import Slab
 
 
 @dataclass(frozen=True)
@@ -162,40 +159,14 @@ class DiffusionProblem:
         return right + (source - (z + y + x))
 
     def solved(self, solve: SolverWithMemory, right: Tensor) -> Tensor:
-        """u of A u = `right`; in slabs by a solve in all ranks' own cells together."""
-        slab, (operator, _) = self.medium.grid, self.system
-        if not isinstance(slab, Slab):
-            return solve_diffusion(solve, operator, right)
-        ghosts = Ghosts.of(slab)
-        if solve.start is not None:
-            solve = replace(solve, start=_inner(slab, ghosts, solve.start))
-        right = ghosts.without(_inner(slab, ghosts, right))
-        return add_halo(ghosts.own(solve_diffusion(solve, self._shared_operator, right)), slab)
-
-    @cached_property
-    def _shared_operator(self) -> Operator:
-        """A of this rank's own cells.
-
-        It is made in the slab with its halo, whose outermost faces are not those of the box: no
-        rank's own cells have them.
-        """
-        slab, (operator, _) = self.medium.grid, self.system
-        assert isinstance(slab, Slab)
-        ghosts = Ghosts.of(slab)
-        z, y, x = (_inner(slab, ghosts, faces) for faces in operator.conductances)
-        return Operator((z, y, x), _inner(slab, ghosts, operator.loss), ghosts=ghosts)
+        """u of A u = `right`."""
+        return solve_diffusion(solve, self.system[0], right)
 
 
 def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = problem.solved(solve, problem.system[1])
     return Moments(mean, problem.flux(mean))
-
-
-def _inner(slab: Slab, ghosts: Ghosts, u: Tensor) -> Tensor:
-    """The part of `u` in `slab` that lies in its own cells, faces and `ghosts` (a view)."""
-    first, last = (halo - layers for halo, layers in zip(slab.halo, ghosts.layers, strict=True))
-    return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
 
 
 def _loss_and_source(

@@ -12,7 +12,6 @@ function's own jvp.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -169,7 +168,6 @@ def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor)
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.
     """
-    assemble = functools.partial(Operator.of, ghosts=operator.ghosts)
     return ImplicitSolve.apply(
-        solve, assemble, operator.prepared, source, operator.loss, *operator.conductances
+        solve, Operator.of, operator.prepared, source, operator.loss, *operator.conductances
     )

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused
-from ddrecon.slabs.ghosts import Ghosts
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -36,8 +35,7 @@ class Operator:
     array along its axis, or as long where that is periodic: the last face is that between the last
     cell and the first. `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that
     all colors share may be given once. `prepared`: what solvers have computed from these numbers;
-    to be handed on with them only. With `ghosts`, its cells are a rank's own and those of its
-    neighbors beside them; rows and columns of all ranks' own cells are one matrix.
+    to be handed on with them only.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
@@ -45,18 +43,16 @@ class Operator:
     prepared: dict[Callable[[Operator], Any], Any] = field(
         default_factory=dict, repr=False, compare=False
     )
-    ghosts: Ghosts | None = None
 
     @staticmethod
     def of(
         prepared: dict[Callable[[Operator], Any], Any],
         loss: Tensor,
         *conductances: Tensor,
-        ghosts: Ghosts | None = None,
     ) -> Operator:
         """The operator of `loss` and three conductances, in the order of its derivatives."""
         z, y, x = conductances
-        return Operator((z, y, x), loss, prepared, ghosts)
+        return Operator((z, y, x), loss, prepared)
 
     @cached_property
     def diagonal(self) -> Tensor:
@@ -90,7 +86,7 @@ class Operator:
         if all(len(tensor) == 1 for tensor in given):
             return self
         own = (t[color : color + 1] if len(t) > 1 else t for t in given)
-        return Operator.of({}, *own, ghosts=self.ghosts)
+        return Operator.of({}, *own)
 
     def transposed(self) -> Operator:
         """A^T, which is A."""
@@ -98,9 +94,6 @@ class Operator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E3.2)."""
-        if self.ghosts is not None:
-            # Each rank has the rows of its own cells: so a face that two have is counted once.
-            adjoint = self.ghosts.without(adjoint)
         if is_fused() and not self.is_periodic:
             from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
 

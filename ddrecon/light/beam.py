@@ -13,12 +13,12 @@ from torch import Tensor
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import is_fused_whole, sum_masses
+from ddrecon.light.shear import sum_masses
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
@@ -66,8 +66,7 @@ def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Bea
         return [torch.addcmul(entered, extinction.field, 0.5 * step) for entered, step in pairs]
 
     # Of lights, which are few, kernels keep what their adjoint needs.
-    is_fused = is_fused_whole(medium.grid, directions)
-    masses = find_masses() if is_fused else recompute(find_masses)
+    masses = find_masses() if is_fused(directions) else recompute(find_masses)
     return [
         Beam(mass, direction, along_colors(light.irradiance))
         for mass, direction, light in zip(masses, each, lights, strict=True)
@@ -128,7 +127,7 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool 
     """
     field, (_, moments, colors) = cells.extinction.field, weights.shape
     quarter = moments * colors // (4 * len(field))
-    if is_fused_whole(cells.grid, directions):
+    if is_fused(directions):
         from ddrecon.light.fused.receive import MOST_BEAMS
 
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
@@ -144,12 +143,12 @@ def attenuate_few(
     cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False
 ) -> Tensor:
     """What is received of a few beams, [moments, C, z, y, x]."""
-    extinction, is_fused = cells.extinction, is_fused_whole(cells.grid, directions)
+    extinction, has_kernel = cells.extinction, is_fused(directions)
     field, scale = extinction.field, extinction.scale
 
     def receive() -> Tensor:
         entered, steps = sum_masses(field, cells.grid, directions, extinction.mass_bound)
-        if is_fused:
+        if has_kernel:
             from ddrecon.light.fused.receive import receive
 
             colors = max(weights.shape[2], len(scale))
@@ -158,4 +157,4 @@ def attenuate_few(
         tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
         return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 
-    return receive() if is_fused and is_kept else recompute(receive)
+    return receive() if has_kernel and is_kept else recompute(receive)

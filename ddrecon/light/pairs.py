@@ -33,8 +33,6 @@ from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.periods import unroll_along
-from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import Slab
 
 SMALLEST = 1e-30
 """The least that k^2 is: its root has a slope there, and what is made of it is even in k."""
@@ -146,8 +144,7 @@ def turn_in_cells(
     order, the way that F goes.
     """
     slicing, slope, step = cross_grid(grid, direction)
-    # A stack is followed from both its ends: where ranks share cells, each has all of them here.
-    fields = [slicing.lay(gather_slabs(field, grid)) for field in (extinction, turned)]
+    fields = [slicing.lay(field) for field in (extinction, turned)]
     shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
     path = step * shear.inside(fields[0])
     depth, back = (shear.to_rays(field, 0.0) * path for field in fields)
@@ -179,6 +176,5 @@ def turn_in_cells(
     share = torch.stack(entering) * norm / decay_mean(depth)
     along = (onward + turned_back * incoming) * share
     against = (onward * incoming + turned_back) * share
-    found = (slicing.lift(shear.to_cells(values)) for values in (along, against))
-    forth, back = (grid.cut(field) if isinstance(grid, Slab) else field for field in found)
+    forth, back = (slicing.lift(shear.to_cells(values)) for values in (along, against))
     return forth, back

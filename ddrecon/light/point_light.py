@@ -29,8 +29,6 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
-from ddrecon.slabs.exchange import gather_slabs
-from ddrecon.slabs.slab import whole_of
 
 NORM_ORDER = 8
 """Order of the norm that gives a ray's path through a cell: nearly the largest component, without
@@ -132,8 +130,8 @@ def _go_to_cells(medium: Medium, position: Tensor) -> tuple[Tensor, Tensor, Tens
     # Mass from the light to where the ray enters the cell, and from there to the center.
     entries = centers - 0.5 * step[..., None] * direction
     entered = _mass_to(
-        gather_slabs(extinction.field, grid),
-        whole_of(grid),
+        extinction.field,
+        grid,
         position,
         entries.flatten(0, 2),
         (distance - 0.5 * step).flatten(),

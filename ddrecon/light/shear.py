@@ -3,9 +3,6 @@
 Times the scale of a `Coefficient` it is the optical depth in the tau of E2.2. It is found in three
 steps on whole slices: shear the grid until the beam runs along an axis, sum along that axis, shear
 back. What is interpolated is the field and its integral, never an exponential of them.
-
-Mass is linear in the field but for bounds on its corrections. So where ranks share cells, what lies
-before a slab is handed on as sums along rays, which are as few as a slice has cells.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -25,13 +21,9 @@ from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder, kink_width, ramp
-from ddrecon.slabs.exchange import add_halo, sum_before
-from ddrecon.slabs.slab import Slab, whole_of
 
 LEAST_SLOPE = 1e-6
 """A smaller slope counts as this: such beams enter through no side of a grid."""
-MARGIN = 2
-"""Rays of a slab beyond those that meet cells' centers: as far as interpolation reaches."""
 
 
 def sum_masses(
@@ -58,7 +50,7 @@ def sum_masses(
             mass, path = sum_masses(period.extend(field), period.wide, one, bound)
             found.append((period.crop(mass), path))
         return torch.cat([mass for mass, _ in found]), torch.cat([path for _, path in found])
-    if is_fused_whole(grid, directions):
+    if is_fused(directions):
         from ddrecon.light.fused import shear
 
         return shear.sum_masses(field, grid, directions, bound)
@@ -73,55 +65,27 @@ def sum_masses(
     return torch.stack(masses), torch.stack(steps)
 
 
-def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:
-    """Whether fused kernels follow beams along `directions`; in slabs they do not."""
-    return not isinstance(grid, Slab) and is_fused(*directions)
-
-
 def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
     """What `sum_masses` returns, of one beam and one field [1, z, y, x]."""
-    whole = whole_of(grid)
-    slicing, slope, step = cross_grid(whole, direction)
-    count, _, *size = (1 if axis == 0 else whole.shape[axis - 1] for axis in slicing.order)
-    rays = Part(slicing, Shear.of(count, size, slope))
-    before = None
-    if isinstance(grid, Slab):
-        before = _sum_before(field, grid, rays, count, direction[grid.axis].item() >= 0)
-        # Near the ends of a slab rays are missing: there its neighbors' cells are right.
-        rays = rays.of_layers(grid.axis, grid.first, grid.last, count)
-        before = rays.cut(before)
-    within, bends, missing = rays.look(field)
-    # Trapezoids over half steps are more than those over whole ones by
-    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
+    slicing, slope, step = cross_grid(grid, direction)
+    slices = slicing.lay(field)
+    shear = Shear.of(len(slices), slices.shape[2:], slope)
+    on_slices = shear.to_rays(slices, 0.0)
+    inside = shear.inside(on_slices)
+    within, missing = on_slices * inside, on_slices * (1 - inside)
+    # Trapezoids over half steps are more than those over whole ones by (step / 2) times the sum
+    # over j < k of how much the field bends: rho_(j + 1/2), where it is the mean of both slices,
+    # less (rho_j + rho_(j + 1)) / 2.
+    midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+    bends = (midway - 0.5 * (on_slices[1:] + on_slices[:-1])) * inside[:-1]
     curved = torch.cat([torch.zeros_like(within[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
     passed = within.cumsum(0) - within
-    if before is not None:
-        passed, curved = passed + before[0], curved + before[1]
-    outside = 1 - rays.shear.inside(within)
-    limit = ThirdOrder(0, 1, bound * (1 - 0.5 * outside))
+    limit = ThirdOrder(0, 1, bound * (1 - 0.5 * (1 - inside)))
     mass = passed * step + limit.bounded((0.5 * curved - missing) * step)
-    entered = rays.to_cells(mass, ThirdOrder(0, 1, bound))
-    return add_halo(grid.own(entered), grid) if isinstance(grid, Slab) else entered, step
-
-
-def _sum_before(field: Tensor, slab: Slab, rays: Part, count: int, is_upwards: bool) -> Tensor:
-    """Sums of what `Part.look` finds before `slab` and its halo, on all `rays` [2, K, *lattice]."""
-
-    def sums(begin: int, end: int) -> Tensor:
-        part = rays.of_layers(slab.axis, begin, end, count)
-        layers = field.narrow(slab.axis - 3, begin - slab.first, end - begin)
-        found = torch.stack([each.sum(0) for each in part.look(layers)[:2]])
-        return part.spread(found, rays.shear.lattice)
-
-    begin, end = slab.cuts[slab.rank : slab.rank + 2]
-    own = sums(begin, end)
-    upwards = torch.full(own[0].shape, is_upwards, device=own.device).flatten()
-    before = sum_before(own.flatten(1), upwards).view_as(own)
-    halo = (slab.first, begin) if is_upwards else (end, slab.last)
-    return before - sums(*halo) if halo[0] < halo[1] else before
+    return slicing.lift(shear.to_cells(mass, ThirdOrder(0, 1, bound))), step
 
 
 def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
@@ -138,79 +102,11 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
 
 
 @dataclass(frozen=True)
-class Part:
-    """Layers of a grid, in slices, and the rays that meet them.
-
-    These are part of the whole's: from `offset` on in rows and columns. Beside layers that other
-    ranks go on with is an empty one, as far as interpolation reaches: a `ring`, as of `pad`.
-    """
-
-    slicing: Slicing
-    shear: Shear
-    offset: tuple[int, ...] = (0, 0)
-    ring: tuple[int, ...] = (0,) * 6
-
-    def of_layers(self, axis: int, begin: int, end: int, count: int) -> Part:
-        """Of the whole, in `count` slices, the layers `begin` to `end` along `axis`."""
-        whole, cut = self.shear, self.slicing.order.index(1 + axis) - 2
-        ring, number = [0] * 6, 0
-        ring[4 - 2 * axis] = low = int(begin > 0)
-        ring[5 - 2 * axis] = high = int(end < (count if cut < 0 else whole.size[cut]))
-        begin, end = begin - low, end + high
-        if cut < 0:
-            number = count - end if self.slicing.is_reversed else begin
-            count = end - begin
-        # The rays that meet these cells on the first slice, on the last or between.
-        lines = []
-        for which, slope in enumerate(whole.slope.tolist()):
-            low, cells = (begin, end - begin) if which == cut else (0, whole.size[which])
-            drifts, start = (slope * number, slope * (number + count - 1)), low + whole.first[which]
-            nearest = max(math.floor(start - max(drifts)) - MARGIN, 0)
-            farthest = math.ceil(start + cells - min(drifts)) + MARGIN
-            rays = min(farthest, whole.lattice[which]) - nearest
-            lines.append((cells, rays, start - nearest, whole.faces[which] - low, nearest))
-        size, lattice, first, faces, offset = zip(*lines, strict=True)
-        shear = Shear(whole.slope, size, lattice, first, faces, number)
-        return Part(self.slicing, shear, offset, tuple(ring))
-
-    def cut(self, sums: Tensor) -> Tensor:
-        """Those of `sums` [2, K, *lattice] on all rays of the whole that are on these."""
-        (row, column), (rows, columns) = self.offset, self.shear.lattice
-        return sums[..., row : row + rows, column : column + columns]
-
-    def spread(self, sums: Tensor, lattice: tuple[int, ...]) -> Tensor:
-        """`sums` [2, K, ...] on these rays as those on all of the whole's `lattice`."""
-        (row, column), (rows, columns) = self.offset, self.shear.lattice
-        return pad(sums, (column, lattice[1] - column - columns, row, lattice[0] - row - rows))
-
-    def look(self, layers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The field on rays within the box: rho_k on slices [N, K, *lattice], how much it bends
-        between two, and what is missing (E5.9).
-
-        It bends by rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean
-        of rho_k and rho_(k + 1).
-        """
-        shear = self.shear
-        slices = self.slicing.lay(pad(layers, self.ring))
-        on_slices = shear.to_rays(slices, 0.0)
-        midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
-        bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
-        inside = shear.inside(on_slices)
-        return on_slices * inside, bends * inside[:-1], on_slices * (1 - inside)
-
-    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
-        """`values` [N, K, *lattice] on the rays at the centers of cells, [K, z, y, x]."""
-        cells = self.slicing.lift(self.shear.to_cells(values, third_order))
-        return pad(cells, [-layers for layers in self.ring])
-
-
-@dataclass(frozen=True)
 class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell. Slices are counted from number `begin` on. The `faces` by which
-    light enters lie so far from cell 0.
+    there is a ray for every cell. The `faces` by which light enters lie so far from cell 0.
     """
 
     slope: Tensor
@@ -218,7 +114,6 @@ class Shear:
     lattice: tuple[int, ...]
     first: tuple[int, ...]
     faces: tuple[float, ...]
-    begin: int = 0
 
     @staticmethod
     def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
@@ -252,7 +147,7 @@ class Shear:
         There are as many slices as `like` has.
         """
         entered = self._numbers(like, 0.5)[:, None, None] - self.entries
-        return ramp(entered, kink_width(entered, self.begin + len(like) + 1))[:, None]
+        return ramp(entered, kink_width(entered, len(like) + 1))[:, None]
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
@@ -269,7 +164,7 @@ class Shear:
 
     def _numbers(self, like: Tensor, shift: float) -> Tensor:
         count = torch.arange(like.shape[0], dtype=like.dtype, device=like.device)
-        return count + (self.begin + shift)
+        return count + shift
 
     def _points(
         self,

@@ -22,7 +22,6 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import for_channels, thinness
 from ddrecon.numerics.remember import remember
-from ddrecon.slabs.slab import Slab
 
 GRAZING = 0.1
 """Cosine from which on a beam shines fully through a face. Below, ever less: where it only grazes
@@ -44,11 +43,10 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
-    outermost centers' these are the mean. Where a slab is cut, and along an axis of a single cell,
-    light stays as it is as well.
+    outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
     grid, extinction = emission.grid, emission.extinction
-    is_line = tuple(_is_line(grid, *face) for face in FACES)
+    is_line = tuple(grid.shape[axis] > 1 for axis, _ in FACES)
     extended, matter = dict[str, Tensor](), list[Tensor]()
     for name, field in emission.fields.items():
         is_light = any(is_line) and (name == "diffuse" or name.startswith("mass "))
@@ -104,11 +102,6 @@ def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | No
             lack = layer(diffusing.scale) * lack
         lacks.append(pad(lack, (1, 1, 1, 1), mode="replicate"))
     return lacks
-
-
-def _is_line(grid: Grid, axis: int, side: int) -> bool:
-    is_cut = isinstance(grid, Slab) and axis == grid.axis and grid.ends[side] is not None
-    return grid.shape[axis] > 1 and not is_cut
 
 
 def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:

@@ -20,14 +20,12 @@ from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
 from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
-from ddrecon.march.slabs import march_slabs
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
-from ddrecon.slabs.slab import Slab
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
@@ -87,14 +85,12 @@ def _march_part(
 
 
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
-    """As `march_rays`, by the engine in use, through all slabs of a grid, or all periods."""
+    """As `march_rays`, by the engine in use, through all periods of a grid."""
     march_own = march_rays
     if current_engine() == "warp":
         from ddrecon.march.fused.integrate import march_rays as march_own
     if sampler.emission.period is not None:
         return march_periods(march_own, sampler, rays, crossing)
-    if isinstance(sampler.emission.grid, Slab):
-        return march_slabs(march_rays, march_own, sampler, rays, crossing)
     return march_own(sampler, rays, crossing)
 
 
@@ -133,13 +129,8 @@ def _spread(along: Tensor, sight: Sight) -> Tensor:
     return pixels.index_copy(1, sight.crossing.hit, along)
 
 
-def march_rays(
-    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2.2, E2.3).
-
-    `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
-    """
+def march_rays(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
+    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2.2, E2.3)."""
     emission, hitting, values = sampler.emission, rays.select(crossing.hit), sampler.values
     sizes = {name: len(field) for name, field in sampler.fields.items()}
 
@@ -148,9 +139,8 @@ def march_rays(
         near, far = crossing.near[chunk], crossing.far[chunk]
         sampled, distance = sampler.sample(values, chosen, near, far)
         nodes = Nodes(chosen.origin, chosen.direction, distance)
-        before = None if front is None else front[:, chunk]
         at_nodes = dict(zip(sizes, sampled.split([*sizes.values()], 1), strict=True))
-        return torch.cat(integrate_segments(emission, at_nodes, nodes, before))
+        return torch.cat(integrate_segments(emission, at_nodes, nodes))
 
     count = max(CHUNK_NODES, emission.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
     chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(max(1, count))
@@ -165,19 +155,15 @@ def opacity_of(emission: Emission, mass: Tensor) -> Tensor:
 
 
 def integrate_segments(
-    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes, front: Tensor | None = None
+    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes
 ) -> tuple[Tensor, Tensor]:
-    """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R].
-
-    `front` [K, R] is the mass between the camera and the first node, 0 if left out.
-    """
+    """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R]."""
     extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
     scattering = extinction if scattering is None else scattering
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
     own = nodes.integral(extinction).cumsum(0)
-    first = torch.zeros_like(own[:1]) if front is None else front[None]
-    passed = torch.cat([first, first + own])
+    passed = torch.cat([torch.zeros_like(own[:1]), own])
     begin, end = passed[:-1], passed[1:]
     # E2.3, E2.11: the integral of tau (kappa_s (L0 + g L1 . w) + j).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]

@@ -21,7 +21,6 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
-from ddrecon.slabs.slab import Slab, own_slab
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -194,12 +193,6 @@ class Medium:
             others += ["g", "mean_cosine", "forward_fraction"]
             seen = SeenPhase(seen.phase.with_cells(put(seen.phase.cells)), seen.degree)
         return self.mapped(put, *others, grid=grid, seen=seen)
-
-
-def cut_volume(volume: Volume) -> Volume:
-    """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
-    slab = own_slab(volume.grid)
-    return put_volume(volume, slab, slab.cut) if isinstance(slab, Slab) else volume
 
 
 def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> Volume:

@@ -19,7 +19,6 @@ from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.slab import Slab
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
 
@@ -44,22 +43,17 @@ def differentiate(
 
     They are those by the leaves `values`, which stand in `scene` for the variables of their names.
     The views are shared out over ranks, which sum what reaches the light field; its way back is the
-    same on all of them. Of a light field in slabs each rank has a part: it goes that part's way
-    back, and the derivatives by `values` are summed.
+    same on all of them.
     """
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
     tensors, leaves = list[Tensor](), list[Tensor]()
     light_field = _cut(solve_light(with_values(scene, values), memory), tensors, leaves)
     outside = {name: value for name, value in values.items() if not is_of_volume(name)}
     inputs = [*values.values(), *leaves]
-    own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
     # Views share what is made of values: so that each has a graph of its own, it is made anew.
-    worlds = ((with_values(scene, outside), name) for name in (names if has_slabs else own))
-    images, loss, sums = _differentiate_views(worlds, own, light_field, inputs, loss_of)
-    if has_slabs:
-        (total,) = sum_found([loss], [loss])
-    else:
-        (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
+    worlds = ((with_values(scene, outside), name) for name in own_views(scene, names))
+    images, loss, sums = _differentiate_views(worlds, light_field, inputs, loss_of)
+    (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E3.2).
     pairs = zip(tensors, leaf_bars, strict=True)
@@ -73,8 +67,6 @@ def differentiate(
         through_light = torch.autograd.grad(product, list(values.values()), allow_unused=True)
         # The derivative is the sum of both ways.
         direct = _add(direct, through_light)
-    if has_slabs:
-        direct = sum_found(direct, list(values.values()))
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -84,15 +76,14 @@ def differentiate(
 
 def _differentiate_views(
     worlds: Iterable[tuple[Scene, str]],
-    own: Sequence[str],
     light_field: LightField,
     inputs: Sequence[Tensor],
     loss_of: Callable[[View, Tensor], Tensor],
 ) -> tuple[list[Tensor], Tensor, list[Tensor | None]]:
-    """The images of `own` views, the sum of their losses, and its derivatives by `inputs`.
+    """The images of views, the sum of their losses, and its derivatives by `inputs`.
 
-    `worlds` are scenes, and which of their views is rendered: of one that is another rank's, it
-    asks this one for its part of the derivative. Each view's is added up at once; None is zero.
+    `worlds` are scenes, and which of their views is rendered. Each view's derivative is added up at
+    once; None is zero.
     """
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
@@ -100,9 +91,6 @@ def _differentiate_views(
         view = scene.view(name)
         derivatives = scene.optimize.derivatives if scene.optimize else "all"
         image = view_picture(light_field, scene, view, derivatives)
-        if name not in own:
-            sums = _add(sums, torch.autograd.grad(0 * image.sum(), inputs, allow_unused=True))
-            continue
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
             sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))

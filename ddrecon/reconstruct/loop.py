@@ -20,7 +20,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import current_engine
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.numerics.remember import forget_changed
-from ddrecon.ranks import cells_are_shared, from_first, rank_count
+from ddrecon.ranks import from_first, rank_count
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
@@ -181,7 +181,7 @@ class Reconstruction:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "total": dict(vars(self.total)),
-            "solutions": {} if cells_are_shared() else dict(self.memory.last),
+            "solutions": dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": asdict(self.schedule.progress),

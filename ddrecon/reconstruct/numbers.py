@@ -26,7 +26,7 @@ from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.shares import has_slabs, own_views
+from ddrecon.reconstruct.shares import own_views
 from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
@@ -185,7 +185,6 @@ def find_curvatures(
     if not names:
         return {}
     own = own_views(point.scene, names)
-    rendered = names if has_slabs(point.scene) else own
     jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
     # Pictures differ by little: the light of each is solved closely, beginning where it is known.
     diffusion, values = point.scene.diffusion, point.values
@@ -194,9 +193,9 @@ def find_curvatures(
     with torch.no_grad():
         world = with_values(scene, values)
         light = solve_light(world, memory)
-        pictures = {name: view_picture(light, world, world.view(name)) for name in rendered}
+        pictures = {name: view_picture(light, world, world.view(name)) for name in own}
         for p in numbers:
-            shown = [name for name in rendered if p.view in (None, name)]
+            shown = [name for name in own if p.view in (None, name)]
             changes: dict[str, list[Tensor]] = {name: [] for name in shown}
             ways, lengths = _ways(point, p)
             for way in ways if shown else ():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
-from ddrecon.ranks import cells_are_shared, sum_numbers
+from ddrecon.ranks import sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
@@ -124,13 +124,12 @@ def render_quality(
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in known}
         rendered = with_values(scene, values)
-        views = [rendered.view(name) for name in (names if cells_are_shared() else own)]
+        views = [rendered.view(name) for name in own]
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
-            if view.name in own:
-                target = targets[view.name]
-                fitted, _ = fit_held_out(image, view, target, response_sizes(parameters))
-                found["psnr"].append(target.psnr_of(fitted))
-                found["ssim"].append(target.ssim_of(fitted))
+            target = targets[view.name]
+            fitted, _ = fit_held_out(image, view, target, response_sizes(parameters))
+            found["psnr"].append(target.psnr_of(fitted))
+            found["ssim"].append(target.ssim_of(fitted))
     psnr, ssim = sum_numbers([float(sum(row)) for row in found.values()])
     return psnr / len(names), ssim / len(names)
 

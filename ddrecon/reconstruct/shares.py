@@ -1,7 +1,4 @@
-"""Which rank does what, and how each learns what the others have found.
-
-Ranks share out the views of a scene, or its cells.
-"""
+"""Which rank renders which views of a scene, and how each learns what the others have found."""
 
 from __future__ import annotations
 
@@ -13,12 +10,6 @@ from torch import Tensor
 
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers, sum_over_ranks
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.slab import Slab, own_slab
-
-
-def has_slabs(scene: Scene) -> bool:
-    """Whether ranks share out the cells of `scene`, so that all of them render each view."""
-    return isinstance(own_slab(scene.volume.grid), Slab)
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:

@@ -15,13 +15,12 @@ from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.progress import bar_settings
-from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
+from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.support import support_text
 from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
-from ddrecon.run.quality import describe_loss, find_results, loss_text
+from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.run.report import registered_text
 from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, RunFolder, remove_run
 from ddrecon.scene import Scene
@@ -55,7 +54,7 @@ def open_run(
     with claim_folder(path, may_exist=may_exist or resume):
         if loaded is None:
             remove_run(path, scene_file)
-        of_run = {"seed": run.seed, "engines": engine_of_scene(scene, has_slabs(scene))}
+        of_run = {"seed": run.seed, "engines": engine_of_scene(scene)}
         folder = RunFolder(path, scene_file, result_of, environment | of_run)
         if loaded is None:
             folder.start(run)
@@ -87,25 +86,16 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     return loaded
 
 
-def follow_run(
-    scene: Scene, scene_file: SceneFile, *, resume: bool, preview_every: int | None
-) -> None:
-    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes.
-
-    Where ranks share cells, that is also a part of the pictures that the first one writes.
-    """
+def follow_run(scene: Scene, scene_file: SceneFile, *, resume: bool) -> None:
+    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes."""
     run = _begin(scene, scene_file)
     if resume:
         run.restore(from_first(run.state()))
     with defer_interrupt() as asked:
         while not run.is_done:
             run.step()
-            if cells_are_shared() and preview_every and run.iteration % preview_every == 0:
-                find_results(run)
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
-    if cells_are_shared():
-        find_results(run, registers=True)
 
 
 def drive_run(
@@ -135,8 +125,6 @@ def drive_run(
         return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
 
     advance(run, make_iteration, folder, is_quiet, title)
-    if cells_are_shared():
-        return folder.finish(run)
     # What is left the first rank does by itself.
     leave_ranks()
     return folder.finish(run)

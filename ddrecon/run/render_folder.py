@@ -19,7 +19,7 @@ from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_
 from ddrecon.losses import Target
 from ddrecon.medium.levels import resample
 from ddrecon.progress import Progress
-from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_over_ranks
+from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.renderer import LightField, fluence_of, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.run_folder import write_values
@@ -188,10 +188,9 @@ def _render_in_turns(
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
     """Each of `views`, its images by `names`, the ends of their files, and the seconds they took.
 
-    With several ranks these are of a turn, in which each renders one view; where they share out
-    cells, all render each view together.
+    With several ranks these are of a turn, in which each renders one view.
     """
-    ranks, rank = (1, 0) if cells_are_shared() else (rank_count(), own_rank())
+    ranks, rank = rank_count(), own_rank()
     for begin in progress(range(0, len(views), ranks), "render"):
         turn, start = views[begin : begin + ranks], perf_counter()
         images = dict[str, Tensor]()

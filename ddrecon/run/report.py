@@ -17,7 +17,6 @@ from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
-from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
@@ -59,7 +58,7 @@ def write_run_report(
 ) -> None:
     """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
-    engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
+    engines = name_engines(engine_of_scene(scene))
     known = {key: value for key, value in environment.items() if key != "engines"}
     settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]

@@ -65,12 +65,6 @@ def test_check_names_it(succeed: Run, name: str, line: str) -> None:
     assert report["engine"] == dict.fromkeys(engine.PARTS, "torch" if name == "torch" else "warp")
 
 
-def test_check_names_what_slabs_leave_to_torch(succeed: Run) -> None:
-    command = "check", "scene.yaml", "--engine", "warp", "--share", "cells"
-    (line,) = (one for one in succeed(*command).stdout.splitlines() if one.startswith("engine:"))
-    assert line.startswith("engine: warp (view rays") and "beams" in line.partition(";")[2]
-
-
 DENSITY = half_empty(3, 4, 5)
 PLACE, POWER = DENSITY.new_tensor([0.9, 0.7, 0.2]), DENSITY.new_tensor([1.0])
 LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
@@ -92,13 +86,9 @@ def test_what_is_left_to_torch_depends_on_scene_and_device(
 ) -> None:
     scene = make_scene(DENSITY, **settings)
     scene.lights += lights
-    assert terms.parts_in_torch(scene, False, is_on_gpu) == parts
-    in_slabs = {*parts, *(["beams"] if scene.lights else [])}
-    in_slabs |= {"transport rounds"} if scene.diffusion.rounds else set()
-    in_slabs |= {"diffusion"} if scene.diffusion.model != "none" else set()
-    assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == in_slabs
+    assert terms.parts_in_torch(scene, is_on_gpu) == parts
     scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
-    assert "phases by cell" in terms.parts_in_torch(scene, False, is_on_gpu)
+    assert "phases by cell" in terms.parts_in_torch(scene, is_on_gpu)
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

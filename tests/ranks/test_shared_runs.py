@@ -68,10 +68,6 @@ SHOWN = ("a", "b", "d")
 RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density"]
 RENDER += [*(word for name in SHOWN for word in ("--view", name)), "-o"]
 FIELDS = "density", "sigma_s"
-WARM = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch"
-TALL = *WARM, "-D", "diffusion.warm_start=false"
-ROUNDS = "-D", "diffusion.transport_rounds=1", "-D", "diffusion.degree=1"
-CELLS = "--share", "cells"
 
 
 def sure(ranks: int, output: str, *options: str) -> Job:
@@ -95,14 +91,6 @@ JOBS = {
     "sure": sure(1, "sure", "--calibrate", "2"),
     "sure begun": sure(1, "doubts", "--calibrate", "1"),
     "sure of three": sure(3, "doubts", "--calibrate", "2", "--resume"),
-    "whole": job(1, "whole", *TALL, *ROUNDS),
-    "warm": job(1, "warm", *WARM, "--iterations", "2"),
-    "warm cells": job(2, "warm cells", *WARM, *CELLS, "--iterations", "2"),
-    "cells killed": job(3, "torn", *TALL, *ROUNDS, *CELLS, failing=[2, 3, "killed"]),
-    "cells resumed": job(2, "torn", *TALL, *ROUNDS, *CELLS, "--resume", "--preview-every", "3"),
-    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.model=flux_limited"),
-    "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
-    "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
 }
 
 
@@ -164,13 +152,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     return Runs(folder)
 
 
-ALIKE = [("four", "one"), ("broken", "one"), ("torn", "whole"), ("warm cells", "warm")]
-
-
-@pytest.mark.parametrize(("output", "alone"), ALIKE)
-def test_ranks_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
-    """Also in slabs, and where solves begin at the last solutions, carried to finer cells."""
-    runs.compare(output, alone)
+@pytest.mark.parametrize("output", ["four", "broken"])
+def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
+    runs.compare(output, "one")
 
 
 def test_the_first_rank_alone_prints(runs: Runs) -> None:
@@ -215,28 +199,6 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
 
 def test_one_rank_imports_and_starts_nothing(runs: Runs) -> None:
     assert runs.text("one", 0, "out").splitlines()[-2:] == ["[]", "False"]
-
-
-def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
-    assert runs.codes["tall"] == [0] and runs.codes["tall cells"] == [0, 0]
-    arrays = sorted(path.name for path in (runs.folder / "tall").glob("*.npy"))
-    assert len(arrays) == 2 * len(SHOWN)
-    for name in arrays:
-        one, other = (np.load(runs.folder / output / name) for output in ("tall", "tall cells"))
-        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5 * abs(one).max())
-
-
-def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
-    assert runs.codes["cells refused"][0] == 2
-    lines = runs.text("cells refused", 0, "err").splitlines()
-    assert len(lines) == 1 and ": diffusion.model: flux_limited: not where processes" in lines[0]
-    assert not (runs.folder / "none").exists()
-
-
-def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
-    names = sorted(path.name for path in (runs.folder / "torn" / "previews").iterdir())
-    assert "c.png" in names and "c.000003.png" in names
-    assert (runs.folder / "torn" / "report.html").is_file()
 
 
 def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:

@@ -91,7 +91,7 @@ def _pass(value: Tensor, course: Course, ends: dict[int, Tensor]) -> tuple[Tenso
         for place, shape in enumerate(shapes)
     )
     passed = torch.exp(-depth).expand_as(source)
-    arriving, _, gone = follow(passed, source, course, (across, row, column))
+    arriving, gone = follow(passed, source, course, (across, row, column))
     return course.lift(arriving * decay_mean(depth)), gone
 
 

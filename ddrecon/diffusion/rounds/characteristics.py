@@ -7,8 +7,7 @@ the cell's mean, and a slope. What leaves a cell goes on to up to four of the ne
 cell the mean of I along its ray is kept: so what is emitted and does not leave is found again, to
 rounding, and a white furnace is exact.
 
-All but the recurrence I_out = passed I_in + source is computed at once. In a slab of the grid,
-light comes from one neighbor and leaves for the other.
+All but the recurrence I_out = passed I_in + source is computed at once.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import NEARLY, Slicing, across
-from ddrecon.slabs.slab import Slab, whole_of
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
@@ -103,11 +101,6 @@ class Course:
         """The inverse of `lay`."""
         return values.permute([self.order.index(dim) for dim in range(4)])
 
-    def way_along(self, axis: int) -> int:
-        """1 where light goes up along the grid's `axis`, -1 where down, 0 where neither."""
-        along = self.moved[axis]
-        return (along > 0) - (along < 0)
-
 
 def radiance_along(
     medium: Medium,
@@ -115,21 +108,18 @@ def radiance_along(
     gradient: Tensor,
     inflow: Tensor | None,
     direction: Direction,
-    entering: Tensor | None = None,
     ends: Ends | None = None,
-) -> tuple[Tensor, Tensor, Ends]:
-    """I along `direction` (E2.9): its mean in each cell, and what leaves it [C, z, y, x].
+) -> tuple[Tensor, Ends]:
+    """I along `direction` (E2.9): its mean in each cell [C, z, y, x], and what leaves the box.
 
-    And what leaves the box. `ends` is what enters it besides `inflow`.
+    `ends` is what enters it besides `inflow`.
 
     `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
     `medium` adds (1 - f) kappa_s a unit length; `gradient` [3, C, z, y, x]: by how much q rises
     from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
-    which what leaves is counted. In a slab both are those of its own cells; `entering` is
-    what leaves the layer before these, as the neighbor has it.
+    which what leaves is counted.
     """
-    grid = medium.grid
-    course = Course.of(whole_of(grid), direction)
+    course = Course.of(medium.grid, direction)
     depth, strength = (
         course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
     )
@@ -145,43 +135,24 @@ def radiance_along(
         source = source - outside * -torch.expm1(-depth)
         own = own - outside * (1 - phi)
     passed, source, own, phi = torch.broadcast_tensors(passed, source, own, phi)
-    way = 0
-    if isinstance(grid, Slab):
-        dim, way = course.order.index(1 + grid.axis), course.way_along(grid.axis)
-        passed, source, own, phi = (
-            part.narrow(dim, grid.halo[0], grid.size) for part in (passed, source, own, phi)
-        )
-        if way and entering is not None:
-            # One layer more, of which nothing passes and to which is added what is there.
-            layer = course.lay(entering)
-            more = torch.zeros_like(layer), layer
-            passed, source = (
-                torch.cat([first, part][::way], dim)
-                for first, part in zip(more, (passed, source), strict=True)
-            )
-    arriving, leaving, gone = follow(passed, source, course, ends)
-    if isinstance(grid, Slab) and way and entering is not None:
-        arriving, leaving = (
-            part.narrow(dim, int(way > 0), grid.size) for part in (arriving, leaving)
-        )
-    found = course.lift(torch.addcmul(own, arriving, phi))
-    return found if inflow is None else found + inflow, course.lift(leaving), gone
+    arriving, gone = follow(passed, source, course, ends)
+    mean = course.lift(torch.addcmul(own, arriving, phi))
+    return mean if inflow is None else mean + inflow, gone
 
 
 def follow(
     passed: Tensor, source: Tensor, course: Course, ends: Ends | None = None
-) -> tuple[Tensor, Tensor, Ends]:
-    """I_in, where rays enter a slice, and I_out = `passed` I_in + `source`, slice after slice.
+) -> tuple[Tensor, Ends]:
+    """I_in, where rays enter a slice [slices, C, rows, columns], and what leaves the box.
 
-    `[slices, C, rows, columns]`; and what leaves the box. Through its faces enters what is at the
-    `ends`, None for nothing.
+    Slice after slice I_out = `passed` I_in + `source`. Through the box's faces enters what is at
+    the `ends`, None for nothing.
     """
     across, *sides = ends or (torch.zeros_like(source[0]), None, None)
     if course.wraps[0]:
         across = _enter_again(passed, source, course)
-    entered, left, gone = _follow_once(passed, source, course, across, sides)
-    arrived, leaving = (torch.stack(one[:: course.forward]) for one in (entered, left))
-    return arrived, leaving, gone
+    entered, gone = _follow_once(passed, source, course, across, sides)
+    return torch.stack(entered[:: course.forward]), gone
 
 
 def _follow_once(
@@ -190,16 +161,15 @@ def _follow_once(
     course: Course,
     arriving: Tensor,
     sides: Sequence[Tensor | None] = (None, None),
-) -> tuple[list[Tensor], list[Tensor], Ends]:
-    """I_in and I_out by slice, for what is `arriving` at the first; and what leaves the box."""
-    entered, left, gone = list[Tensor](), list[Tensor](), (list[Tensor](), list[Tensor]())
+) -> tuple[list[Tensor], Ends]:
+    """I_in by slice, for what is `arriving` at the first; and what leaves the box."""
+    entered, gone = list[Tensor](), (list[Tensor](), list[Tensor]())
     ways = list(zip((1, 2), sides, gone, course.drift, course.wraps[1:], strict=True))
     # All slices at once: the adjoint of one by its number is an array of zeros as large as all.
     sources, shares = source.unbind(), passed.unbind()
     for k in range(len(source))[:: course.forward]:
         entered.append(arriving)
         arriving = torch.addcmul(sources[k], shares[k], arriving)
-        left.append(arriving)
         # Part of each row goes on to the next, and of the last leaves the box; so of columns.
         for dim, side, beyond, drift, is_around in ways:
             if drift:
@@ -212,22 +182,22 @@ def _follow_once(
                 arriving = torch.lerp(arriving, behind, abs(drift))
     nothing = torch.zeros_like(source[0])
     rows, columns = (torch.stack(one[:: course.forward]) if one else nothing for one in gone)
-    return entered, left, (arriving, rows, columns)
+    return entered, (arriving, rows, columns)
 
 
 def _enter_again(passed: Tensor, source: Tensor, course: Course) -> Tensor:
     """What enters the first slice where the last comes before it: light from all periods."""
     nothing, count = torch.zeros_like(source[0]), len(passed)
-    _, _, (entering, *_) = _follow_once(passed, source, course, nothing)
+    _, (entering, *_) = _follow_once(passed, source, course, nothing)
     if any(drift % 1 for drift in course.drift):
         for _ in range(MOST_LAPS):
             before = entering
-            _, _, (entering, *_) = _follow_once(passed, source, course, before)
+            _, (entering, *_) = _follow_once(passed, source, course, before)
             if bool((entering - before).abs().max() <= LEFT * entering.abs().max()):
                 break
         return entering
     # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
-    _, _, (share, *_) = _follow_once(passed, 0 * source, course, torch.ones_like(nothing))
+    _, (share, *_) = _follow_once(passed, 0 * source, course, torch.ones_like(nothing))
     moved = [count * int(drift) for drift in course.drift]
     for _ in range(DOUBLINGS):
         entering = entering + share * entering.roll(moved, (1, 2))

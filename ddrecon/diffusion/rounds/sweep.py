@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.diffusion.rounds.characteristics import Course, Direction, Ends, radiance_along
+from ddrecon.diffusion.rounds.characteristics import Direction, Ends, radiance_along
 from ddrecon.diffusion.rounds.mirror import Mirror
 from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
@@ -30,9 +29,6 @@ from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.slicing import NEARLY
-from ddrecon.ranks import own_rank, rank_count
-from ddrecon.slabs.exchange import add_halo, swap_layers
-from ddrecon.slabs.slab import Slab, whole_of
 
 DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
 """By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
@@ -62,66 +58,22 @@ def sweep(
     grid, (count, colors) = medium.grid, source.shape[:2]
     courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
-    axis, shape, ways = 0, list(grid.shape), [0] * len(courses)
-    nothing = source.new_zeros(())
-    if isinstance(grid, Slab):
-        axis, shape[grid.axis] = grid.axis, grid.size
-        ways = [Course.of(grid.whole, direction).way_along(axis) for direction in courses]
-        # It varies as light does: all layers are exchanged alike.
-        nothing = torch.zeros_like(source[0].narrow(axis - 3, 0, 1)) + 0 * source.flatten()[0]
-    moments = source.new_zeros(count, colors * math.prod(shape))
-
-    def add(number: int, entering: Tensor) -> Tensor:
+    moments = source.new_zeros(count, colors * grid.cells)
+    for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
         row, ends = values[number], None if mirror is None else mirror.entering(number)
 
-        def follow() -> tuple[Tensor, Tensor, Ends]:
+        def follow(
+            row: Tensor = row, direction: Direction = direction, ends: Ends | None = ends
+        ) -> tuple[Tensor, Ends]:
             # I (E2.9), of the sum over moments of this direction's harmonics
             scatters = torch.tensordot(row, source, 1)
-            way = courses[number]
-            return radiance_along(medium, scatters, gradient, inflow, way, entering, ends)
+            return radiance_along(medium, scatters, gradient, inflow, direction, ends)
 
-        radiance, leaving, gone = recompute(follow)
+        radiance, gone = recompute(follow)
         if mirror is not None:
             mirror.left.append(gone)
-        moments.addr_(weights[number] * row, radiance.flatten())
-        return leaving.narrow(1 + axis, shape[axis] - 1 if ways[number] > 0 else 0, 1)
-
-    rest = _pass_on(ways, nothing, add)
-    found = moments.view(count, colors, *shape)
-    return add_halo(found + 0 * rest.sum(), grid) if isinstance(grid, Slab) else found
-
-
-def _pass_on(
-    ways: Sequence[int], nothing: Tensor, follow: Callable[[int, Tensor], Tensor]
-) -> Tensor:
-    """Has directions followed, by number and what enters the slab, as what leaves one goes on.
-
-    `ways`: 1 for directions that go from a slab to the next, -1 to the last, 0 to none; `nothing`
-    enters the first. Returns what nobody took up at the end: derivatives that go through it meet
-    all exchanges, on all ranks in the same order.
-    """
-    for number, way in enumerate(ways):
-        if way == 0:
-            follow(number, nothing)
-    if not any(ways):
-        return nothing
-    upwards, downwards = (
-        [number for number, way in enumerate(ways) if way == one] for one in (1, -1)
-    )
-
-    def take_turn(numbers: Sequence[int], place: int, entering: Tensor) -> Tensor:
-        is_there = 0 <= place < len(numbers)
-        return follow(numbers[place], entering) if is_there else 0 * entering
-
-    to_below = to_above = below = above = nothing
-    rank, last = own_rank(), rank_count() - 1
-    for turn in range(max(len(upwards), len(downwards)) + last):
-        if turn:
-            below, above = swap_layers(to_below, to_above)
-        # Its turn comes to a rank as many turns later as ranks are before it.
-        to_above = take_turn(upwards, turn - rank, below)
-        to_below = take_turn(downwards, turn - (last - rank), above)
-    return to_below + to_above
+        moments.addr_(weight * row, radiance.flatten())
+    return moments.view(count, colors, *grid.shape)
 
 
 def sweep_change(
@@ -141,9 +93,8 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light.mean + source.mean, directions)
-    where = light.mean.is_cuda, isinstance(medium.grid, Slab)
     is_apart = mirror is None and not medium.grid.periodic
-    if is_apart and is_fused() and has_kernels("transport rounds", *where):
+    if is_apart and is_fused() and has_kernels("transport rounds", light.mean.is_cuda):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
@@ -171,7 +122,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
     though it goes on to several cells (E2.16).
     """
     gradient = apply_around(cell_gradient, q, medium.grid)
-    shares, steps = _spread(whole_of(medium.grid), directions)
+    shares, steps = _spread(medium.grid, directions)
     extinction = medium.extinction
     if not any(shares):
         return gradient

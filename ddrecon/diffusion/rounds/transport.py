@@ -30,9 +30,6 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.ranks import sum_numbers
-from ddrecon.slabs.exchange import add_halo
-from ddrecon.slabs.slab import Slab, whole_of
 
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
@@ -57,8 +54,7 @@ def run_rounds(
     """
     if rounds == 0:
         return light
-    medium, grid = problem.medium, problem.medium.grid
-    directions, light = count_directions(degree, rounds), _renewed(light, grid)
+    medium, directions = problem.medium, count_directions(degree, rounds)
     emitted, glow = None, face_mirror(medium, directions)
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
@@ -69,9 +65,8 @@ def run_rounds(
         is_last, before = round_index == rounds, light.mean
         cosine = _flux_factor(medium, is_last and not is_open)
         given = round_index, cosine, factor, mirror
-        made = _round(problem, light, emitted, solve, directions, *given)
-        light = _renewed(made, grid)
-        residual = _residual(light.mean, before, grid) if is_open or is_last else 1.0
+        light = _round(problem, light, emitted, solve, directions, *given)
+        residual = _residual(light.mean, before) if is_open or is_last else 1.0
         if is_last or residual < tolerance:
             break
     record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
@@ -80,12 +75,9 @@ def run_rounds(
 
 
 @torch.no_grad()
-def _residual(new: Tensor, old: Tensor, grid: Grid) -> Tensor:
+def _residual(new: Tensor, old: Tensor) -> Tensor:
     """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
     squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
-    if isinstance(grid, Slab):
-        # halos count as well, alike in both
-        squares = squares.new_tensor(sum_numbers(squares.flatten().tolist())).view_as(squares)
     changed, whole = squares
     return (changed / whole.clamp(min=1e-300)).amax().sqrt()
 
@@ -107,14 +99,6 @@ def sweep_emission(medium: Medium, directions: int, mirror: Mirror | None = None
     nothing = torch.zeros_like(medium.extinction.value.detach() * emitting.remaining.value.detach())
     even = Moments(torch.ones_like(nothing))
     return sweep_change(emitting, Moments(nothing), even, None, directions, mirror)
-
-
-def _renewed(light: Moments, grid: Grid) -> Moments:
-    """`light`, whose flux is right where slabs end: there it was made of half of what is around."""
-    if light.flux is None or not isinstance(grid, Slab):
-        return light
-    z, y, x = (add_halo(grid.own(along), grid) for along in light.flux)
-    return replace(light, flux=(z, y, x))
 
 
 def _round(
@@ -187,7 +171,7 @@ def _gain(
     the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and L1 -
     3 F(L0), None for zero.
     """
-    step = _mean_step(whole_of(medium.grid), directions)
+    step = _mean_step(medium.grid, directions)
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 

@@ -26,8 +26,6 @@ from torch.nn.functional import pad
 
 from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, sides, upper_cells
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
-from ddrecon.ranks import sum_over_ranks
-from ddrecon.slabs.ghosts import Ghosts
 
 FEW_CELLS = 128
 """So many cells are solved directly."""
@@ -110,10 +108,7 @@ def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     coarse = [_sum_of_pairs(c, axis) for c in operator.conductances]
     coarse[axis - 1] = _stiffened(1 / resistance, way, operator)
     z, y, x = coarse
-    ghosts = operator.ghosts
-    if ghosts is not None and ghosts.axis == axis:
-        ghosts = ghosts.halved()
-    return way, Operator((z, y, x), _sum_of_pairs(operator.loss, axis), ghosts=ghosts)
+    return way, Operator((z, y, x), _sum_of_pairs(operator.loss, axis))
 
 
 def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
@@ -200,8 +195,6 @@ class Coarsest:
 class Level:
     """A grid: its matrix, and the way to the next coarser one, axis by axis.
 
-    Of a grid in slabs the next coarser one is gathered on every rank.
-
     `taken` [C, z, y, x]: S times what a cell exchanges with its neighbors, the sum of its
     conductances. Corrections from the coarser grid are multiplied by it: by 1/S where nothing is
     lost, by nearly nothing where light is absorbed before it gets to the next cell. Else they would
@@ -211,7 +204,7 @@ class Level:
     matrix: ScaledMatrix
     taken: Tensor
     ways: tuple[Coarsening, ...]
-    coarser: Level | Coarsest | Gathered
+    coarser: Level | Coarsest
 
     @staticmethod
     def of(operator: Operator) -> Level:
@@ -219,9 +212,6 @@ class Level:
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
         means = [c.sum() / max(c.numel(), 1) for c in matrix.conductances]
-        if matrix.ghosts is not None:
-            # All ranks coarsen the same axes.
-            means = sum_over_ranks(means)
         for axis in strong_axes(taken.shape, torch.stack(means).tolist()):
             way, operator = coarsen(operator, axis)
             ways.append(way)
@@ -248,34 +238,8 @@ class Level:
         return self.cycle(self.matrix.scale * residual).mul_(self.matrix.scale)
 
 
-@dataclass(frozen=True)
-class Gathered:
-    """A `whole` grid that every rank has, beneath one in slabs with `ghosts`."""
-
-    ghosts: Ghosts
-    whole: Level | Coarsest
-
-    @staticmethod
-    def of(operator: Operator, ghosts: Ghosts) -> Gathered:
-        """The grid of all cells of `operator`, which has those of one rank, and all coarser."""
-        z, y, x = (
-            ghosts.gather(ghosts.own_faces(faces, axis), without_last=axis == ghosts.axis)
-            for axis, faces in zip(AXES, operator.conductances, strict=True)
-        )
-        whole = _coarser(Operator((z, y, x), ghosts.gather(ghosts.own(operator.loss))))
-        assert not isinstance(whole, Gathered)
-        return Gathered(ghosts, whole)
-
-    def correction(self, residual: Tensor) -> Tensor:
-        """Roughly A^-1 `residual` of this rank's cells, by one cycle of all."""
-        whole = self.ghosts.gather(self.ghosts.own(residual))
-        return self.ghosts.cut(self.whole.correction(whole))
-
-
-def _coarser(operator: Operator) -> Level | Coarsest | Gathered:
+def _coarser(operator: Operator) -> Level | Coarsest:
     """The grid of `operator`, coarsened from a finer one, and all coarser ones."""
-    if operator.ghosts is not None:
-        return Gathered.of(operator, operator.ghosts)
     has_few = operator.loss[0].numel() <= FEW_CELLS
     return Coarsest.of(operator) if has_few else Level.of(operator)
 

@@ -29,10 +29,10 @@ def multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
     """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
-    # Fused, a thread does slices. On a GPU, where one does a cell, in slabs, and where cells at
-    # both ends are neighbors, it is all torch's.
+    # Fused, a thread does slices. On a GPU, where one does a cell, and where cells at both ends are
+    # neighbors, it is all torch's.
     is_fused = current_engine() == "warp" and has_kernels("diffusion", source.is_cuda)
-    if is_fused and operator.ghosts is None and not operator.is_periodic:
+    if is_fused and not operator.is_periodic:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, sides, subtract_neighbors
 from ddrecon.errors import SolveError
-from ddrecon.slabs.ghosts import Ghosts
 
 
 @dataclass(frozen=True)
@@ -26,49 +25,41 @@ class Solution:
 
 @dataclass(frozen=True)
 class ScaledMatrix:
-    """S A S, whose diagonal is 1; `scale` is S, `conductances` those of S A S.
-
-    With `ghosts`, so have all arrays, and each product ends with an exchange of them.
-    """
+    """S A S, whose diagonal is 1; `scale` is S, `conductances` those of S A S."""
 
     scale: Tensor
     conductances: tuple[Tensor, ...]
-    ghosts: Ghosts | None = None
 
     @staticmethod
     def of(operator: Operator) -> ScaledMatrix:
         """The scaled form of `operator`."""
-        scale = fill(operator.ghosts, operator.diagonal.rsqrt())
+        scale = operator.diagonal.rsqrt()
         scaled = tuple(c.expand(len(scale), -1, -1, -1).clone() for c in operator.conductances)
         for axis, conductance in zip(AXES, scaled, strict=True):
             for part, below, above in sides(conductance, scale, axis):
                 part.mul_(below).mul_(above)
-        return ScaledMatrix(scale, scaled, operator.ghosts)
+        return ScaledMatrix(scale, scaled)
 
     def apply(self, y: Tensor) -> Tensor:
         """S A S y."""
-        return self._subtract_neighbors(y.clone(), y)
+        return subtract_neighbors(y.clone(), y, self.conductances)
 
     def residual(self, y: Tensor, source: Tensor) -> Tensor:
         """`source` - S A S y."""
-        return self._subtract_neighbors(source - y, y, times=-1.0)
+        return subtract_neighbors(source - y, y, self.conductances, times=-1.0)
 
     def relaxed(self, y: Tensor, source: Tensor, step: float) -> Tensor:
         """y + `step` (`source` - S A S y)."""
-        return self._subtract_neighbors(torch.lerp(y, source, step), y, times=-step)
+        relaxed = torch.lerp(y, source, step)
+        return subtract_neighbors(relaxed, y, self.conductances, times=-step)
 
     def inner(self, a: Tensor, b: Tensor) -> Tensor:
         """Inner product per color, `[C, 1, 1, 1]`."""
-        if self.ghosts is not None:
-            return self.ghosts.inner(a, b)
         return (a * b).sum((1, 2, 3), keepdim=True)
 
     def norm(self, a: Tensor) -> Tensor:
         """Euclidean norm per color, `[C, 1, 1, 1]`."""
         return self.inner(a, a).sqrt()
-
-    def _subtract_neighbors(self, result: Tensor, y: Tensor, times: float = 1.0) -> Tensor:
-        return fill(self.ghosts, subtract_neighbors(result, y, self.conductances, times))
 
 
 @dataclass(frozen=True)
@@ -83,7 +74,7 @@ class ScaledSystem:
     def of(operator: Operator, source: Tensor) -> ScaledSystem:
         """The scaled form of `operator` u = `source`."""
         matrix = operator.once(ScaledMatrix.of)
-        scaled = fill(matrix.ghosts, matrix.scale * source)
+        scaled = matrix.scale * source
         return ScaledSystem(matrix, scaled, matrix.norm(scaled))
 
     def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -107,11 +98,6 @@ class ScaledSystem:
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
         return Solution(self.matrix.scale * y, iterations, residual)
-
-
-def fill(ghosts: Ghosts | None, u: Tensor) -> Tensor:
-    """`u`, whose `ghosts` are now what their owners have: `u` itself where there are none."""
-    return u if ghosts is None else ghosts.fill(u)
 
 
 def require_reached(name: str, solution: Solution, tolerance: float) -> Solution:
