@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import is_fused
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -94,10 +93,6 @@ class Operator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E3.2)."""
-        if is_fused() and not self.is_periodic:
-            from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
-
-            return find_cotangents(self, adjoint, u)
         conductance_bars = (
             difference(adjoint, c, axis).mul_(difference(u, c, axis)).neg_().sum_to_size(c.shape)
             for axis, c in zip(AXES, self.conductances, strict=True)

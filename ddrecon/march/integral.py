@@ -22,7 +22,7 @@ from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
@@ -73,7 +73,7 @@ def _march_part(
     else:
         lattice = sight.lattice
         between = march_these(lattice.rays, lattice.crossing).unflatten(1, lattice.shape)
-        values = _interpolate(between, sight, lattice.places)
+        values = _spread(interpolate_between(between, lattice.places), sight)
         numbers = _find_rough(between, lattice, settings.tolerance, behind)
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
@@ -92,15 +92,6 @@ def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[
     if sampler.emission.period is not None:
         return march_periods(march_own, sampler, rays, crossing)
     return march_own(sampler, rays, crossing)
-
-
-def _interpolate(values: Tensor, sight: Sight, places: Tensor) -> Tensor:
-    """`values` [K, r, c] of a lattice at the `places` of pixels, [K, R] along all rays."""
-    if current_engine() == "warp" and not is_varied(places):
-        from ddrecon.march.fused.between import interpolate_pixels
-
-        return interpolate_pixels(values, places, sight.crossing.hit, len(sight.rays.direction))
-    return _spread(interpolate_between(values, places), sight)
 
 
 def _find_rough(

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from graphics_cards import assert_compiles
-from media import box_grid, half_empty, make_operator, random_values
+from media import box_grid, half_empty, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
@@ -16,12 +16,6 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import faces
-from ddrecon.diffusion.fused.product import (
-    KERNELS,
-    find_cotangents,
-    product_kernel,
-    subtract_product,
-)
 from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
@@ -123,21 +117,5 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
-        *(product_kernel(name, 32) for name in KERNELS),
     ]
     assert_compiles(kernels, tmp_path)
-
-
-@each_shape
-@each_colors
-def test_the_product_with_the_operator_is_torchs(shape: Shape, colors: tuple[int, int]):
-    """What changes of a solve start from: A may have one color where light has three."""
-    of_medium, of_light = colors
-    diffusion, absorption = (random_values(of_medium, *shape, seed=seed) for seed in (1, 2))
-    operator = make_operator(box_grid(shape), diffusion + 0.1, absorption)
-    u = random_values(of_light, *shape, seed=3)
-    found = subtract_product(u, u, operator.loss, *operator.conductances)
-    torch.testing.assert_close(found, u - operator.apply(u), rtol=1e-13, atol=1e-13)
-    use_engine("torch")
-    bars = operator.cotangents(found, u)
-    torch.testing.assert_close(find_cotangents(operator, found, u), bars, rtol=1e-13, atol=1e-13)

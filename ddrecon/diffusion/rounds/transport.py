@@ -187,10 +187,6 @@ def _gain(
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
-    if is_fused() and not operator.is_periodic:
-        from ddrecon.diffusion.fused.product import find_imbalance
-
-        return find_imbalance(operator, right, mean)
     return recompute(_plain_imbalance, operator, right, mean)
 
 
