@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
-from ddrecon.engine import current_engine
+from ddrecon.engine import current_engine, use_engine
 
 T = TypeVar("T")
 
@@ -157,11 +157,11 @@ class _Recomputation:
     """Numbers in place of the tensors that `function` saves for its backward pass.
 
     When the first is asked for, `function` runs again and saves the same tensors in the same order:
-    not in forward mode, as it did not before.
+    by the engine of then, and not in forward mode, as it did not before.
     """
 
     def __init__(self, function: Callable[[], Any]):
-        self.function = function
+        self.function, self.engine = function, current_engine()
         self.count = 0
         self.saved: dict[int, Tensor] = {}
 
@@ -178,8 +178,11 @@ class _Recomputation:
 
     def _run(self) -> None:
         saved: list[Tensor] = []
-        level, forward_ad._current_level = forward_ad._current_level, -1
+        level, engine = forward_ad._current_level, current_engine()
         try:
+            forward_ad._current_level = -1
+            if engine != self.engine:
+                use_engine(self.engine)
             with (
                 torch.enable_grad(),
                 saved_tensors_hooks(lambda one: saved.append(one.detach()), saved.__getitem__),
@@ -187,4 +190,6 @@ class _Recomputation:
                 self.function()
         finally:
             forward_ad._current_level = level
+            if engine != self.engine:
+                use_engine(engine)
         self.saved = dict(enumerate(saved))
