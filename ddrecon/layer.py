@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
@@ -114,6 +114,9 @@ class VolumeRenderer(torch.nn.Module):
                 one = {n: v[index] if n in counts else v for n, v in given.items()}
                 images.append(render(with_values(self.scene, one), view, self.memories[index]))
             return torch.stack(images) if counts else images[0]
+
+    if TYPE_CHECKING:
+        __call__ = forward  # which torch's own class says nothing of
 
     def _is_batch(self, name: str, value: Tensor) -> bool:
         """Whether `value` has an axis of entries in front of what the variable `name` has."""

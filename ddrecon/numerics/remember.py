@@ -35,7 +35,7 @@ class _Source(NamedTuple):
     copy: Tensor | None
 
     @staticmethod
-    def of(tensor: Tensor, forget: Callable[[object], None]) -> _Source:
+    def of(tensor: Tensor, forget: Callable[[object], object]) -> _Source:
         copy = None if _results.get(id(tensor)) is tensor else tensor.detach().clone()
         return _Source(ref(tensor, forget), version_of(tensor), copy)
 
