@@ -15,7 +15,7 @@ from torch import Tensor
 from ddrecon import renderer
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.numerics.autodiff import leave_uncompiled, require_plain_autograd
+from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
 from ddrecon.supported import require_above
@@ -37,13 +37,13 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     Raises UsageError where `require_legal` does.
     """
     _look_at(scene, view)
-    return renderer.render(scene, view, memory)
+    return refuse_batches(renderer.render(scene, view, memory))
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
     """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
     _look_at(scene, None)
-    return renderer.fluence(scene, memory)
+    return refuse_batches(renderer.fluence(scene, memory))
 
 
 def _look_at(scene: Scene, view: str | None) -> None:

@@ -330,6 +330,10 @@ def test_what_torch_cannot_do_is_said() -> None:
     ):
         with pytest.raises(NotImplementedError, match="only first derivatives of light"):
             again()
+    image = layer(density=density)
+    both = torch.stack([image, image]).detach()
+    with pytest.raises(NotImplementedError, match="light has one cotangent a pass"):
+        torch.autograd.grad(image, density, both, is_grads_batched=True)
 
 
 @pytest.mark.slow

@@ -140,6 +140,18 @@ def _refuse_graph() -> None:
         )
 
 
+def refuse_batches(result: Tensor) -> Tensor:
+    """`result`, whose backward pass raises NotImplementedError for many cotangents at once."""
+
+    def look_at(bar: Tensor) -> None:
+        if "Batched" in str(torch._C._dispatch_keys(bar)):
+            raise NotImplementedError("is_grads_batched, vectorize: light has one cotangent a pass")
+
+    if result.requires_grad:
+        result.register_hook(look_at)
+    return result
+
+
 def recompute(function: Callable[..., T], *arguments: object) -> T:
     """`function(*arguments)`, of which only the arguments are kept for the backward pass.
 
