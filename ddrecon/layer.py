@@ -23,7 +23,7 @@ from ddrecon.variables.values import (
     is_real,
     require_legal,
     require_scene,
-    value_of,
+    shapes_of,
     with_values,
 )
 
@@ -90,9 +90,9 @@ class VolumeRenderer(torch.nn.Module):
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
         (`ddrecon.variables`). What is not given is the scene's. Each may have one more axis in
-        front, of n entries; the images then are `[n, views, 3, h, w]`. Raises UsageError for a name
-        the scene does not have, for other shapes, another device, and where `render` does;
-        NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
+        front than it may have else, of n entries; the images then are `[n, views, 3, h, w]`. Raises
+        UsageError for a name the scene does not have, for other shapes, another device, and where
+        `render` does; NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         given = {name: value for name, value in named.items() if value is not None}
@@ -119,13 +119,11 @@ class VolumeRenderer(torch.nn.Module):
         __call__ = forward  # which torch's own class says nothing of
 
     def _is_batch(self, name: str, value: Tensor) -> bool:
-        """Whether `value` has an axis of entries in front of what the variable `name` has."""
+        """Whether `value` has an axis of entries in front of what the variable `name` may have."""
         if not isinstance(value, Tensor):
             return False
-        if name in ("sigma_a", "sigma_s", "sigma_t", "albedo"):
-            return value.ndim in (2, 5)
-        with torch.no_grad():
-            return value.ndim == value_of(self.scene, name).ndim + 1
+        shapes, shape = shapes_of(self.scene, name), tuple(value.shape)
+        return shape not in shapes and shape[1:] in shapes
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What torch calls to move a module: the scene's tensors are moved as well."""

@@ -235,6 +235,13 @@ def require_range(name: str, value: Tensor) -> None:
         raise UsageError(f"{name}: must not be zero")
 
 
+def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
+    """Those that the variable `name` of `scene` may have; raises as `value_of`."""
+    is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
+    now = () if is_pair else tuple(value_of(scene, name).shape)
+    return _shapes(_own_name(scene.volume, name), now, scene.volume.grid.shape)
+
+
 def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tuple[int, ...]]:
     """Those that the variable `name` may have in place of the one it has `now`."""
     kind, last = kind_of(name), split_name(name)[1]
