@@ -18,7 +18,7 @@ from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
-from ddrecon.supported import require_above
+from ddrecon.supported import require_above, require_settings
 from ddrecon.variables.values import (
     is_real,
     require_legal,
@@ -53,6 +53,7 @@ def _look_at(scene: Scene, view: str | None) -> None:
     require_legal(scene, view)
     if scene.volume.density.is_cpu:
         require_above(scene)
+    require_settings(scene)
     scene.settle()
     forget_changed()
 

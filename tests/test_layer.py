@@ -315,7 +315,8 @@ RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         {"pose": torch.eye(4, **DOUBLE)},
         "views.view.camera: expected a pose [3, 4], found [4, 4",
     ),
-    ({}, {"principal_point": [0.5]}, "principal_point: has shape [1]; expected [2]"),
+    ({}, {"principal_point": [0.5]}, "principal_point: must be two finite numbers, found (0.5,)"),
+    ({}, {"principal_point": (0.5, math.nan)}, "principal_point: must be two finite numbers"),
 ]
 
 

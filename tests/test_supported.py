@@ -1,5 +1,6 @@
 """What is not computed together is refused from Python as from a file, in the same words."""
 
+import math
 import re
 from dataclasses import replace
 from typing import Any
@@ -52,6 +53,29 @@ def test_what_a_file_may_not_say_python_may_not(
     for call in (render, fluence, lambda scene: VolumeRenderer(scene)()):
         with pytest.raises(UsageError, match=re.escape(problem)):
             call(scene)
+
+
+SETTINGS = [
+    (
+        "diffusion",
+        {"model": "P1"},
+        "diffusion.model: expected one of none, p1, flux_limited, found",
+    ),
+    ("diffusion", {"degree": 4}, "diffusion.degree: expected one of 1, 3, 5, 7, found 4"),
+    ("diffusion", {"tolerance": math.nan}, "diffusion.tolerance: must be above 0, found nan"),
+    ("diffusion", {"tolerance": "small"}, "diffusion.tolerance: expected a number, found 'small'"),
+    ("render", {"samples_per_pixel": 0}, "render.samples_per_pixel: must be at least 1, found 0"),
+]
+
+
+@pytest.mark.parametrize(("section", "values", "problem"), SETTINGS)
+def test_a_setting_that_no_file_may_have_is_refused(
+    section: str, values: dict[str, Any], problem: str
+) -> None:
+    scene = scene_of({})
+    setattr(scene, section, replace(getattr(scene, section), **values))
+    with pytest.raises(UsageError, match=re.escape(problem)):
+        render(scene)
 
 
 def test_a_camera_below_a_ground_is_refused() -> None:

@@ -164,9 +164,13 @@ def _view_numbers(view: View) -> dict[str, Tensor]:
         raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
     if behind is not None and behind.is_cpu and not bool(behind.isfinite().all()):
         raise UsageError(f"{owner}background: must be finite")
+    middle = camera.principal_point
+    if not isinstance(middle, Tensor) and (len(middle) != 2 or not all(map(math.isfinite, middle))):
+        what = "must be two finite numbers"
+        raise UsageError(f"{owner}principal_point: {what}, found {middle}")
     parts = {part: getattr(view, part) for part in RESPONSE}
     parts |= {"camera": pose, "distortion": camera.distortion}
-    parts["principal_point"] = _view_value(view, "principal_point")
+    parts["principal_point"] = middle if isinstance(middle, Tensor) else None
     return {owner + part: value for part, value in parts.items() if value is not None}
 
 
