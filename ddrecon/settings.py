@@ -64,11 +64,9 @@ def faults_of(record: Any) -> Iterator[Violation]:
         value, known = getattr(record, part.name), part.metadata
         if value is None and part.default is None:
             continue
-        if "choices" in known and value not in known["choices"]:
-            yield (
-                part.name,
-                f"expected one of {', '.join(map(str, known['choices']))}, found {value!r}",
-            )
+        if value not in known.get("choices", [value]):
+            words = ", ".join(map(str, known["choices"]))
+            yield part.name, f"expected one of {words}, found {value!r}"
         for name, (words, is_within) in LIMITS.items():
             if name not in known:
                 continue
