@@ -109,10 +109,11 @@ def forget_changed() -> None:
     """Forgets all results where a tensor on a GPU has changed by `.data`; that takes one read."""
     found = [kept for memory in _memories for kept in [*memory.values()]]  # others may change it
     pairs: dict[torch.device, list[tuple[Tensor, Tensor]]] = {}
-    for tensor, version, copy in ((one.tensor(), *one[1:]) for kept in found for one in kept[0]):
-        is_there = copy is not None and tensor is not None and tensor.is_cuda
-        if is_there and version == version_of(tensor):
-            pairs.setdefault(tensor.device, []).append((tensor.detach(), copy))
+    for reference, version, copy in (source for kept in found for source in kept.sources):
+        tensor = reference()
+        if tensor is None or copy is None or not tensor.is_cuda or version != version_of(tensor):
+            continue
+        pairs.setdefault(tensor.device, []).append((tensor.detach(), copy))
     for each in pairs.values():
         now, then = (torch.cat([one.flatten() for one in side]) for side in zip(*each, strict=True))
         if not torch.equal(now, then):
