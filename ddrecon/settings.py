@@ -13,6 +13,7 @@ import operator
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypedDict, Unpack
 
@@ -70,10 +71,10 @@ def faults_of(record: Any) -> Iterator[Violation]:
         for name, (words, is_within) in LIMITS.items():
             if name not in known:
                 continue
-            if not isinstance(value, int | float):
+            if not isinstance(value, Real):
                 yield part.name, f"expected a number, found {value!r}"
             elif not is_within(value, known[name]):
-                yield part.name, f"must be {words} {known[name]:g}, found {value:g}"
+                yield part.name, f"must be {words} {known[name]:g}, found {float(value):g}"
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
@@ -99,6 +100,6 @@ def test_lists_serve_as_tuples() -> None:
     scene.volume.grid = Grid(*lists, periodic=[])
     scene.views[0].camera = replace(camera, size=list(camera.size), principal_point=[0.5, 0.5])
     assert torch.equal(render(scene), expected)
-    for size in ([2, 3], torch.Size([2, 3])):
+    for size in ([2, 3], torch.Size([2, 3]), np.array([2, 3])):
         scene.views[0].camera.size = size
         assert render(scene).shape[-2:] == (2, 3)

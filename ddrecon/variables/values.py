@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from numbers import Integral
 from typing import Any, TypeVar
 
 import torch
@@ -156,7 +157,7 @@ def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
     pose, half = camera.pose, torch.as_tensor(camera.half_width).detach()
     if not isinstance(pose, Tensor) or pose.shape != (3, 4):
         raise UsageError(f"{owner}camera: expected a pose [3, 4], found {_shape_of(pose)}")
-    if len(camera.size) != 2 or not all(isinstance(n, int) and n > 0 for n in camera.size):
+    if len(camera.size) != 2 or not all(isinstance(n, Integral) and n > 0 for n in camera.size):
         raise UsageError(f"{owner}camera: expected a size (height, width), found {camera.size}")
     if (waits or half.is_cpu) and not 0 < float(half) < math.inf:
         what = "half_width, 1 / (2 focal), must be above 0 and finite"
