@@ -6,38 +6,54 @@ the renderer as a layer. Names are imported when first used, so that `import ddr
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ddrecon.display import Displayed
 
 __version__ = "0.1.0"
 _HOMES = {
-    "load_scene": "ddrecon.scene_file.build",
-    "render": "ddrecon.layer",
-    "fluence": "ddrecon.layer",
-    "VolumeRenderer": "ddrecon.layer",
-    "optimize": "ddrecon.reconstruct.loop",
-    "optimize_sequence": "ddrecon.film.drive",
-    "Result": "ddrecon.reconstruct.loop",
-    "Scene": "ddrecon.scene",
-    "use_engine": "ddrecon.engine",
-    "DdreconError": "ddrecon.errors",
-    "SceneError": "ddrecon.errors",
-    "UsageError": "ddrecon.errors",
-    "FormatError": "ddrecon.errors",
-    "SolveError": "ddrecon.errors",
+    "load_scene": "scene_file.build",
+    "render": "layer",
+    "fluence": "layer",
+    "VolumeRenderer": "layer",
+    "optimize": "reconstruct.loop",
+    "optimize_sequence": "film.drive",
+    "Result": "reconstruct.log",
+    "Scene": "scene",
+    "use_engine": "engine",
+    "DdreconError": "errors",
+    "SceneError": "errors",
+    "UsageError": "errors",
+    "FormatError": "errors",
+    "SolveError": "errors",
 }
 __all__ = ["__version__", *_HOMES]
+
+if TYPE_CHECKING:
+    from ddrecon.engine import use_engine as use_engine
+    from ddrecon.errors import DdreconError as DdreconError
+    from ddrecon.errors import FormatError as FormatError
+    from ddrecon.errors import SceneError as SceneError
+    from ddrecon.errors import SolveError as SolveError
+    from ddrecon.errors import UsageError as UsageError
+    from ddrecon.film.drive import optimize_sequence as optimize_sequence
+    from ddrecon.layer import VolumeRenderer as VolumeRenderer
+    from ddrecon.layer import fluence as fluence
+    from ddrecon.layer import render as render
+    from ddrecon.reconstruct.log import Result as Result
+    from ddrecon.reconstruct.loop import optimize as optimize
+    from ddrecon.scene import Scene as Scene
+    from ddrecon.scene_file.build import load_scene as load_scene
+else:  # where names are unknown to a type checker, they are wrong
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOMES:
+            raise AttributeError(f"module 'ddrecon' has no attribute {name!r}")
+        return getattr(import_module(f"ddrecon.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return __all__
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'ddrecon' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
 
 
 def _draw(record: Any) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
@@ -15,15 +15,15 @@ from torch import Tensor
 from ddrecon import renderer
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.numerics.autodiff import leave_uncompiled, require_plain_autograd
+from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
-from ddrecon.supported import require_above
+from ddrecon.supported import require_above, require_settings
 from ddrecon.variables.values import (
     is_real,
     require_legal,
     require_scene,
-    value_of,
+    shapes_of,
     with_values,
 )
 
@@ -37,13 +37,13 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     Raises UsageError where `require_legal` does.
     """
     _look_at(scene, view)
-    return renderer.render(scene, view, memory)
+    return refuse_batches(renderer.render(scene, view, memory))
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
     """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
     _look_at(scene, None)
-    return renderer.fluence(scene, memory)
+    return refuse_batches(renderer.fluence(scene, memory))
 
 
 def _look_at(scene: Scene, view: str | None) -> None:
@@ -53,6 +53,7 @@ def _look_at(scene: Scene, view: str | None) -> None:
     require_legal(scene, view)
     if scene.volume.density.is_cpu:
         require_above(scene)
+    require_settings(scene)
     scene.settle()
     forget_changed()
 
@@ -90,9 +91,9 @@ class VolumeRenderer(torch.nn.Module):
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
         (`ddrecon.variables`). What is not given is the scene's. Each may have one more axis in
-        front, of n entries; the images then are `[n, views, 3, h, w]`. Raises UsageError for a name
-        the scene does not have, for other shapes, another device, and where `render` does;
-        NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
+        front than it may have else, of n entries; the images then are `[n, views, 3, h, w]`. Raises
+        UsageError for a name the scene does not have, for other shapes, another device, and where
+        `render` does; NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         given = {name: value for name, value in named.items() if value is not None}
@@ -115,14 +116,15 @@ class VolumeRenderer(torch.nn.Module):
                 images.append(render(with_values(self.scene, one), view, self.memories[index]))
             return torch.stack(images) if counts else images[0]
 
+    if TYPE_CHECKING:
+        __call__ = forward  # which torch's own class says nothing of
+
     def _is_batch(self, name: str, value: Tensor) -> bool:
-        """Whether `value` has an axis of entries in front of what the variable `name` has."""
+        """Whether `value` has an axis of entries in front of what the variable `name` may have."""
         if not isinstance(value, Tensor):
             return False
-        if name in ("sigma_a", "sigma_s", "sigma_t", "albedo"):
-            return value.ndim in (2, 5)
-        with torch.no_grad():
-            return value.ndim == value_of(self.scene, name).ndim + 1
+        shapes, shape = shapes_of(self.scene, name), tuple(value.shape)
+        return shape not in shapes and shape[1:] in shapes
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What torch calls to move a module: the scene's tensors are moved as well."""

@@ -9,9 +9,11 @@ several values together.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import MISSING, dataclass, field
+import operator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypedDict, Unpack
 
@@ -23,6 +25,13 @@ See docs/theory.md, section 5.
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
 
+LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
+    "minimum": ("at least", operator.ge),
+    "above": ("above", operator.gt),
+    "maximum": ("at most", operator.le),
+    "below": ("below", operator.lt),
+}
+"""What a bound in a field's metadata means."""
 Violation = tuple[str, str]
 """The key of a record that breaks a rule, and what is wrong with its value."""
 
@@ -48,6 +57,24 @@ def bounded(default: Any = MISSING, **limits: Unpack[Limits]) -> Any:
 def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
     """One of `choices`, `default` where the scene gives none."""
     return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
+
+
+def faults_of(record: Any) -> Iterator[Violation]:
+    """The keys of `record`, made in Python, whose values a scene file could not have, and why."""
+    for part in fields(record):
+        value, known = getattr(record, part.name), part.metadata
+        if value is None and part.default is None:
+            continue
+        if value not in known.get("choices", [value]):
+            words = ", ".join(map(str, known["choices"]))
+            yield part.name, f"expected one of {words}, found {value!r}"
+        for name, (words, is_within) in LIMITS.items():
+            if name not in known:
+                continue
+            if not isinstance(value, Real):
+                yield part.name, f"expected a number, found {value!r}"
+            elif not is_within(value, known[name]):
+                yield part.name, f"must be {words} {known[name]:g}, found {float(value):g}"
 
 
 @dataclass(frozen=True)

@@ -146,6 +146,29 @@ def test_a_batch_is_its_entries_one_by_one() -> None:
         layer(density=densities, g=torch.tensor([0.1, 0.2]))
 
 
+BATCHES = {
+    "density": [((2, *SHAPE), 2), ((1, *SHAPE), 1), (SHAPE, None)],
+    "g": [((2,), 2), ((2, *SHAPE), 2), ((2, 1, *SHAPE), 2), (SHAPE, None), ((1, *SHAPE), None)],
+    "sigma_s": [((3,), None), ((2, 3), 2), ((3, 3), 3), ((2, 3, *SHAPE), 2), ((3, *SHAPE), None)],
+    "albedo": [((1,), None), ((2, 1), 2), ((1, 1, *SHAPE), 1), ((1, *SHAPE), None)],
+    "lights.0.direction": [((3,), None), ((2, 3), 2), ((3, 3), 3)],
+    "views.view.exposure": [((3,), None), ((2, 1), 2)],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "count"), [(name, *case) for name, cases in BATCHES.items() for case in cases]
+)
+def test_one_axis_more_than_a_number_may_have_is_a_batch(
+    name: str, shape: tuple[int, ...], count: int | None
+) -> None:
+    value = 0.3 + 0.1 * random_values(*shape)
+    images = small_layer()(values={name: value})
+    alone = small_layer()(values={name: value if count is None else value[0]})
+    assert images.shape == (alone.shape if count is None else (count, *alone.shape))
+    torch.testing.assert_close(images if count is None else images[0], alone)
+
+
 DOUBLE = {"dtype": torch.float64}
 WRONG = {
     "density": [
@@ -292,7 +315,8 @@ RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         {"pose": torch.eye(4, **DOUBLE)},
         "views.view.camera: expected a pose [3, 4], found [4, 4",
     ),
-    ({}, {"principal_point": [0.5]}, "principal_point: has shape [1]; expected [2]"),
+    ({}, {"principal_point": [0.5]}, "principal_point: must be two finite numbers, found (0.5,)"),
+    ({}, {"principal_point": (0.5, math.nan)}, "principal_point: must be two finite numbers"),
 ]
 
 
@@ -330,6 +354,10 @@ def test_what_torch_cannot_do_is_said() -> None:
     ):
         with pytest.raises(NotImplementedError, match="only first derivatives of light"):
             again()
+    image = layer(density=density)
+    both = torch.stack([image, image]).detach()
+    with pytest.raises(NotImplementedError, match="light has one cotangent a pass"):
+        torch.autograd.grad(image, density, both, is_grads_batched=True)
 
 
 @pytest.mark.slow

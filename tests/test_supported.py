@@ -1,9 +1,11 @@
 """What is not computed together is refused from Python as from a file, in the same words."""
 
+import math
 import re
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
@@ -54,6 +56,29 @@ def test_what_a_file_may_not_say_python_may_not(
             call(scene)
 
 
+SETTINGS = [
+    (
+        "diffusion",
+        {"model": "P1"},
+        "diffusion.model: expected one of none, p1, flux_limited, found",
+    ),
+    ("diffusion", {"degree": 4}, "diffusion.degree: expected one of 1, 3, 5, 7, found 4"),
+    ("diffusion", {"tolerance": math.nan}, "diffusion.tolerance: must be above 0, found nan"),
+    ("diffusion", {"tolerance": "small"}, "diffusion.tolerance: expected a number, found 'small'"),
+    ("render", {"samples_per_pixel": 0}, "render.samples_per_pixel: must be at least 1, found 0"),
+]
+
+
+@pytest.mark.parametrize(("section", "values", "problem"), SETTINGS)
+def test_a_setting_that_no_file_may_have_is_refused(
+    section: str, values: dict[str, Any], problem: str
+) -> None:
+    scene = scene_of({})
+    setattr(scene, section, replace(getattr(scene, section), **values))
+    with pytest.raises(UsageError, match=re.escape(problem)):
+        render(scene)
+
+
 def test_a_camera_below_a_ground_is_refused() -> None:
     scene = scene_of({}, height=-0.7)
     scene.views[0].camera.pose[1, 3] = -0.8
@@ -75,6 +100,6 @@ def test_lists_serve_as_tuples() -> None:
     scene.volume.grid = Grid(*lists, periodic=[])
     scene.views[0].camera = replace(camera, size=list(camera.size), principal_point=[0.5, 0.5])
     assert torch.equal(render(scene), expected)
-    for size in ([2, 3], torch.Size([2, 3])):
+    for size in ([2, 3], torch.Size([2, 3]), np.array([2, 3])):
         scene.views[0].camera.size = size
         assert render(scene).shape[-2:] == (2, 3)

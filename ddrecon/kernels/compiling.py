@@ -55,7 +55,7 @@ def compile_rehearsed(computation: Callable[[], object]) -> None:
     pool = ThreadPoolExecutor(torch.get_num_threads(), "compiling")
     try:
         # Adjoints, which come last, take longest.
-        list(pool.map(lambda each: load(*each, len(kernels)), reversed(kernels)))
+        list(pool.map(lambda one: load(one[0], one[1], len(kernels)), reversed(kernels)))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 

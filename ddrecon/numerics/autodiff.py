@@ -17,6 +17,7 @@ from torch.autograd.graph import saved_tensors_hooks
 from ddrecon.engine import current_engine, use_engine
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def is_varied(tensor: Tensor) -> bool:
@@ -54,7 +55,7 @@ def require_plain_autograd() -> None:
         )
 
 
-def leave_uncompiled(function: Any) -> Any:
+def leave_uncompiled(function: F) -> F:
     """`function`, which torch.compile leaves as it is: what is around it is compiled.
 
     It is what `torch.compiler.disable` does, without importing torch's compiler, which takes two
@@ -64,8 +65,8 @@ def leave_uncompiled(function: Any) -> Any:
     skip = frames._FrameAction.SKIP
     # What it calls is left as it is as well.
     frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(skip, skip))
-    function._torchdynamo_disable = True
-    function._torchdynamo_disable_msg = "light is computed by kernels and solvers of its own"
+    why = "light is computed by kernels and solvers of its own"
+    vars(function).update(_torchdynamo_disable=True, _torchdynamo_disable_msg=why)
     return function
 
 
@@ -137,6 +138,18 @@ def _refuse_graph() -> None:
         raise NotImplementedError(
             "create_graph=True: only first derivatives of light are implemented"
         )
+
+
+def refuse_batches(result: Tensor) -> Tensor:
+    """`result`, whose backward pass raises NotImplementedError for many cotangents at once."""
+
+    def look_at(bar: Tensor) -> None:
+        if "Batched" in str(torch._C._dispatch_keys(bar)):
+            raise NotImplementedError("is_grads_batched, vectorize: light has one cotangent a pass")
+
+    if result.requires_grad:
+        result.register_hook(look_at)
+    return result
 
 
 def recompute(function: Callable[..., T], *arguments: object) -> T:

@@ -21,6 +21,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 MOST_BYTES = 1 << 29
 """So much is kept of all functions together; other results are found again each time."""
+_bytes_kept: dict[Any, int] = {}
+"""What each result takes, by its function's memory and its key in that."""
+_copies: WeakValueDictionary[tuple[int, int], Tensor] = WeakValueDictionary()
+"""Of tensors that results were computed from, by identity and version."""
 _results: WeakValueDictionary[int, Tensor] = WeakValueDictionary()
 """The tensors in results, by identity: nobody changes these."""
 _memories: list[dict[Any, _Kept]] = []
@@ -36,28 +40,35 @@ class _Source(NamedTuple):
 
     @staticmethod
     def of(tensor: Tensor, forget: Callable[[object], None]) -> _Source:
-        copy = None if _results.get(id(tensor)) is tensor else tensor.detach().clone()
-        return _Source(ref(tensor, forget), version_of(tensor), copy)
+        key, copy = (id(tensor), version_of(tensor)), None
+        if _results.get(id(tensor)) is not tensor:
+            copy = _copies.get(key)
+            if copy is None or not _is_same(copy, tensor):
+                copy = _copies[key] = tensor.detach().clone()
+        return _Source(ref(tensor, forget), key[1], copy)
 
     def is_still(self, other: Tensor) -> bool:
-        """Whether `other` is this tensor, unchanged; identities of tensors that went come again.
-
-        Nobody counts changes through NumPy or `.data`, so numbers are compared: of those on a GPU,
-        for which a processor would wait, by `forget_changed`.
-        """
+        """Whether `other` is this tensor, unchanged; identities of tensors that went come again."""
         if self.tensor() is not other or self.version != version_of(other):
             return False
-        if self.copy is None or not other.is_cpu:
-            return True
-        return self.copy.dtype == other.dtype and torch.equal(self.copy, other)
+        return self.copy is None or _is_same(self.copy, other)
+
+
+def _is_same(copy: Tensor, tensor: Tensor) -> bool:
+    """Whether `tensor`, which has its version yet, has the numbers of `copy`.
+
+    Nobody counts changes through NumPy or `.data`. For numbers on a GPU a processor would wait:
+    `forget_changed` looks at these.
+    """
+    is_alike = (copy.is_cpu, copy.dtype) == (tensor.is_cpu, tensor.dtype)
+    return is_alike and (not tensor.is_cpu or torch.equal(copy, tensor))
 
 
 class _Kept(NamedTuple):
-    """A `value`, what it was computed from, and how many bytes both take."""
+    """A `value`, and what it was computed from."""
 
     sources: list[_Source]
     value: Any
-    size: int
 
 
 def remember(function: Callable[P, T]) -> Callable[P, T]:
@@ -77,31 +88,38 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
         found = kept.get(key)
         if found is not None and all(map(_Source.is_still, found.sources, tensors)):
             return found.value
-        kept.pop(key, None)
+        forget(key)
         with torch.inference_mode(False), torch.no_grad():
             value = function(*arguments)  # type: ignore[call-arg]
-            sources = [_Source.of(one, lambda _: kept.pop(key, None)) for one in tensors]
-        size = sum(each.untyped_storage().nbytes() for each in _tensors((value, *sources)))
-        if size + sum(each.size for memory in _memories for each in memory.values()) <= MOST_BYTES:
-            kept[key] = _Kept(sources, value, size)
+            sources = [_Source.of(one, lambda _: forget(key)) for one in tensors]
+        size = sum(each.untyped_storage().nbytes() for each in _tensors(value))
+        if size + sum(_bytes_kept.values()) <= MOST_BYTES:
+            kept[key], _bytes_kept[id(kept), key] = _Kept(sources, value), size
             _results.update((id(each), each) for each in _tensors(value))
         return value
+
+    def forget(key: Any) -> None:
+        kept.pop(key, None)
+        _bytes_kept.pop((id(kept), key), None)
 
     return cast("Callable[P, T]", functools.wraps(function)(recall))
 
 
 def forget_changed() -> None:
     """Forgets all results where a tensor on a GPU has changed by `.data`; that takes one read."""
-    sources = [one for memory in _memories for kept in memory.values() for one in kept.sources]
-    pairs = [
-        (tensor.detach().flatten(), copy.flatten())
-        for tensor, version, copy in ((one.tensor(), *one[1:]) for one in sources)
-        if tensor is not None and tensor.is_cuda and copy is not None
-        if version == version_of(tensor)
-    ]
-    if pairs and not torch.equal(*map(torch.cat, zip(*pairs, strict=True))):
-        for memory in _memories:
-            memory.clear()
+    found = [kept for memory in _memories for kept in [*memory.values()]]  # others may change it
+    pairs: dict[torch.device, list[tuple[Tensor, Tensor]]] = {}
+    for reference, version, copy in (source for kept in found for source in kept.sources):
+        tensor = reference()
+        if tensor is None or copy is None or not tensor.is_cuda or version != version_of(tensor):
+            continue
+        pairs.setdefault(tensor.device, []).append((tensor.detach(), copy))
+    for each in pairs.values():
+        now, then = (torch.cat([one.flatten() for one in side]) for side in zip(*each, strict=True))
+        if not torch.equal(now, then):
+            for memory in _memories:
+                memory.clear()
+            _bytes_kept.clear()
 
 
 def _tensors(value: object) -> Iterator[Tensor]:

@@ -6,7 +6,6 @@ of them it is. Records are told apart by their `type`, others by their first key
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache, reduce
@@ -17,20 +16,13 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 
 from ddrecon.errors import Problems, suggestion
 from ddrecon.scene_file.nodes import Node, describe_found
-from ddrecon.settings import FieldFile
+from ddrecon.settings import LIMITS, FieldFile
 
 R = TypeVar("R")
 type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 
 LARGEST = 3e38
 """The largest magnitude that single precision holds, roughly."""
-LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
-    "minimum": ("at least", operator.ge),
-    "above": ("above", operator.gt),
-    "maximum": ("at most", operator.le),
-    "below": ("below", operator.lt),
-}
-"""What a bound in a field's metadata means."""
 WORDS = {
     float: "a number",
     int: "a whole number",

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from numbers import Integral
 from typing import Any, TypeVar
 
 import torch
@@ -143,30 +144,33 @@ def require_legal(scene: Scene, view: str | None = None, *, waits: bool = False)
     if scene.ground is not None:
         numbers["ground.albedo"] = scene.ground.albedo
     for item in scene.views if view is None else [scene.view(view)]:
-        numbers |= _view_numbers(item)
+        numbers |= _view_numbers(item, waits)
     for name, value in numbers.items():
         require_form(name, value, value, density, cells)
         if waits or value.is_cpu:
             require_range(name, value)
 
 
-def _view_numbers(view: View) -> dict[str, Tensor]:
+def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
     """What is varied of `view`, by name; raises UsageError where the rest of it is none."""
     owner, camera, behind = f"views.{view.name}.", view.camera, view.background
-    pose, half = camera.pose, camera.half_width
-    is_seen = not isinstance(half, Tensor) or half.is_cpu
+    pose, half = camera.pose, torch.as_tensor(camera.half_width).detach()
     if not isinstance(pose, Tensor) or pose.shape != (3, 4):
         raise UsageError(f"{owner}camera: expected a pose [3, 4], found {_shape_of(pose)}")
-    if len(camera.size) != 2 or not all(isinstance(n, int) and n > 0 for n in camera.size):
+    if len(camera.size) != 2 or not all(isinstance(n, Integral) and n > 0 for n in camera.size):
         raise UsageError(f"{owner}camera: expected a size (height, width), found {camera.size}")
-    if is_seen and not 0 < float(half) < math.inf:
+    if (waits or half.is_cpu) and not 0 < float(half) < math.inf:
         what = "half_width, 1 / (2 focal), must be above 0 and finite"
         raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
-    if behind is not None and behind.is_cpu and not bool(behind.isfinite().all()):
+    if behind is not None and (waits or behind.is_cpu) and not bool(behind.isfinite().all()):
         raise UsageError(f"{owner}background: must be finite")
+    middle = camera.principal_point
+    if not isinstance(middle, Tensor) and (len(middle) != 2 or not all(map(math.isfinite, middle))):
+        what = "must be two finite numbers"
+        raise UsageError(f"{owner}principal_point: {what}, found {middle}")
     parts = {part: getattr(view, part) for part in RESPONSE}
     parts |= {"camera": pose, "distortion": camera.distortion}
-    parts["principal_point"] = _view_value(view, "principal_point")
+    parts["principal_point"] = middle if isinstance(middle, Tensor) else None
     return {owner + part: value for part, value in parts.items() if value is not None}
 
 
@@ -233,6 +237,13 @@ def require_range(name: str, value: Tensor) -> None:
         raise UsageError(f"{name}: must be {bounds}, {found}")
     if kind.is_direction and least == most == 0:
         raise UsageError(f"{name}: must not be zero")
+
+
+def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
+    """Those that the variable `name` of `scene` may have; raises as `value_of`."""
+    is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
+    now = () if is_pair else tuple(value_of(scene, name).shape)
+    return _shapes(_own_name(scene.volume, name), now, scene.volume.grid.shape)
 
 
 def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tuple[int, ...]]:

@@ -11,9 +11,9 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
+from ddrecon import defaults
 from ddrecon.errors import SceneError
 from ddrecon.io.volumes.table import write_field, write_fields
-from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
 
 Write = Callable[[str], Path]
@@ -86,7 +86,7 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
 def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(
     write: Write, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(build, "MOST_CELLS", 300)
+    monkeypatch.setattr(defaults, "MOST_CELLS", 300)
     bounds = {"min": [0, 0, 0], "max": [9, 1, 9]}
     scene = load_scene(write(volume(bounds=bounds, resolution=[9, 3, 3], density=50)))
     assert "refine 3, refine_along y: " in scene.reason
