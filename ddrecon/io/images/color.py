@@ -39,12 +39,15 @@ class Encoding(NamedTuple):
     has_srgb_primaries: bool
 
 
-def has_linear_samples(path: Path, picture: Any) -> bool:
-    """Whether samples of `picture`, by Pillow from `path`, are linear; else they are sRGB's.
+def has_linear_samples(path: Path) -> bool:
+    """Whether samples of the PNG, JPEG or WebP image at `path` are linear; else they are sRGB's.
 
     Raises FormatError for other curves; warns of other primaries.
     """
-    found = _find_encoding(path, picture)
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        found = _find_encoding(path, picture)
     if found.is_linear is None:
         what = "another curve than sRGB's; convert it to sRGB, or save it linear as .exr"
         raise FormatError(path, f"its {found.source} says that it is encoded by {what}")
@@ -116,8 +119,8 @@ def doubt_primaries(path: Path, source: str) -> None:
 def doubt_orientation(path: Path, orientation: int) -> None:
     """Warns where viewers turn a picture of this EXIF `orientation`."""
     if orientation not in (0, TOP_LEFT):
-        what = f"EXIF orientation {orientation}: viewers turn such pictures, here they are taken as"
-        _doubt(path, f"{what} stored; cameras must belong to them so")
+        what = f"EXIF orientation {orientation} is not applied; cameras must be those of pictures"
+        _doubt(path, f"{what} as they are stored, not as viewers turn them")
 
 
 def _doubt(path: Path, what: str) -> None:

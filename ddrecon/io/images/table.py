@@ -49,6 +49,8 @@ SECONDS = 4.0
 COLORS = ("LA", "RGB", "RGBA")
 MODES = ("1", "L", "P", "I", "I;16", *COLORS)
 """Pillow's modes that are read: in PNG, I is 16 bits."""
+SPREAD = {"1": 255, "L;2": 85, "L;4": 17}
+"""By what Pillow spreads samples of few bits over 8, but not always the one that is transparent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +83,17 @@ def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
         if path.suffix.lower() == ".npy":
             what = f"holds whole numbers ({stored.dtype}), not radiance"
             raise FormatError(path, f"{what}; save it as float32, or 8 bits of sRGB as .png")
+        if path.suffix.lower() not in FILMS and has_linear_samples(path):
+            return _image_of(path, _decode(stored, np.asarray))
         return _image_of(path, _decode(stored), 1 / np.iinfo(stored.dtype).max)
 
 
 def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
     """The mask at `path`: 1 where it is more than half white and half opaque, else 0.
 
-    Half is meant as stored: what lossy files leave around edges does not count. Arrays and PNGs
-    may have whole numbers 0 and 1. Raises FormatError where it is dark, but not black.
+    Half is meant as stored, by whatever curve: what lossy files leave around edges does not count.
+    Arrays and PNGs may have whole numbers 0 and 1. Raises FormatError where it is dark, but not
+    black.
     """
     suffix = path.suffix.lower()
     with guard_reading(path):
@@ -106,7 +111,7 @@ def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
 
 
 def _read_stored(path: Path, frame: int, time: float) -> np.ndarray:
-    """Linear values as floats, or whole numbers that sRGB encodes."""
+    """Linear values as floats, or whole numbers as the file has them."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         known = ", ".join(READERS)
@@ -194,7 +199,7 @@ def _read_array(path: Path) -> np.ndarray:
 
 
 def _read_encoded(path: Path) -> np.ndarray:
-    """The values as stored: 8 or 16 bits of sRGB; floats where they are linear."""
+    """The values as stored, of 8 or 16 bits."""
     from PIL import Image as Pillow
 
     with path.open("rb") as stream:
@@ -206,7 +211,6 @@ def _read_encoded(path: Path) -> np.ndarray:
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
         if mode not in MODES:
             raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
-        is_encoded = not has_linear_samples(path, picture)
         if "16B" in str(picture.tile) and mode in COLORS:  # which Pillow reads as 8 bits
             picture.verify()  # of its checksums libpng would tell stderr as well
             with opened(path, "PNG") as (file, _):
@@ -215,22 +219,22 @@ def _read_encoded(path: Path) -> np.ndarray:
             stored = _samples_of(picture)
         # Other ways to ask for EXIF would decode a PNG for it.
         doubt_orientation(path, Pillow.Image.getexif(picture).get(ORIENTATION, TOP_LEFT))
-    return stored if is_encoded else _decode(stored, np.asarray)
+    return stored
 
 
 def _samples_of(picture: Any) -> np.ndarray:
     """uint8 or uint16 [h, w] or [h, w, c]: colors of palettes, and what is said to be transparent
     with an alpha of 0.
     """
-    clear, packing = picture.info.get("transparency"), str(picture.tile)
+    clear, packing = picture.info.get("transparency"), str(picture.tile and picture.tile[0][3])
     if picture.mode in ("P", "RGB"):
         return np.asarray(picture.convert("RGB" if clear is None else "RGBA"))
     samples = np.asarray(picture.convert("L") if picture.mode == "1" else picture)
     samples = samples.astype(np.uint16) if picture.mode.startswith("I") else samples
     if clear is None:
         return samples
-    # Pillow spreads samples of 2 and 4 bits over 8, but not the one that is transparent.
-    clear *= 85 if "L;2" in packing else 17 if "L;4" in packing else 1
+    spread = SPREAD.get(packing, 1)
+    clear = clear * spread if clear <= 255 // spread else clear
     alpha = np.where(samples == clear, 0, np.iinfo(samples.dtype).max)
     return np.stack([samples, alpha.astype(samples.dtype)], axis=2)
 

@@ -223,9 +223,12 @@ def test_a_mask_is_the_same_in_every_format(tmp_path: Path, suffix: str, mode: s
 
 
 def test_a_mask_counts_from_half_on_as_stored(tmp_path: Path):
+    """Whatever curve it names."""
     stored = [[127, 0, 0, 255], [128, 0, 0, 255], [255, 255, 255, 127], [255, 255, 255, 128]]
     iio.imwrite(tmp_path / "m.png", np.array([stored], np.uint8))
     assert read_mask(tmp_path / "m.png").pixels[0, :, 0].tolist() == [0, 1, 0, 1]
+    write_png(tmp_path / "n.png", np.array([[[127], [128]]]), 8, 0, gAMA=bytes([0, 0, 200, 0]))
+    assert read_mask(tmp_path / "n.png").pixels[0, :, 0].tolist() == [0, 1]
     np.save(tmp_path / "m.npy", np.array([[0.49, 0.51, 7, -1]]))
     assert read_mask(tmp_path / "m.npy").pixels[0, :, 0].tolist() == [0, 1, 1, 0]
 
