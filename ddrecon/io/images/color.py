@@ -49,8 +49,8 @@ def has_linear_samples(path: Path) -> bool:
     with Image.open(path) as picture:
         found = _find_encoding(path, picture)
     if found.is_linear is None:
-        what = "another curve than sRGB's; convert it to sRGB, or save it linear as .exr"
-        raise FormatError(path, f"its {found.source} says that it is encoded by {what}")
+        what = f"is encoded by another curve than sRGB's, by its {found.source}"
+        raise FormatError(path, f"{what}; convert it to sRGB, or save it linear as .exr")
     if not found.has_srgb_primaries:
         doubt_primaries(path, found.source)
     return found.is_linear
@@ -73,7 +73,7 @@ def _find_encoding(path: Path, picture: Any) -> Encoding:
         return Encoding("sRGB", False, True)
     with suppress(KeyError):  # there is no such part of EXIF
         if picture.format != "PNG" and picture.getexif().get_ifd(INTEROPERABILITY)[1] == "R03":
-            return Encoding("EXIF, R03 for Adobe RGB,", None, False)
+            return Encoding("EXIF (R03, Adobe RGB)", None, False)
     gamma = info.get("gamma", GAMMAS_SRGB[0])
     if gamma != 1 and min(abs(gamma - known) for known in GAMMAS_SRGB) > 0.01:
         return Encoding(f"gAMA {gamma:g}", None, False)
@@ -85,19 +85,18 @@ def read_profile(profile: bytes) -> Encoding:
     """What an ICC `profile` says, by the colors that it makes of grays and of `MUTED` ones."""
     from PIL import Image, ImageCms
 
-    read = ImageCms.ImageCmsProfile(io.BytesIO(profile))
     grays = np.arange(256, dtype=np.uint8)
     colors = np.array([*zip(grays, grays, grays, strict=True), *MUTED], np.uint8)
-    is_gray = read.profile.xcolor_space.strip() == "GRAY"
-    shown = ImageCms.profileToProfile(
-        Image.fromarray((grays if is_gray else colors)[None]),
-        read,
-        ImageCms.createProfile("sRGB"),
-        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-        outputMode="RGB",
-    )
+    target, intent = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+    try:
+        read = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        is_gray = read.profile.xcolor_space.strip() == "GRAY"
+        stored = Image.fromarray((grays if is_gray else colors)[None])
+        shown = ImageCms.profileToProfile(stored, read, target, intent, outputMode="RGB")
+        source = f"color profile {ImageCms.getProfileDescription(read).strip()!r}"
+    except (OSError, ImageCms.PyCMSError):
+        return Encoding("color profile, which is damaged or of other colors", None, False)
     values = np.asarray(shown, int)[0]
-    source = f"color profile {ImageCms.getProfileDescription(read).strip()!r}"
     for is_linear, expected in ((False, colors), (True, srgb.encode_bytes(colors / 255))):
         is_near = (abs(values - expected[: len(values)]) <= NEAR).all(axis=1)
         if is_near[:256].all():
@@ -118,7 +117,7 @@ def doubt_primaries(path: Path, source: str) -> None:
 
 def doubt_orientation(path: Path, orientation: int) -> None:
     """Warns where viewers turn a picture of this EXIF `orientation`."""
-    if orientation not in (0, TOP_LEFT):
+    if orientation in range(2, 9):
         what = f"EXIF orientation {orientation} is not applied; cameras must be those of pictures"
         _doubt(path, f"{what} as they are stored, not as viewers turn them")
 

@@ -62,6 +62,7 @@ REFUSED = {
     "video range": ({"cICP": bytes([1, 13, 0, 0])}, "cICP 1/13/0/0"),
     "an old Mac": ({"gAMA": gama(1 / 1.8)}, "gAMA 0.55556"),
     "Adobe RGB": ({"iCCP": iccp(icc_profile(2.2)), "sRGB": b"\0"}, "color profile 'sRGB built-in'"),
+    "a profile of no colors": ({"iCCP": iccp(b"nothing" * 40)}, "color profile, which is damaged"),
     "PQ before sRGB": ({"cICP": bytes([9, 16, 0, 1]), "sRGB": b"\0"}, "cICP 9/16/0/1"),
 }
 
@@ -89,7 +90,7 @@ def test_the_curve_that_a_png_names_is_the_one_that_decodes_it(
 def test_other_curves_are_refused_by_name(tmp_path: Path, case: str) -> None:
     chunks, named = REFUSED[case]
     path = write_png(tmp_path / "a.png", np.full((2, 2, 3), 128), **chunks)
-    assert f"its {named} says that it is encoded by another curve" in image_refusal(path)
+    assert f"is encoded by another curve than sRGB's, by its {named}" in image_refusal(path)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".png"])
@@ -174,7 +175,7 @@ def test_a_camera_that_says_adobe_rgb_by_exif_alone_is_refused(tmp_path: Path) -
     exif = Pillow.Exif()
     exif[0x8769] = {0xA001: 65535, 0xA005: {1: "R03"}}
     Pillow.new("RGB", (16, 16)).save(tmp_path / "a.jpg", exif=exif)
-    assert "R03 for Adobe RGB" in image_refusal(tmp_path / "a.jpg")
+    assert "by its EXIF (R03, Adobe RGB);" in image_refusal(tmp_path / "a.jpg")
 
 
 @pytest.mark.parametrize(
