@@ -27,6 +27,8 @@ ORIENTATION, INTEROPERABILITY = 0x112, 0xA005
 TOP_LEFT = 1
 MUTED = ((200, 100, 100), (100, 200, 100), (100, 100, 200))
 """Colors within every gamut: those at its corners would be clipped."""
+UNABRIDGED: Any = 0x100
+"""To LittleCMS: no tables in place of curves, which are coarse in the dark."""
 NEAR = 3
 """Of 255, how far a profile's colors may be off. A gamma of 2.2 is off by 9 from sRGB."""
 
@@ -92,7 +94,7 @@ def read_profile(profile: bytes) -> Encoding:
         read = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         is_gray = read.profile.xcolor_space.strip() == "GRAY"
         stored = Image.fromarray((grays if is_gray else colors)[None])
-        shown = ImageCms.profileToProfile(stored, read, target, intent, outputMode="RGB")
+        shown = ImageCms.profileToProfile(stored, read, target, intent, "RGB", flags=UNABRIDGED)
         source = f"color profile {ImageCms.getProfileDescription(read).strip()!r}"
     except (OSError, ImageCms.PyCMSError):
         return Encoding("color profile, which is damaged or of other colors", None, False)

@@ -108,19 +108,19 @@ def test_a_profile_counts_in_every_format(tmp_path: Path, suffix: str) -> None:
         assert np.array_equal(read_image(wide).pixels, expected)
 
 
-def test_a_gray_profile_counts(tmp_path: Path) -> None:
-    """What has one curve for gray, of a gamma that is no sRGB's."""
-    head = bytearray(icc_profile()[:128])
-    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(1.8 * 256)) + b"\0\0"
-    white = b"XYZ \0\0\0\0" + struct.pack(
-        ">3i", *(round(each * 2**16) for each in (0.9642, 1, 0.8249))
-    )
+@pytest.mark.parametrize("gamma", [1.0, 1.8])
+def test_a_gray_profile_counts(tmp_path: Path, gamma: float) -> None:
+    """It has a white and one curve, a gamma, which is linear or another than sRGB's."""
+    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + b"\0\0"
+    white = b"XYZ \0\0\0\0" + struct.pack(">3i", 63190, 65536, 54061)  # of D50, in 1/65536
     table = struct.pack(">I4sII4sII", 2, b"kTRC", 156, 14, b"wtpt", 172, 20)
-    head[16:20] = b"GRAY"
-    profile = bytes(head) + table + curve + white
-    profile = struct.pack(">I", len(profile)) + profile[4:]
+    head = icc_profile()[4:128].replace(b"RGB ", b"GRAY")
+    profile = struct.pack(">I", 192) + head + table + curve + white
     Pillow.new("L", (4, 4), 99).save(tmp_path / "a.png", icc_profile=profile)
-    assert "color profile" in image_refusal(tmp_path / "a.png")
+    if gamma == 1:
+        assert np.allclose(read_silently(tmp_path / "a.png").pixels, 99 / 255)
+    else:
+        assert "color profile" in image_refusal(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("said", [{"cHRM": chrm(DISPLAY_P3)}, {"cICP": bytes([12, 13, 0, 1])}])
