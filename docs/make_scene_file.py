@@ -282,7 +282,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg, .webp and "
                 "films (.mp4, .mov, .mkv, .webm) are decoded from sRGB; alpha 0 is empty."
             ),
-            "mask": "A picture of the same size, black where pixels are ignored.",
+            "mask": "A picture of the same size, white where pixels count, else black.",
             "frame": (
                 "Of a film, which frame is taken, counted from 0. With `frames`, the one that the "
                 "scene's frame 0 is."
