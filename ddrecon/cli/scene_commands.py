@@ -18,9 +18,11 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 from ddrecon.errors import DataWarning, UsageError
+from ddrecon.run.result import RESULT
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.scene_file.load import SceneFile
 
 
 EXPORTED = click.Choice(["vdb", "vti", "npz"])
@@ -147,7 +149,7 @@ def _render(
     session: Session, scene: Path, output: Path, choice: _Choice
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
-    kinds = [kind for kind in ("npz", choice.exported) if kind and choice.has_fluence]
+    kinds = sorted({"npz", choice.exported or "npz"}) if choice.has_fluence else []
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -161,7 +163,7 @@ def _render(
     )
 
     loaded = session.build(scene_file)
-    if choice.has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+    if choice.has_fluence and not _are_rounds_said(session, scene_file):
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
@@ -182,6 +184,15 @@ def _render(
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
     return report, render_lines(report, output)
+
+
+def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
+    """Whether a user said how many transport rounds there are, of a result in the run's scene."""
+    of_run = scene_file.path.with_name("scene.yaml")
+    if scene_file.path.name == RESULT and of_run.is_file():
+        said = tuple(each for each in session.overrides if each.startswith("diffusion"))
+        scene_file = replace(session, overrides=said).read(of_run)
+    return scene_file.tree.diffusion.transport_rounds is not None
 
 
 @click.command()
