@@ -110,8 +110,8 @@ def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float
     if not moves:
         return None
     return (
-        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels', abs)}; check "
-        "poses and intrinsics, or optimize the poses (views.NAME.camera)"
+        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels', abs)}; "
+        "check poses and intrinsics, or optimize the poses (views.NAME.camera)"
     )
 
 
