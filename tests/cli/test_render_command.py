@@ -130,6 +130,23 @@ def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run, o
         np.testing.assert_allclose(fluence(*options), (one, two)[rounds - 1].numpy(), rtol=1e-4)
 
 
+REST = [("1", "null", "what diffusion alone lacks"), ("16", "0.01", "at rest")]
+REST += [("2", "0.1", "at rest"), ("2", "1e-6", "not at rest"), ("3", "null", "at rest")]
+
+
+@pytest.mark.parametrize(("rounds", "tolerance", "verdict"), REST)
+def test_it_is_said_whether_light_has_come_to_rest(
+    succeed: Run, rounds: str, tolerance: str, verdict: str
+) -> None:
+    said = "-D", f"diffusion={{transport_rounds: {rounds}, transport_tolerance: {tolerance}}}"
+    out = succeed(*RENDER, "--view", "side", *said).stdout
+    report = json.loads(Path("out/render.json").read_text())["rounds"]
+    changed = f"changed light by {100 * report['residual']:.2g} %: {verdict}"
+    assert f"transport rounds: {report['count']}, the last {changed}" in out
+    least = 0.01 if tolerance == "null" else float(tolerance)
+    assert (report["residual"] < least) == (verdict == "at rest")
+
+
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
     assert set(record["enters"]) == {"lights.0", "lights.1"}
