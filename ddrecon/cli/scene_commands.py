@@ -115,7 +115,8 @@ def render(
     if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
-        session = session.with_override(f"lights=[{', '.join(lights)}]")
+        typed = " ".join(f"--light {light}" for light in lights)
+        session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
     if not (scene / "frames").is_dir():
         if part is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
@@ -242,7 +243,8 @@ def optimize(
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
     if iterations is not None:
-        session = session.with_override(f"optimize.iterations={iterations}")
+        typed = f"--iterations {iterations}"
+        session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
     from ddrecon.ranks import alone, from_first, is_first
 

@@ -8,8 +8,8 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,7 @@ class Session:
     report: Path | None = None
     share: str = "views"
     place: torch.device | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def start(self) -> torch.device:
         """Sets torch and the engine up as the options say; the device to compute on.
@@ -100,9 +101,10 @@ class Session:
         """Whether no progress is shown; of several ranks the first alone shows it."""
         return self.quiet or not is_first()
 
-    def with_override(self, override: str) -> Session:
-        """The same session with one more override of the scene file."""
-        return replace(self, overrides=(*self.overrides, override))
+    def with_override(self, override: str, option: str) -> Session:
+        """The same session with one more override of the scene file, which an `option` says."""
+        options = {**self.options, override: option}
+        return replace(self, overrides=(*self.overrides, override), options=options)
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
@@ -111,7 +113,8 @@ class Session:
                 f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; "
                 "name a scene file, or finish the run with --resume"
             )
-        return read_scene(path / RESULT if os.path.isdir(path) else path, self.overrides)
+        file = path / RESULT if os.path.isdir(path) else path
+        return read_scene(file, self.overrides, self.options)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.

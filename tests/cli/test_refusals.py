@@ -31,11 +31,11 @@ optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for 
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
 render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range x>=2
-render scene.yaml -o out --light '{type: sun}' => 2 -D lights=[{type: sun}]: lights.0.type: expected
+render scene.yaml -o out --light '{type: sun}' => 2 --light {type: sun}: lights.0.type: expected
 render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
-optimize scene.yaml -o out --iterations 0 => 2 -D optimize.iterations=0: optimize.iterations: must
-optimize scene.yaml -o out --iterations some => 2 -D optimize.iterations=some: optimize.iterations:
+optimize scene.yaml -o out --iterations 0 => 2 --iterations 0: optimize.iterations: must
+optimize scene.yaml -o out --iterations some => 2 --iterations some: optimize.iterations:
 optimize scene.yaml -o out --watch --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and

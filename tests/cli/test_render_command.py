@@ -147,6 +147,15 @@ def test_it_is_said_whether_light_has_come_to_rest(
     assert (report["residual"] < least) == (verdict == "at rest")
 
 
+def test_a_run_is_relit_by_a_picture_in_the_current_folder(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
+    np.save("sky.npy", np.ones((4, 8, 3), np.float32))
+    sky, ambient = "{type: environment, file: sky.npy}", "{type: ambient, radiance: 1}"
+    for name, light in (("sky", sky), ("ambient", ambient)):
+        succeed("render", "run", "-o", name, "-q", "--view", "front", "--light", light)
+    np.testing.assert_allclose(np.load("sky/front.npy"), np.load("ambient/front.npy"), rtol=1e-3)
+
+
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
     assert set(record["enters"]) == {"lights.0", "lights.1"}
