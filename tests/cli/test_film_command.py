@@ -64,7 +64,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     z, y, x = np.mgrid[-0.44:0.44:8j, -0.44:0.44:8j, -0.44:0.44:8j]
     for name in VIEWS:
         np.save(folder / f"{name}_00.npy", np.ones((12, 12, 3), np.float32))
-    overrides = ["volume.density={file: ball.npz}", "lights.0.irradiance=3"]
+    overrides = [f"volume.density={{file: {folder}/ball.npz}}", "lights.0.irradiance=3"]
     for number in reversed(range(FRAMES)):
         ball = np.exp(-(z**2 + (y + 0.1 - 0.05 * number) ** 2 + x**2) / 0.05)
         write_field(folder / "ball.npz", "density", ball, np.array([[-0.5] * 3, [0.5] * 3]))
