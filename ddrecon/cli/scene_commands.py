@@ -18,7 +18,7 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.run.result import RESULT
+from ddrecon.run.result import RESULT, require_no_film
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -242,6 +242,12 @@ def optimize(
     exported: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
+    of_run = (scene.parent if scene.name == RESULT else scene) / "scene.yaml"
+    if of_run.is_file() and of_run.with_name(RESULT).is_file():
+        raise UsageError(
+            f"{scene}: a finished run leaves nothing to optimize; name its scene, {of_run}, "
+            "and another folder or --resume --iterations N"
+        )
     if iterations is not None:
         typed = f"--iterations {iterations}"
         session = session.with_override(f"optimize.iterations={iterations}", typed)
@@ -339,7 +345,8 @@ def uncertainty(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
-    from ddrecon.run.run_folder import load_run
+    from ddrecon.run.checkpoint import require_checkpoint
+    from ddrecon.run.run_folder import CHECKPOINTS, load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
@@ -347,6 +354,9 @@ def uncertainty(
         warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
+    require_no_film(run)
+    if resume:
+        require_checkpoint(output / CHECKPOINTS)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):
         raise UsageError(

@@ -22,7 +22,7 @@ from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
-from ddrecon.run.result import RESULT
+from ddrecon.run.result import RESULT, require_no_film
 from ddrecon.scene_file.load import SceneFile, read_scene
 
 if TYPE_CHECKING:
@@ -109,9 +109,11 @@ class Session:
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
         if os.path.isdir(path) and not (path / RESULT).is_file():
+            require_no_film(path)
+            is_run = (path / "scene.yaml").is_file() and (path / "loss.csv").is_file()
+            advice = "finish the run with --resume" if is_run else "name a scene file"
             raise UsageError(
-                f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; "
-                "name a scene file, or finish the run with --resume"
+                f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; {advice}"
             )
         file = path / RESULT if os.path.isdir(path) else path
         return read_scene(file, self.overrides, self.options)

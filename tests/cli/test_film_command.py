@@ -392,6 +392,11 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     for command, line in (("optimize", "is for films"), ("render", "is for the folders of films")):
         single = run(command, "scene.yaml", "-o", "single", "--frames", "0:1")
         assert single.exit_code == 2 and f"--frames {line}" in single.stderr
+    refused = run("export", "out", "-o", "out.vdb")
+    (advice,) = re.findall("`ddrecon (.*)`", refused.stderr)
+    assert refused.exit_code == 2
+    succeed(*advice.split(), "-q", "--frames", "0:0")
+    assert Path("out/sequence/film_0000.vdb").is_file()
     beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
     assert beyond.exit_code == 2 and "no such frame is done" in beyond.stderr
 
