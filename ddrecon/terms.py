@@ -88,21 +88,22 @@ def _color_term(scene: Scene) -> str:
     """How many color channels there are, and what has as many."""
     volume, ground = scene.volume, scene.ground
     lights = [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS]
-    values = {
-        "the medium": [volume.sigma_a, volume.sigma_s],
-        "what glows": [volume.emission, volume.black_body],
-        "lights": [value for value in lights if value.ndim],
-        "the ground": [None if ground is None else ground.albedo],
-        "views": [v for each in scene.views for v in (each.exposure, each.offset, each.background)],
+    views = [v for each in scene.views for v in (each.exposure, each.offset, each.background)]
+    colors = {
+        "the medium": _count_colors(volume.sigma_a, volume.sigma_s),
+        "the phase function": volume.phase.colors,
+        "what glows": _count_colors(volume.emission, volume.black_body),
+        "lights": _count_colors(*lights),
+        "the ground": _count_colors(None if ground is None else ground.albedo),
+        "views": _count_colors(*views),
     }
-    colored = [
-        name for name, some in values.items() if any(x is not None and len(x) > 1 for x in some)
-    ]
-    if volume.phase.colors > 1:
-        colored.insert(0, "the phase function")
-    return (
-        f"3 color channels ({', '.join(colored)})" if colored else "1 color channel (all is gray)"
-    )
+    colored = ", ".join(name for name, count in colors.items() if count > 1)
+    return f"3 color channels ({colored})" if colored else "1 color channel (all is gray)"
+
+
+def _count_colors(*values: Tensor | None) -> int:
+    """Of `values` [C, ...], numbers and Nones the largest C, or 1."""
+    return max((len(value) for value in values if value is not None and value.ndim), default=1)
 
 
 def _face_terms(index: float) -> list[str]:

@@ -156,7 +156,8 @@ def pick_color(scene: Scene, color: int) -> Scene:
     lights = []
     for light in scene.lights:
         colors = {k: v for k, v in vars(light).items() if k in BRIGHTNESS and v.ndim}
-        lights.append(replace(light, **{name: _pick(v, color) for name, v in colors.items()}))
+        picked: Any = {name: _pick(value, color) for name, value in colors.items()}
+        lights.append(replace(light, **picked))
     ground = scene.ground
     if ground is not None:
         ground = replace(ground, albedo=_pick(ground.albedo, color))
