@@ -18,7 +18,6 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.run.result import RESULT, require_no_film
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -189,6 +188,8 @@ def _render(
 
 def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
     """Whether a user said how many transport rounds there are, of a result in the run's scene."""
+    from ddrecon.run.result import RESULT
+
     of_run = scene_file.path.with_name("scene.yaml")
     if scene_file.path.name == RESULT and of_run.is_file():
         said = tuple(each for each in session.overrides if each.startswith("diffusion"))
@@ -242,6 +243,8 @@ def optimize(
     exported: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
+    from ddrecon.run.result import RESULT
+
     of_run = (scene.parent if scene.name == RESULT else scene) / "scene.yaml"
     if of_run.is_file() and of_run.with_name(RESULT).is_file():
         raise UsageError(
@@ -346,6 +349,7 @@ def uncertainty(
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
     from ddrecon.run.checkpoint import require_checkpoint
+    from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import CHECKPOINTS, load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
