@@ -33,7 +33,7 @@ Every key, with what it takes, its limits and its default, made from the program
 - Vectors are x, y, z.
 - Lengths are in a world unit u of your choice.
 - `1e-3` is a number.
-- Paths are relative to the scene file.
+- Paths are relative to the scene file; those of `-D` and `--light` to the current folder.
 - Three equal colors are rendered as one, unless they are optimized.
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
