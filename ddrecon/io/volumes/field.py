@@ -28,11 +28,13 @@ SIGNED = ("g", *VECTORS)
 class Field:
     """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0, in a box.
 
-    `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them.
+    `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
+    `unit` is that of the values, as it spells it.
     """
 
     values: np.ndarray
     bounds: np.ndarray | None = None
+    unit: str = ""
 
     @property
     def resolution(self) -> tuple[int, int, int]:
