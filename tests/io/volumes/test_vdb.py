@@ -82,6 +82,25 @@ def test_fields_of_a_file_are_read_by_name(tmp_path: Path) -> None:
         read_field(path, "lwc")
 
 
+@pytest.mark.parametrize("colors", [(), (3,)])
+def test_a_haze_is_not_written(tmp_path: Path, colors: tuple[int, ...]) -> None:
+    """Below a ten thousandth of the largest, of either sign: a sequence stays sparse."""
+    rng = np.random.default_rng(0)
+    haze = (
+        rng.uniform(-1, 1, (20, 20, 20, *colors))
+        * 10.0 ** rng.uniform(-19, -4, (20, 20, 20))[(...,) + (None,) * len(colors)]
+    )
+    smoke = 4 * haze
+    smoke[8:12, 8:12, 8:12] = rng.uniform(0.001, 4, (4, 4, 4, *colors))
+    smoke[9, 9, 9] = 4
+    path = written(tmp_path / "smoke.vdb", velocity=smoke)
+    kept = np.zeros_like(smoke)
+    kept[8:12, 8:12, 8:12] = smoke[8:12, 8:12, 8:12]
+    assert np.array_equal(read_field(path, "velocity").values, kept.astype(np.float32))
+    counts = openvdb_python.described("[g.activeVoxelCount() for g in grids.values()]", path)
+    assert counts == [64]
+
+
 AGAIN = """
 import sys
 try: import openvdb as vdb
