@@ -205,7 +205,9 @@ def read_quantity(
 ) -> Field:
     """The quantity `name`, which the file has as `called`, in this `unit`; raises FormatError."""
     field, kind = read_field(path, called), kind_of(name)
-    if unit and field.unit:
+    if unit and field.unit == "":
+        warnings.warn(f"{path}: {called} says no unit; taken in {unit[0]}", DataWarning, 2)
+    elif unit and field.unit:
         size = size_of(field.unit, unit[1])
         if size is None:
             raise FormatError(path, f"{called} is in {field.unit}, not {unit[0]}; convert it first")

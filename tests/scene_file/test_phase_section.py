@@ -173,6 +173,9 @@ def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None
         assert own.sigma_s.item() == pytest.approx(1500 / size)
 
 
+UNITS = {"density": "g/m3", "effective_radius": "um", "temperature": "K"}
+
+
 def water_of_file(path: Path, **units: str) -> str:
     """A scene of droplets: density 2 and radius 1 in these units, heat 300, from a netCDF file."""
     netcdf = pytest.importorskip("netCDF4", reason="needs the extra `netcdf`")
@@ -182,7 +185,7 @@ def water_of_file(path: Path, **units: str) -> str:
             file.createDimension(axis, count)
         for name, value in known.items():
             file.createVariable(name, "f4", tuple("zyx"))[:] = value
-            file.variables[name].units = units.get(name, "")
+            file.variables[name].units = (UNITS | units)[name]
     volume = {name: VOLUME[name] for name in ("bounds", "resolution")}
     volume |= {"sigma_t": {"meters": 1000}, "albedo": 1} | {n: {"file": path.name} for n in known}
     droplets = {"type": "mie", "wavelength": 0.67, "refractive_index": 1.33}
@@ -193,7 +196,7 @@ def water_of_file(path: Path, **units: str) -> str:
     ("units", "expected"),
     [
         ({}, 3000),
-        ({"density": "g m-3", "effective_radius": "µm", "temperature": "K"}, 3000),
+        ({"density": "g m-3", "effective_radius": "µm", "temperature": "kelvin"}, 3000),
         ({"density": "kg/m^3", "effective_radius": "microns"}, 3e6),
         ({"density": "mg m**-3", "effective_radius": "micrometers"}, 3),
     ],
@@ -206,6 +209,14 @@ def test_files_of_droplets_are_read_in_their_units(
     text = water_of_file(tmp_path / "les.nc", **units)
     medium = load_scene(write(text)).volume
     assert (medium.density * medium.sigma_s).amax().item() == pytest.approx(expected)
+
+
+def test_a_unit_that_a_file_does_not_say_is_taken_with_a_warning(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    pytest.importorskip("miepython")
+    with pytest.warns(DataWarning, match="les.nc: density says no unit; taken in g/m3"):
+        load_scene(write(water_of_file(tmp_path / "les.nc", density="")))
 
 
 @pytest.mark.parametrize(

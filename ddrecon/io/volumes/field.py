@@ -31,12 +31,12 @@ class Field:
     """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0, in a box.
 
     `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
-    `unit` is that of the values, as it spells it.
+    `unit` is that of the values, as it spells it, "" where it could say one.
     """
 
     values: np.ndarray
     bounds: np.ndarray | None = None
-    unit: str = ""
+    unit: str | None = None
 
     @property
     def resolution(self) -> tuple[int, int, int]:

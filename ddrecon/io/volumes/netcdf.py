@@ -61,9 +61,9 @@ def netcdf_names(path: Path) -> list[str]:
 
 
 def _variables(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """All variables in `group` but coordinates, by their paths."""
+    """All variables of numbers in `group` but coordinates, by their paths."""
     for name, variable in group.variables.items():
-        if name not in variable.dimensions:
+        if name not in variable.dimensions and np.issubdtype(variable.dtype, np.number):
             yield prefix + name, variable
     for name, inner in group.groups.items():
         yield from _variables(inner, f"{prefix}{name}/")
@@ -81,7 +81,7 @@ def read_netcdf(path: Path, name: str) -> Field:
         for dimension, axis in sorted(_axes(variable).items(), key=lambda one: -sizes[one[0]]):
             if axis in [*"xyz"] and axis not in axes:
                 axes[axis] = dimension
-            elif sizes[dimension] > 1:
+            elif sizes[dimension] != 1:
                 what = f"{name} has {sizes[dimension]} entries along {dimension!r}"
                 raise FormatError(path, f"{what}; choose one (ncks -d {dimension},0)")
         kept = [axes[axis] for axis in "zyx"]
@@ -133,10 +133,11 @@ def _coordinate(variable: Any, dimension: str) -> Any:
     """
     group, others, axis = variable.group(), list[Any](), _axis_of(dimension, None)
     while group is not None:
-        known = group.variables.get(dimension)
-        if known is not None and dimension in known.dimensions:
-            return known
         for other in group.variables.values():
+            if not np.issubdtype(other.dtype, np.number) or dimension not in other.dimensions:
+                continue
+            if other.name == dimension:
+                return other
             if other.dimensions == (dimension,) and size_of(_says(other, "units"), METERS):
                 its_axis = _axis_of(other.name, other)
                 others += [other] if its_axis and axis in ("", its_axis) else []
@@ -152,13 +153,20 @@ def _side(path: Path, variable: Any, axis: str, dimension: str) -> _Side:
     is_depth = not positive and any(_begins(name, "depth") for name in names)
     are_levels = any(_begins(name, LEVELS) for name in names) or (is_depth and coordinate is None)
     if meters is None and (unit or (are_levels and axis == "z")):
-        what = f"{dimension} is in {unit}, which is no" if unit else f"{dimension} says no unit of"
+        what = (
+            f"{dimension} is in {unit}, which is no known"
+            if unit
+            else f"{dimension} says no unit of"
+        )
         drop = f"leave it out (ncks -C -x -v {dimension}) and say volume.bounds"
         advice = "interpolate to heights in m" if axis == "z" else f"project it to m, or {drop}"
         raise FormatError(path, f"{what} length; {advice}")
     if coordinate is None:
         return _Side(dimension)
     centers = _centers(path, coordinate, dimension)
+    if is_depth and centers.min() < 0:
+        advice = f"say which way it counts (ncatted -a positive,{dimension},o,c,up)"
+        raise FormatError(path, f"{dimension} has depths below 0; {advice}")
     sign = -1 if axis == "z" and (is_depth or positive.startswith("down")) else 1
     step = sign * (-1 if centers[-1] < centers[0] else 1)
     # The two ends of a cell come in either order, whichever way the axis goes.
@@ -181,7 +189,7 @@ def _centers(path: Path, coordinate: Any, dimension: str) -> np.ndarray:
     centers = columns.mean(1)
     steps, even = np.diff(centers), np.linspace(centers[0], centers[-1], len(centers))
     reason = None
-    if not np.ptp(columns, 1).max() <= EVEN * np.abs(steps).min(initial=np.inf):
+    if np.ptp(columns, 1).max() > EVEN * np.abs(steps).min(initial=np.inf):
         reason = "differs from column to column"
     elif len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
         spacing = f"{np.abs(steps).min():g} to {np.abs(steps).max():g}"

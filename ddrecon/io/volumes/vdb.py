@@ -39,7 +39,7 @@ TREES = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 """Values of a voxel, by the kind of tree."""
 ADVICE = (
     "is of another program, and needs the Python module openvdb once: Blender's Python has it, and "
-    "Debian's (apt-get install python3-openvdb); docs/formats.md has the line that makes it .npz"
+    "Debian's (apt-get install python3-openvdb); docs/formats.md has the lines that make it .npz"
 )
 
 

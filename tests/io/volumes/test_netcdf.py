@@ -169,13 +169,25 @@ METERS = dict.fromkeys("xyz", "m")
 @pytest.mark.parametrize(
     ("renamed", "attributes", "told"),
     [
-        ("x lon", {"units": "degrees_east"}, "lon is in degrees_east, which is no length; project"),
-        ("y rlat", {"units": "degrees"}, "rlat is in degrees, which is no length; project"),
-        ("x x", {"units": "rad"}, "x is in rad, which is no length"),
-        ("y y", {"units": "Mm"}, "y is in Mm, which is no length"),
-        ("z plev", {"units": "hPa", "positive": "down"}, "plev is in hPa, which is no length"),
-        ("z z", {"units": "mbar"}, "z is in mbar, which is no length; interpolate to heights"),
-        ("z lev", {"units": "1"}, "lev is in 1, which is no length; interpolate to heights"),
+        (
+            "x lon",
+            {"units": "degrees_east"},
+            "lon is in degrees_east, which is no known length; project",
+        ),
+        ("y rlat", {"units": "degrees"}, "rlat is in degrees, which is no known length; project"),
+        ("x x", {"units": "rad"}, "x is in rad, which is no known length"),
+        ("y y", {"units": "Mm"}, "y is in Mm, which is no known length"),
+        (
+            "z plev",
+            {"units": "hPa", "positive": "down"},
+            "plev is in hPa, which is no known length",
+        ),
+        (
+            "z z",
+            {"units": "mbar"},
+            "z is in mbar, which is no known length; interpolate to heights",
+        ),
+        ("z lev", {"units": "1"}, "lev is in 1, which is no known length; interpolate to heights"),
         ("z level", {}, "level says no unit of length; interpolate to heights"),
         ("z p", {"axis": "Z"}, "p says no unit of length; interpolate to heights"),
         ("z k", {"standard_name": "model_level_number"}, "k says no unit of length; interpolate"),
@@ -227,7 +239,12 @@ def test_downward_axes_are_turned(tmp_path: Path, order: int) -> None:
 
 
 def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
-    field = read_field(written(tmp_path / "f.nc", VALUES, "bottom_top south_north west_east"), "QN")
+    """Nor one whose coordinate is in words."""
+    path = written(tmp_path / "f.nc", VALUES, "bottom_top south_north west_east")
+    with netcdf.Dataset(path, "a") as file:
+        words = file.createVariable("west_east", str, ("west_east",))
+        words[:] = np.array(["a", "b", "c", "d"], object)
+    field = read_field(path, "QN")
     assert np.array_equal(field.values, VALUES) and field.bounds is None
 
 
@@ -241,6 +258,9 @@ def test_what_does_not_fit_is_refused_with_advice(tmp_path: Path) -> None:
     holes = np.ma.masked_less(VALUES, VALUES.max())
     for values, dimensions, axes, told in (
         (twice, "time z y x", {}, "QN has 2 entries along 'time'; choose one"),
+        (twice[:0], "time z y x", {}, "QN has 0 entries along 'time'; choose one"),
+        (VALUES, "z y x", {"z": ([1, np.nan, 3], {})}, "z is not evenly spaced (nan to nan)"),
+        (VALUES, "depth y x", {"depth": ([-3, -2, -1], {})}, "depth has depths below 0; say which"),
         (VALUES[:1], "a y x", {}, "has the dimensions a, y, x; name some of them x, y and z"),
         (VALUES, "z y x", stretched, "z is not evenly spaced (1 to 1.5); interpolate it first"),
         (holes, "z y x", {}, "QN is NaN"),
