@@ -145,7 +145,13 @@ def _read_fields(
             read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
             with problems.collecting():
                 at = f"volume.{prefix}{name}.file"
-                found[variable] = at, read_referenced(scene_file, at, value.file, read)
+                field = read_referenced(scene_file, at, value.file, read)
+                found[variable] = at, field
+                if isinstance(section.sigma_t, Water):
+                    said = section.sigma_t.meters
+                    if field.meters not in (None, said):
+                        what = f"is {said:g}, but u of {value.file.name} has {field.meters:g} m"
+                        raise scene_file.refused(f"volume.{prefix}sigma_t.meters", what)
     problems.raise_any()
     return found
 

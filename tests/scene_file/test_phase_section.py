@@ -1,5 +1,6 @@
 """The section volume.phase: what it becomes, what is written back, and what is refused."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.errors import DataWarning, FormatError
+from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
@@ -217,6 +218,19 @@ def test_a_unit_that_a_file_does_not_say_is_taken_with_a_warning(
     pytest.importorskip("miepython")
     with pytest.warns(DataWarning, match="les.nc: density says no unit; taken in g/m3"):
         load_scene(write(water_of_file(tmp_path / "les.nc", density="")))
+
+
+def test_a_file_of_droplets_whose_box_is_in_another_unit_is_refused(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    text = water_of_file(tmp_path / "les.nc")
+    with pytest.importorskip("netCDF4").Dataset(tmp_path / "les.nc", "a") as file:
+        for axis, count in zip("zyx", (4, 3, 2), strict=True):
+            file.createVariable(axis, "f4", (axis,))[:] = np.arange(count)
+            file.variables[axis].units = "m"
+    told = "volume.sigma_t.meters: is 1000, but u of les.nc has 1 m"
+    with pytest.raises(SceneError, match=re.escape(told)):
+        load_scene(write(text))
 
 
 @pytest.mark.parametrize(

@@ -31,12 +31,14 @@ class Field:
     """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0, in a box.
 
     `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
-    `unit` is that of the values, as it spells it, "" where it could say one.
+    so is how many `meters` a u has; `unit` is that of the values, as it spells it, "" where it
+    could say one.
     """
 
     values: np.ndarray
     bounds: np.ndarray | None = None
     unit: str | None = None
+    meters: float | None = None
 
     @property
     def resolution(self) -> tuple[int, int, int]:

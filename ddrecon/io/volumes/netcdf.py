@@ -91,7 +91,8 @@ def read_netcdf(path: Path, name: str) -> Field:
         bounds, unit = _box(path, sides), _says(variable, "units")
     flips = tuple(slice(None, None, side.step) for side in reversed(sides))
     values = values.reshape(values.shape[:3])[flips]
-    return replace(check_field(path, name, values, bounds), unit=unit)
+    meters = None if bounds is None else sides[0].meters
+    return replace(check_field(path, name, values, bounds), unit=unit, meters=meters)
 
 
 def _numbers(path: Path, variable: Any) -> np.ndarray:
