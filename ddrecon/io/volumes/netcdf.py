@@ -8,7 +8,7 @@ in the unit of x, which is taken for the scene's unit of length.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,10 @@ EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
 
 
+Coordinates = Mapping[str, Any]
+"""Variables that say where cells lie, by dimension."""
+
+
 @dataclass(frozen=True)
 class _Side:
     """Cells along a `dimension`.
@@ -51,8 +55,7 @@ class _Side:
 def netcdf_names(path: Path) -> list[str]:
     """The variables of the file at `path` that have axes x, y and z; there must be some."""
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        variables = dict(_variables(file))
-        axes = {name: _axes(variable) for name, variable in variables.items()}
+        axes = {name: _axes(variable, seen) for name, variable, seen in _variables(file)}
         names = [name for name in axes if set("xyz") <= set(axes[name].values())]
         if not names:
             known = ", ".join(dict.fromkeys(axis for each in axes.values() for axis in each))
@@ -60,13 +63,32 @@ def netcdf_names(path: Path) -> list[str]:
         return names
 
 
-def _variables(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """All variables of numbers in `group` but coordinates, by their paths."""
+def _variables(
+    group: Any, prefix: str = "", above: Coordinates | None = None
+) -> Iterator[tuple[str, Any, Coordinates]]:
+    """The path of each variable in `group`, itself, and the coordinates that it sees.
+
+    A coordinate has the name of its dimension, or else is the only length along it alone; those
+    `above` are of dimensions of groups around this one.
+    """
+    known = {name: one for name, one in (above or {}).items() if name not in group.dimensions}
+    lengths, others = dict[str, list[Any]](), dict[str, Any]()
     for name, variable in group.variables.items():
-        if name not in variable.dimensions and np.issubdtype(variable.dtype, np.number):
-            yield prefix + name, variable
+        if not np.issubdtype(variable.dtype, np.number):
+            continue
+        if name in variable.dimensions:
+            known[name] = variable
+            continue
+        others[name] = variable
+        if variable.ndim == 1 and size_of(_says(variable, "units"), METERS) is not None:
+            axis, (along,) = _axis_of(name, variable), variable.dimensions
+            if axis and _axis_of(along, None) in ("", axis):
+                lengths.setdefault(along, []).append(variable)
+    known = {along: each[0] for along, each in lengths.items() if len(each) == 1} | known
+    for name, variable in others.items():
+        yield prefix + name, variable, known
     for name, inner in group.groups.items():
-        yield from _variables(inner, f"{prefix}{name}/")
+        yield from _variables(inner, f"{prefix}{name}/", known)
 
 
 def read_netcdf(path: Path, name: str) -> Field:
@@ -75,10 +97,12 @@ def read_netcdf(path: Path, name: str) -> Field:
     Raises FormatError when it is damaged, unevenly spaced or not a legal field.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        variable = file[name]
+        variable, known = next(each[1:] for each in _variables(file) if each[0] == name)
         values, axes = _numbers(path, variable), dict[str, str]()
         sizes = dict(zip(variable.dimensions, values.shape, strict=True))
-        for dimension, axis in sorted(_axes(variable).items(), key=lambda one: -sizes[one[0]]):
+        for dimension, axis in sorted(
+            _axes(variable, known).items(), key=lambda one: -sizes[one[0]]
+        ):
             if axis in [*"xyz"] and axis not in axes:
                 axes[axis] = dimension
             elif sizes[dimension] != 1:
@@ -87,7 +111,7 @@ def read_netcdf(path: Path, name: str) -> Field:
         kept = [axes[axis] for axis in "zyx"]
         order = sorted(variable.dimensions, key=lambda one: [*kept, one].index(one))
         values = values.transpose([variable.dimensions.index(one) for one in order])
-        sides = [_side(path, variable, axis, axes[axis]) for axis in "xyz"]
+        sides = [_side(path, axis, axes[axis], known.get(axes[axis])) for axis in "xyz"]
         bounds, unit = _box(path, sides), _says(variable, "units")
     flips = tuple(slice(None, None, side.step) for side in reversed(sides))
     values = values.reshape(values.shape[:3])[flips]
@@ -106,9 +130,9 @@ def _says(variable: Any, attribute: str) -> str:
     return str(getattr(variable, attribute, "")).strip()
 
 
-def _axes(variable: Any) -> dict[str, str]:
+def _axes(variable: Any, known: Coordinates) -> dict[str, str]:
     """Which of x, y, z and t each dimension of `variable` is, "" where that is unknown."""
-    return {name: _axis_of(name, _coordinate(variable, name)) for name in variable.dimensions}
+    return {name: _axis_of(name, known.get(name)) for name in variable.dimensions}
 
 
 def _axis_of(dimension: str, coordinate: Any) -> str:
@@ -127,41 +151,17 @@ def _begins(name: str, pattern: str) -> bool:
     return re.match(pattern, name, re.IGNORECASE) is not None
 
 
-def _coordinate(variable: Any, dimension: str) -> Any:
-    """What says where cells of `variable` along `dimension` lie, if anything in the file does.
-
-    It has the name of the dimension, or else is the only length along this dimension alone.
-    """
-    group, others, axis = variable.group(), list[Any](), _axis_of(dimension, None)
-    while group is not None:
-        for other in group.variables.values():
-            if not np.issubdtype(other.dtype, np.number) or dimension not in other.dimensions:
-                continue
-            if other.name == dimension:
-                return other
-            if other.dimensions == (dimension,) and size_of(_says(other, "units"), METERS):
-                its_axis = _axis_of(other.name, other)
-                others += [other] if its_axis and axis in ("", its_axis) else []
-        group = group.parent
-    return others[0] if len(others) == 1 else None
-
-
-def _side(path: Path, variable: Any, axis: str, dimension: str) -> _Side:
-    """Where cells of `variable` lie along its `axis`, the `dimension`; raises FormatError."""
-    coordinate = _coordinate(variable, dimension)
+def _side(path: Path, axis: str, dimension: str, coordinate: Any) -> _Side:
+    """Where cells lie along the `axis`, a `dimension`, by its `coordinate`; raises FormatError."""
     unit, positive = _says(coordinate, "units"), _says(coordinate, "positive").lower()
     meters, names = size_of(unit, METERS), (_says(coordinate, "standard_name"), dimension)
     is_depth = not positive and any(_begins(name, "depth") for name in names)
     are_levels = any(_begins(name, LEVELS) for name in names) or (is_depth and coordinate is None)
     if meters is None and (unit or (are_levels and axis == "z")):
-        what = (
-            f"{dimension} is in {unit}, which is no known"
-            if unit
-            else f"{dimension} says no unit of"
-        )
+        what = f"is in {unit}, which is no known length" if unit else "says no unit of length"
         drop = f"leave it out (ncks -C -x -v {dimension}) and say volume.bounds"
         advice = "interpolate to heights in m" if axis == "z" else f"project it to m, or {drop}"
-        raise FormatError(path, f"{what} length; {advice}")
+        raise FormatError(path, f"{dimension} {what}; {advice}")
     if coordinate is None:
         return _Side(dimension)
     centers = _centers(path, coordinate, dimension)

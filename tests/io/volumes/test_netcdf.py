@@ -120,6 +120,18 @@ def test_coordinates_may_have_other_names_and_stand_in_groups(
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
 
+def test_a_group_may_have_dimensions_of_the_same_names(tmp_path: Path) -> None:
+    path = written(tmp_path / "f.nc", VALUES, "z y x", **plain())
+    with netcdf.Dataset(path, "a") as file:
+        inner = file.createGroup("finer")
+        for axis, count in zip("zyx", VALUES.shape, strict=True):
+            inner.createDimension(axis, 2 * count)
+        inner.createVariable("QN", "f4", ("z", "y", "x"))[:] = 1
+    outer, finer = (read_field(path, name) for name in ("QN", "finer/QN"))
+    assert outer.resolution == (4, 5, 3) and np.allclose(outer.bounds, BOUNDS)
+    assert finer.resolution == (8, 10, 6) and finer.bounds is None
+
+
 @pytest.mark.parametrize("order", ["z y x", "time z y x", "y z x"])
 def test_heights_on_several_axes_are_taken_where_all_columns_agree(
     tmp_path: Path, order: str
