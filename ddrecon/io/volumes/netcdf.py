@@ -25,8 +25,8 @@ LEVELS = "[pim]?lev|(model|pressure)_?lev|(air_)?pres|p$|isobaric|sigma|eta$|hyb
 """How the names of axes begin that are no length but pressures, or numbers of levels."""
 NAMES = {
     "t": ".*time",
-    "x": "n?x|n?i(p1)?$|ni_|west_east|projection_x|(grid_|r)?lon",
-    "y": "n?y(?!r|ear)|n?j(p1)?$|nj_|south_north|projection_y|(grid_|r)?lat",
+    "x": "n?x|n?i(p1)?$|ni_|west_east|easting|projection_x|(grid_|r)?lon",
+    "y": "n?y(?!r|ear)|n?j(p1)?$|nj_|south_north|northing|projection_y|(grid_|r)?lat",
     "z": f"n?z(?!en)|n?k(p1)?$|nk_|bottom_top|height|alt|depth|{LEVELS}",
 }
 """How the names of axes begin."""

@@ -83,10 +83,11 @@ def _facts(path: Path, description: str, samples: int) -> dict[str, str]:
     facts = dict(line.split("=", 1) for line in description.splitlines() if "=" in line)
     units = {facts[name] for name in ("unit", "yunit", "zunit") if name in facts}
     several = ""
-    if images := re.findall(r"<(?:\w+:)?Pixels\b[^>]*>", description):
-        said = dict(re.findall(r'(\w+)="([^"]*)"', images[0]))
-        slices, channels, times = (int(said[f"Size{axis}"]) for axis in "ZCT")
-        if len(images) > 1 or channels != samples or times > 1:
+    if re.search(r"<(\w+:)?OME\b", description):
+        images = re.findall(r"<(?:\w+:)?Pixels\b[^>]*>", description)
+        said = dict(re.findall(r'(\w+)="([^"]*)"', "".join(images)))
+        slices, channels, times = (int(said.get(f"Size{axis}", 1)) for axis in "ZCT")
+        if len(images) != 1 or channels != samples or times > 1:
             several = f"{len(images)} images of {channels} channels and {times} frames"
         facts, units = {"images": str(slices)}, set()
         if all(f"PhysicalSize{axis}" in said for axis in "XYZ"):

@@ -87,6 +87,7 @@ def test_stacks_of_ome_have_the_box_of_their_voxels(tmp_path: Path, axes: str, c
         ("CZYX", {"ome": True}, "has 1 images of 2 channels and 1 frames; save a stack of one"),
         ("ZCYX", {"ome": True}, "has 1 images of 2 channels and 1 frames; save a stack of one"),
         ("TZYX", {"ome": True}, "has 1 images of 1 channels and 2 frames; save a stack of one"),
+        ("ZYX", {"description": "<OME><BinaryOnly/></OME>"}, "has 0 images of 1 channels"),
         ("QZYX", {}, "has the shape [2, 3, 5, 4]; save a stack of one"),
         ("ZCYX", {"imagej": True}, "has shape [3, 5, 4, 2]"),
         ("TZYX", {"imagej": True}, "has 2 frames; save a stack of one"),
@@ -96,7 +97,7 @@ def test_channels_and_times_are_no_slices(
     tmp_path: Path, axes: str, options: dict[str, Any], told: str
 ) -> None:
     values = np.ones([{"Z": 3, "Y": 5, "X": 4}.get(axis, 2) for axis in axes], np.float32)
-    metadata = {"axes": axes} if options else {}
+    metadata = None if "description" in options else {"axes": axes} if options else {}
     tifffile.imwrite(
         tmp_path / "f.tif", values, photometric="minisblack", metadata=metadata, **options
     )
