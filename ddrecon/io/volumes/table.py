@@ -145,7 +145,8 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
 
 def _place(field: Field) -> str:
     cells = " x ".join(map(str, field.resolution))
-    return f"{cells} cells (x, y, z) in the box {np.asarray(field.bounds).tolist()}"
+    box = "no box" if field.bounds is None else f"the box {field.bounds.tolist()}"
+    return f"{cells} cells (x, y, z) in {box}"
 
 
 def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
