@@ -451,8 +451,8 @@ class ViewSource:
 
     Such files are written by NeRF, instant-ngp or nerfstudio; the model is a folder.
 
-    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn, or the
-    folder of COLMAP's pictures. Of every `test_every` views, where files say nothing of it, the
+    `images` is a glob pattern whose matches, sorted by the numbers in their names, belong to the
+    ring's cameras in turn, or the folder of COLMAP's pictures. Of every `test_every` views, where files say nothing of it, the
     first is a test view.
     """
 

@@ -13,12 +13,13 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, Problems
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
+from ddrecon.scene_file.read import path_in
 from ddrecon.scene_file.schema import (
     FRAME,
     PerspectiveSection,
@@ -40,6 +41,18 @@ MODELS: dict[str, tuple[str, ...]] = {
 """The camera models that are read, in the order of their numbers in binary files, with their
 parameters in order.
 """
+OTHERS = {
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
+"""The next models, whose cameras may be there but have no image, and how many parameters they have.
+"""
+Lens = tuple[str, tuple[int, int], Sequence[float]]
+"""A camera of a model: what it is called, its width and height, and its parameters."""
 Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
@@ -52,18 +65,18 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
         files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
         return name_by_images(read_transforms(entries["transforms"], files, every))
     if source.colmap is not None:
-        pictures = (folder / (source.images or "")).absolute()
-        read = read_colmap(entries["colmap"], source.colmap, pictures)
+        read = read_colmap(entries["colmap"], source.colmap, path_in(folder, source.images or ""))
         return name_by_images(split_views(read, every))
     assert source.ring is not None
     cameras = ring_cameras(source.ring)
     images: list[Path] | list[None] = [None] * len(cameras)
     if source.images is not None:
         # Wildcards stand in the last two parts: those above may match without end.
-        is_endless = glob.has_magic(str(Path(source.images).parent.parent))
-        names = [] if is_endless else glob.glob(source.images, root_dir=folder)
-        paths = [(folder / name).absolute() for name in names]
-        images = sorted(path for path in paths if path.is_file())
+        patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
+        is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
+        names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
+        paths = [(folder / name).absolute() for name in next(filter(None, names), [])]
+        images = sorted((path for path in paths if path.is_file()), key=in_order)
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
             raise entries["images"].refused(f"{what} {len(cameras)} cameras")
@@ -72,6 +85,12 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
         for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]
     return tuple(split_views(views, every))
+
+
+def in_order(path: Path | str) -> list[int | str]:
+    """A key that sorts names by the numbers in them: 2 before 10."""
+    words = re.split("([0-9]+)", str(path))
+    return [int(word) if index % 2 else word for index, word in enumerate(words)]
 
 
 def name_listed(
@@ -129,21 +148,22 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
     with guard_reading(of_cameras):
         cameras = dict(READERS[suffix][0](of_cameras))
     with guard_reading(path):
-        posed = sorted(READERS[suffix][1](path))
+        posed = sorted(READERS[suffix][1](path), key=lambda image: in_order(image[0]))
     if not posed:
         raise FormatError(path, "has no images")
     views = []
     for name, number, pose in posed:
         if number not in cameras:
             raise FormatError(path, f"image {name!r}: there is no camera {number}")
-        picture = Path(name)
+        picture = PurePosixPath(name.replace("\\", "/"))
         if picture.is_absolute() or ".." in picture.parts:
             raise FormatError(path, f"image {name!r} leaves the folder of pictures; rename it")
-        frame = cameras[number] | {"transform_matrix": _matrix(path, name, pose)}
+        camera = _camera(of_cameras, number, *cameras[number])
+        frame = camera | {"transform_matrix": _matrix(path, name, pose)}
         with in_file(of_cameras):
             said = node_of(f"camera {number}", str(of_cameras), frame)
-            camera = read_camera(said, said.entries(), folder)
-        views.append(ViewSection(camera=camera, image=images / picture))
+            section = read_camera(said, said.entries(), folder)
+        views.append(ViewSection(camera=section, image=path_in(images, name)))
     return views
 
 
@@ -182,32 +202,33 @@ def _camera(
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """The lines of a text file that are no comments, with their numbers."""
-    with path.open(encoding="utf-8") as stream:
-        for number, line in enumerate(stream, 1):
+    with path.open(encoding="utf-8-sig") as stream:
+        for number, line in enumerate(map(str.strip, stream), 1):
             if not line.startswith("#"):
-                yield number, line.strip()
+                yield number, line
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for number, line in _lines(path):
         if not line:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            size, values = (int(width), int(height)), [float(word) for word in parameters]
+            lens = model, (int(width), int(height)), [float(word) for word in parameters]
             index = int(camera)
         except ValueError as error:
             raise FormatError(
                 path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
             ) from error
-        yield index, _camera(path, index, model, size, values)
+        yield index, lens
 
 
 def _text_images(path: Path) -> Iterator[Posed]:
-    """Every other line is an image; the others, which may be empty, are its points."""
-    lines = _lines(path)
-    for number, line in lines:
-        if not line:
+    """After the line of an image there may be one of its points, which may be empty."""
+    may_be_points = False
+    for number, line in _lines(path):
+        if not line or (may_be_points and _are_points(line.split())):
+            may_be_points = False
             continue
         try:
             _, *numbers = (words := line.split(maxsplit=9))[:8]
@@ -217,16 +238,27 @@ def _text_images(path: Path) -> Iterator[Posed]:
                 path, f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
         yield name, camera, pose
-        next(lines, None)
+        may_be_points = True
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _are_points(words: Sequence[str]) -> bool:
+    """Whether `words` are points of an image: X Y POINT3D_ID each."""
+    try:
+        [float(word) for word in words], [int(word) for word in words[2::3]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
             number, model, width, height = _unpack(path, stream, "<iiQQ")
-            name = dict(enumerate(MODELS)).get(model, f"number {model}")
-            parameters = _unpack(path, stream, f"<{len(MODELS.get(name, ()))}d")
-            yield number, _camera(path, number, name, (width, height), parameters)
+            if not 0 <= model < len(lengths):
+                raise FormatError(path, f"camera {number}: lens model {model} is not known")
+            name = [*lengths][model]
+            yield number, (name, (width, height), _unpack(path, stream, f"<{lengths[name]}d"))
 
 
 def _binary_images(path: Path) -> Iterator[Posed]:

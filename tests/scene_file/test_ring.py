@@ -39,13 +39,19 @@ def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None
     assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
 
 
-def test_images_are_sorted_and_relative_to_the_scene(read: Read, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names", [["a", "b", "c"], ["2", "10", "11"], ["09", "10", "100"], ["1_10", "2_1", "2_9"]]
+)
+@pytest.mark.parametrize("pattern", ["targets/t_*.exr", "targets\\t_*.exr"])
+def test_images_are_in_order_of_their_numbers(
+    read: Read, tmp_path: Path, names: list[str], pattern: str
+) -> None:
+    """Of files alone, which are relative to the scene."""
     (tmp_path / "targets").mkdir()
-    for name in ("c", "a", "b"):
-        (tmp_path / "targets" / f"t_{name}.exr").touch()
+    paths = [tmp_path / "targets" / f"t_{name}.exr" for name in names]
+    for path in reversed(paths):
+        path.touch()
     (tmp_path / "targets" / "t_d.exr").mkdir()
     ring = {name: value for name, value in RING.items() if name != "resolution"}
-    views = read(changed(views={"ring": ring, "images": "targets/t_*.exr"})).tree.views
-    assert [view.image for view in views] == [
-        tmp_path / "targets" / f"t_{name}.exr" for name in "abc"
-    ]
+    views = read(changed(views={"ring": ring, "images": pattern})).tree.views
+    assert [view.image for view in views] == paths
