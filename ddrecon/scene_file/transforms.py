@@ -243,11 +243,12 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
     if not set(FOCAL) & set(given):
         raise frame.refused("has neither fl_x nor camera_angle_x")
     if not {"w", "h"} <= set(given):
-        needing = [name for name in ("fl_x", "fl_y", "cx", "cy") if name in given]
-        if needing or not {"x_fov", "camera_angle_x"} & set(given):
-            name, *_ = [*needing, *filter(given.get, FOCAL)]
-            what = "is in pixels" if needing else "says how high a picture is in pixels"
-            raise entries[name].refused(f"{what}, but w and h do not say how many there are")
+        if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in given]:
+            raise entries[needing[0]].refused(
+                "is in pixels, but w and h do not say how many there are"
+            )
+        if "x_fov" not in given and "camera_angle_x" not in given:
+            raise frame.refused("says how high its picture is, but not how wide: give w and h")
         return {"fov": given.get("x_fov") or math.degrees(given["camera_angle_x"])}
     width, height = given["w"], given["h"]
     for name in ("w", "h"):

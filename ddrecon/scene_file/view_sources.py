@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, Problems
+from ddrecon.grid import Triple
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.read import path_in
@@ -57,8 +58,11 @@ Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
-def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection, ...]:
-    """The views that `source` stands for, which `node` of a scene in `folder` says."""
+def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[ViewSection, ...]:
+    """The views that `source` stands for, which `node` of a scene in `folder` says.
+
+    `up` points up in the scene.
+    """
     entries = node.entries()
     every = source.test_every
     if source.transforms is not None:
@@ -68,7 +72,7 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
         read = read_colmap(entries["colmap"], source.colmap, path_in(folder, source.images or ""))
         return name_by_images(split_views(read, every))
     assert source.ring is not None
-    cameras = ring_cameras(source.ring)
+    cameras = ring_cameras(source.ring, up)
     images: list[Path] | list[None] = [None] * len(cameras)
     if source.images is not None:
         # Wildcards stand in the last two parts: those above may match without end.
@@ -121,15 +125,25 @@ def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
 
-def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
-    """Camera i of n stands at target + (r sin(2 pi i/n), height, r cos(2 pi i/n))."""
-    (x, y, z), cameras = ring.target, []
+def ring_cameras(ring: RingSection, up: Triple) -> list[PerspectiveSection]:
+    """Camera i of n stands at target + height u + r (cos(2 pi i/n) a + sin(2 pi i/n) u x a).
+
+    u is the unit vector along the ring's own `up` or this one, and a the axis after the one
+    nearest to it, made perpendicular.
+    """
+    import numpy as np
+
+    upward = np.array(ring.up or up) / math.hypot(*(ring.up or up))
+    ahead = np.eye(3)[(np.abs(upward).argmax() + 1) % 3]
+    ahead = ahead - upward * (ahead @ upward)
+    ahead /= np.linalg.norm(ahead)
+    aside, cameras = np.cross(upward, ahead), []
     for index in range(ring.count):
         turn = 2 * math.pi * index / ring.count
-        right, forth = ring.radius * math.sin(turn), ring.radius * math.cos(turn)
-        origin = x + right, y + ring.height, z + forth
+        way = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
+        x, y, z = (np.array(ring.target) + ring.height * upward + way).tolist()
         camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
-        cameras.append(replace(camera, origin=origin, target=ring.target, up=ring.up))
+        cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=ring.up or up))
     return cameras
 
 
