@@ -263,7 +263,7 @@ TOO_LITTLE: list[tuple[list[Any], dict[str, Any], str]] = [
     (
         [frame()],
         {"camera_angle_y": 0.5},
-        "camera_angle_y: says how high a picture is in pixels, but",
+        "frames.0: says how high its picture is, but not how wide: give w and h",
     ),
     ([frame(None)], {"camera_angle_x": 0.5}, "frames.0: has neither file_path nor w and h"),
 ]
