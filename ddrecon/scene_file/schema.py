@@ -431,10 +431,9 @@ def split_views(views: Sequence[ViewSection], test_every: int | None) -> list[Vi
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target` and `up`, which is the volume's unless given, turning to the right.
+    """Cameras around `target`, on a circle `height` above it about `up`, the volume's unless given.
 
-    The first is towards +z where y is up, +x where z is, +y where x is. The circle is horizontal,
-    `height` above `target`.
+    Where y is up, the first is towards +z and the next towards +x; where z is, +x and +y.
     """
 
     count: int = bounded(minimum=1, maximum=10000)

@@ -63,6 +63,7 @@ GROUPS = (
 )
 """What belongs together: of a group that a frame has any of, nothing of the file counts."""
 MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
+"""What is refused, as it is not read, of a frame that says no focal length besides."""
 NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """What lenses are called there."""
 Entries = Mapping[str, Node]
@@ -147,11 +148,11 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
     if not lists:
         return []
     named = [isinstance(frame.value, dict) and frame.value.get("file_path") for frame in frames]
-    paths = [_plain(str(one.value)) if one else None for one in named]
+    paths = [Path(str(one.value).replace("\\", "/")) if one else None for one in named]
     listed = {name: set[Path]() for name in LISTS}
     for name, node in lists.items():
         for entry in node.children():
-            path = _plain(read_as(entry, str, Path()))
+            path = Path(read_as(entry, str, Path()).replace("\\", "/"))
             if path not in paths:
                 raise entry.refused(f"no frame has the file_path {entry.value!r}")
             listed[name].add(path)
@@ -164,11 +165,6 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
     if not any(splits):
         raise root.refused("its lists of files name no frame")
     return splits
-
-
-def _plain(name: str) -> Path:
-    """What `name` is once separators are those of all systems."""
-    return Path(name.replace("\\", "/"))
 
 
 def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:

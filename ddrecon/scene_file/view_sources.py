@@ -79,8 +79,8 @@ def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[
         patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
         is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
         names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
-        paths = [(folder / name).absolute() for name in next(filter(None, names), [])]
-        images = sorted((path for path in paths if path.is_file()), key=in_order)
+        there = sorted(next(filter(None, names), []), key=in_order)
+        images = [path for name in there if (path := (folder / name).absolute()).is_file()]
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
             raise entries["images"].refused(f"{what} {len(cameras)} cameras")
@@ -91,10 +91,10 @@ def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[
     return tuple(split_views(views, every))
 
 
-def in_order(path: Path | str) -> list[int | str]:
+def in_order(name: str) -> tuple[list[int | str], str]:
     """A key that sorts names by the numbers in them: 2 before 10."""
-    words = re.split("([0-9]+)", str(path))
-    return [int(word) if index % 2 else word for index, word in enumerate(words)]
+    words = re.split("([0-9]+)", name)
+    return [int(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
 def name_listed(
@@ -241,7 +241,7 @@ def _text_images(path: Path) -> Iterator[Posed]:
     """After the line of an image there may be one of its points, which may be empty."""
     may_be_points = False
     for number, line in _lines(path):
-        if not line or (may_be_points and _are_points(line.split())):
+        if not line or (may_be_points and _are_points(line)):
             may_be_points = False
             continue
         try:
@@ -255,8 +255,9 @@ def _text_images(path: Path) -> Iterator[Posed]:
         may_be_points = True
 
 
-def _are_points(words: Sequence[str]) -> bool:
-    """Whether `words` are points of an image: X Y POINT3D_ID each."""
+def _are_points(line: str) -> bool:
+    """Whether `line` begins with points of an image: X Y POINT3D_ID each."""
+    words = line.split(maxsplit=12)[:12]
     try:
         [float(word) for word in words], [int(word) for word in words[2::3]]
     except ValueError:
