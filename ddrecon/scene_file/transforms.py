@@ -56,9 +56,11 @@ UNKNOWN = (
     *("sk_x", "sk_y", "skew", "b1", "b2", "s1", "s2", "s3", "s4"),
 )
 """What says of a lens that it is not modeled, unless it is 0 or false."""
+UNNAMED = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
+"""Coefficients whose order is not known."""
 GROUPS = (
     FOCAL,
-    (*COEFFICIENTS, "distortion_params", *UNKNOWN),
+    (*COEFFICIENTS, "distortion_params", *UNKNOWN, *UNNAMED),
     ("camera_model", "is_fisheye"),
 )
 """What belongs together: of a group that a frame has any of, nothing of the file counts."""
@@ -281,17 +283,28 @@ def _distortion(entries: Entries) -> LensSection | None:
             raise entries["camera_model"].refused(
                 f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
             )
-    for name in UNKNOWN:
-        if name in entries and entries[name].value:
-            raise entries[name].refused(f"is of a lens that is not modeled; {REMEDY}")
+    for name in (*UNKNOWN, *UNNAMED):
+        if name in entries and any(
+            leaf.value for leaf in entries[name].walk() if not leaf.children()
+        ):
+            what = f"is of a lens that is not modeled; {REMEDY}"
+            raise entries[name].refused(
+                what if name in UNKNOWN else "is not read: write k1, k2, ..."
+            )
     is_fisheye = model in FISHEYE or (
         "is_fisheye" in entries and read_as(entries["is_fisheye"], bool | int, Path())
     )
     section = FisheyeSection if is_fisheye else OpencvSection
     given = {name: entries[name] for name in COEFFICIENTS if name in entries}
     if "distortion_params" in entries:
-        # nerfstudio: k1, k2, k3, k4, p1, p2
-        given |= dict(zip(COEFFICIENTS, entries["distortion_params"].children(), strict=False))
+        # as in nerfstudio; OpenCV's own order is another
+        if len(listed := entries["distortion_params"].children()) not in (
+            6,
+            4 if is_fisheye else 6,
+        ):
+            what = f"expected k1, k2, k3, k4, p1, p2, found {len(listed)} numbers"
+            raise entries["distortion_params"].refused(what)
+        given |= dict(zip(COEFFICIENTS, listed, strict=False))
     lens = {name: read_as(node, float, Path()) for name, node in given.items()}
     for name in set(lens) - set(LENSES[section.type]):
         if (value := lens.pop(name)) != 0:

@@ -125,14 +125,14 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
     ("shared", "own", "expected"),
     [
         ({"k1": -0.1, "k2": 0.02}, {"k1": 0.05}, OpencvSection(k1=0.05)),
-        ({"distortion_params": [-0.1, 0.02]}, {"k1": 0.05}, OpencvSection(k1=0.05)),
-        ({"k1": -0.1}, {"distortion_params": [0.05]}, OpencvSection(k1=0.05)),
+        ({"distortion_params": [-0.1, 0.02, 0, 0, 0, 0]}, {"k1": 0.05}, OpencvSection(k1=0.05)),
+        ({"k1": -0.1}, {"distortion_params": [0.05, 0, 0, 0, 0, 0]}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "OPENCV"}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "PINHOLE"}, None),
         ({"k1": 0.05}, {"is_fisheye": True}, FisheyeSection(k1=0.05)),
         ({"k1": 0.05, "is_fisheye": True}, {"camera_model": "OPENCV"}, OpencvSection(k1=0.05)),
         ({"ftheta_p1": 0.01, "latlong": True}, {"k1": 0.05}, OpencvSection(k1=0.05)),
-        ({"k1": 0.05, "latlong": False, "sk_x": 0.0}, {}, OpencvSection(k1=0.05)),
+        ({"k1": 0.05, "latlong": False, "sk_x": 0.0, "dist": [0, 0]}, {}, OpencvSection(k1=0.05)),
     ],
 )
 def test_a_lens_is_a_frames_own_before_that_of_its_file(
@@ -238,6 +238,12 @@ WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"equirectangular": True}, "equirectangular: is of a lens that is not modeled"),
     ([frame()], {"sk_x": 0.1}, "sk_x: is of a lens that is not modeled"),
     ([frame(K=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])], {}, "frames.0.K: is not read: write fl_x, fl_y"),
+    (
+        [frame()],
+        {"distortion_params": [0.1, 0, 0, 0]},
+        "distortion_params: expected k1, k2, k3, k4",
+    ),
+    ([frame(dist_coeffs=[[0.1, 0]])], {}, "frames.0.dist_coeffs: is not read: write k1, k2"),
     ([frame()], {"is_fisheye": "false"}, "is_fisheye: expected true or false"),
     ([frame()], {"x_fov": 180}, "x_fov: must be below 180"),
     ([frame()], {"fl_x": 0}, "fl_x: must be above 0"),
