@@ -54,6 +54,8 @@ OTHERS = {
 """
 Lens = tuple[str, tuple[int, int], Sequence[float]]
 """A camera of a model: what it is called, its width and height, and its parameters."""
+DECIMAL = r"(?:(?<=_)-)?[0-9]+(?:\.[0-9]+)?"
+"""A number in a name, if it may have a sign and a fraction."""
 Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
@@ -80,6 +82,9 @@ def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[
         is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
         names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
         there = sorted(next(filter(None, names), []), key=in_order)
+        if there != sorted(there, key=lambda name: in_order(name, DECIMAL)):
+            what = "matches names with fractions or signs, whose order is not plain: count them"
+            raise entries["images"].refused(f"{source.images!r} {what} 0, 1, 2, ...")
         images = [path for name in there if (path := (folder / name).absolute()).is_file()]
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
@@ -91,10 +96,10 @@ def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[
     return tuple(split_views(views, every))
 
 
-def in_order(name: str) -> tuple[list[int | str], str]:
-    """A key that sorts names by the numbers in them: 2 before 10."""
-    words = re.split("([0-9]+)", name)
-    return [int(word) if index % 2 else word for index, word in enumerate(words)], name
+def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]:
+    """A key that sorts names by each `number` in them, a regular expression: 2 before 10."""
+    words = re.split(f"({number})", name)
+    return [float(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
 def name_listed(

@@ -74,7 +74,11 @@ def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "names", [["a", "b", "c"], ["2", "10", "11"], ["09", "10", "100"], ["1_10", "2_1", "2_9"]]
+    "names",
+    [
+        *(["a", "b", "c"], ["2", "10", "11"], ["09", "10", "100"], ["1_10", "2_1", "2_9"]),
+        *(["0.25", "0.50", "1.00"], ["a-2", "a-9", "a-10"]),
+    ],
 )
 @pytest.mark.parametrize("pattern", ["targets/t_*.exr", "targets\\t_*.exr"])
 def test_images_are_in_order_of_their_numbers(
@@ -89,3 +93,13 @@ def test_images_are_in_order_of_their_numbers(
     ring = {name: value for name, value in RING.items() if name != "resolution"}
     views = read(changed(views={"ring": ring, "images": pattern})).tree.views
     assert [view.image for view in views] == paths
+
+
+@pytest.mark.parametrize("names", [["0.25", "0.5", "1"], ["-30", "0", "30"], ["1.9", "1.10", "2"]])
+def test_an_order_that_is_not_plain_is_refused(
+    refusal: Callable[..., list[str]], tmp_path: Path, names: list[str]
+) -> None:
+    for name in names:
+        (tmp_path / f"t_{name}.exr").touch()
+    (line,) = refusal(changed(views={"ring": RING, "images": "t_*.exr"}))
+    assert "views.images: 't_*.exr' matches names with fractions or signs" in line
