@@ -67,7 +67,8 @@ def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | N
     chosen = [*STREAM, "-vf", f"trim=start={low - start:.6f}{end},setpts=0", "-frames:v", "1"]
     try:
         frames = read(path, input_params=options, output_params=chosen)
-        width, height = next(frames)["size"]
+        about = next(frames)
+        width, height = about["size"]
         check_size(4 * width * height, path, f"a film of {width} x {height} pixels")
         decoded = list(frames)
     except (OSError, RuntimeError):
