@@ -62,7 +62,8 @@ class Scene(Displayed):
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from; `ground` lies under the volume, where there is any. What
     `render` and `diffusion` leave out is chosen by the medium when the scene is made, and stays
-    when the medium changes. `reason`: which settings of `diffusion` these are, and why.
+    when the medium changes. `reason`: which settings of `diffusion` these are, and why. `up`: which
+    of x, y, z (0, 1, 2) points up; None where cameras tell.
     """
 
     volume: Volume
@@ -75,6 +76,7 @@ class Scene(Displayed):
     path: Path | None = None
     ground: Ground | None = None
     reason: str = ""
+    up: int | None = None
 
     def __post_init__(self) -> None:
         self.settle()

@@ -33,7 +33,7 @@ Every key, with what it takes, its limits and its default, made from the program
 - Vectors are x, y, z.
 - Lengths are in a world unit u of your choice.
 - `1e-3` is a number.
-- Paths are relative to the scene file.
+- Paths are relative to the scene file; those of `-D` and `--light` to the current folder.
 - Three equal colors are rendered as one, unless they are optimized.
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
@@ -63,7 +63,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Cells along x, y and z; those of the field's file where left out. `auto`: two "
                 "pixels wide."
             ),
-            "up": "The axis along which heights count, those of a `ground` and of `heights`.",
+            "up": (
+                "The axis along which heights count, those of a `ground`, of `heights` and of "
+                "rings, and that `export --up` turns."
+            ),
             "index": (
                 "Refractive index inside the box, whose flat faces refract and reflect light; "
                 "outside it is 1. Not with a ground, point lights or cameras inside."
@@ -282,7 +285,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg, .webp and "
                 "films (.mp4, .mov, .mkv, .webm) are decoded from sRGB; alpha 0 is empty."
             ),
-            "mask": "A picture of the same size, black where pixels are ignored.",
+            "mask": "A picture of the same size, white where pixels count, else black.",
             "frame": (
                 "Of a film, which frame is taken, counted from 0. With `frames`, the one that the "
                 "scene's frame 0 is."
@@ -311,8 +314,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
             "colmap": "Folder of COLMAP's sparse model, such as `sparse/0`; text or binary.",
             "images": (
-                "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, "
-                "belong to the cameras in turn. For COLMAP: the folder of its pictures."
+                "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted by the "
+                "numbers in their names, belong to the cameras in turn. For COLMAP: the folder of "
+                "its pictures."
             ),
             "test_every": (
                 "One view in this many, the first of them, is a test view, where transforms do "
@@ -323,14 +327,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "views: {ring: ...}",
         schema.RingSection,
-        "Cameras around `target`, the first towards +z of it, the next towards +x.",
+        "Cameras around `target`: where y is up, the first towards +z of it, the next towards +x.\n"
+        "Where z is up they are +x and +y.",
         {
             "count": "How many.",
             "radius": "Of the circle [u].",
             "fov": "Horizontal field of view, in degrees.",
-            "height": "Of the circle above the target [u].",
+            "height": "Of the circle above the target, along `up` [u].",
             "target": "What they look at [u].",
-            "up": "The direction that is up in their images.",
+            "up": "What the circle lies around, and up in their images; `volume.up` unless given.",
             "resolution": "Width and height in pixels; left out where there are images.",
         },
     ),

@@ -21,6 +21,7 @@ from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.scene_file.load import SceneFile
 
 
 EXPORTED = click.Choice(["vdb", "vti", "npz"])
@@ -35,9 +36,11 @@ def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
     from ddrecon.cli.check import describe, lines, supports_of
-    from ddrecon.scene_file.frames import each_frame
+    from ddrecon.scene_file.frames import each_frame, require_frames
     from ddrecon.scene_file.load import find_expert_keys
 
+    if scene_file.tree.frames is not None:
+        require_frames(scene_file)
     expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
     first = next(scenes)
@@ -111,7 +114,8 @@ def render(
     if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
-        session = session.with_override(f"lights=[{', '.join(lights)}]")
+        typed = " ".join(f"--light {light}" for light in lights)
+        session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
     if not (scene / "frames").is_dir():
         if part is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
@@ -145,7 +149,7 @@ def _render(
     session: Session, scene: Path, output: Path, choice: _Choice
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
-    kinds = [kind for kind in ("npz", choice.exported) if kind and choice.has_fluence]
+    kinds = sorted({"npz", choice.exported or "npz"}) if choice.has_fluence else []
     scene_file = session.read(scene)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import claim_folder
@@ -159,7 +163,7 @@ def _render(
     )
 
     loaded = session.build(scene_file)
-    if choice.has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+    if choice.has_fluence and not _are_rounds_said(session, scene_file):
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
@@ -180,6 +184,17 @@ def _render(
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
     return report, render_lines(report, output)
+
+
+def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
+    """Whether a user said how many transport rounds there are, of a result in the run's scene."""
+    from ddrecon.run.result import RESULT
+
+    of_run = scene_file.path.with_name("scene.yaml")
+    if scene_file.path.name == RESULT and of_run.is_file():
+        said = tuple(each for each in session.overrides if each.startswith("diffusion"))
+        scene_file = replace(session, overrides=said).read(of_run)
+    return scene_file.tree.diffusion.transport_rounds is not None
 
 
 @click.command()
@@ -227,8 +242,17 @@ def optimize(
     exported: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
+    from ddrecon.run.result import RESULT
+
+    of_run = (scene.parent if scene.name == RESULT else scene) / "scene.yaml"
+    if of_run.is_file() and of_run.with_name(RESULT).is_file():
+        raise UsageError(
+            f"{scene}: a finished run leaves nothing to optimize; name its scene, {of_run}, "
+            "and another folder or --resume --iterations N"
+        )
     if iterations is not None:
-        session = session.with_override(f"optimize.iterations={iterations}")
+        typed = f"--iterations {iterations}"
+        session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
     from ddrecon.ranks import alone, from_first, is_first
 
@@ -323,7 +347,9 @@ def uncertainty(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
-    from ddrecon.run.run_folder import load_run
+    from ddrecon.run.checkpoint import require_checkpoint
+    from ddrecon.run.result import require_no_film
+    from ddrecon.run.run_folder import CHECKPOINTS, load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
@@ -331,6 +357,9 @@ def uncertainty(
         warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     if output.resolve() == run.resolve():
         raise click.UsageError("-o names the run itself; name another folder")
+    require_no_film(run)
+    if resume:
+        require_checkpoint(output / CHECKPOINTS)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):
         raise UsageError(

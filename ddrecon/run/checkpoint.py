@@ -51,6 +51,13 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return next((folder / name for name in (LAST, PREVIOUS) if (folder / name).is_file()), None)
 
 
+def require_checkpoint(folder: Path) -> None:
+    """Raises UsageError where there is no checkpoint in `folder`."""
+    if newest_checkpoint(folder) is None:
+        what = "there is no checkpoint to resume from; run without --resume"
+        raise UsageError(f"{folder / LAST}: {what}")
+
+
 def load_checkpoint(
     folder: Path, scene: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, Any], Path]:
@@ -60,8 +67,7 @@ def load_checkpoint(
     neither can be used, UsageError if there is none or it is not of `scene` (None: of any).
     """
     last, previous = folder / LAST, folder / PREVIOUS
-    if newest_checkpoint(folder) is None:
-        raise UsageError(f"{last}: there is no checkpoint to resume from; run without --resume")
+    require_checkpoint(folder)
     try:
         return _load(last, scene), last
     except FormatError as error:

@@ -63,7 +63,7 @@ def load_scene(
 ) -> Scene:
     """The scene in the file at `path`, as tensors of `dtype` on `device`.
 
-    `overrides` (`key.path=value`) are put in first.
+    `overrides` (`key.path=value`) are put in first; their paths start at the current folder.
 
     Raises SceneError with one line per problem of the scene, FormatError for a file it names that
     cannot be used, or UsageError for another `dtype` than `DTYPES` and a `device` that is not here.
@@ -98,6 +98,7 @@ def build_scene(
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()
     }
     volume = media[""] if "" in media else mix_media(media)
+    has_up = ground is not None or tree.volume.up != "y"  # which stands where nothing is said
     scene = Scene(
         volume,
         lights,
@@ -107,6 +108,7 @@ def build_scene(
         optimize,
         path=scene_file.path,
         ground=ground,
+        up="xyz".index(tree.volume.up) if has_up else None,
     )
     try:
         require_supported(scene)

@@ -6,12 +6,15 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
 
 from ddrecon.errors import FormatError, Problems, SceneError, UsageError, suggestion
+from ddrecon.grid import Triple
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
@@ -59,10 +62,16 @@ class SceneFile:
         return SceneError(f"{self.marks[nearest]}: {key}: {what}")
 
 
-def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
+def read_scene(
+    path: str | os.PathLike[str],
+    overrides: Iterable[str] = (),
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> SceneFile:
     """The scene file at `path` with `overrides` (`key.path=value`) put in, its box in numbers.
 
-    Raises SceneError with one line per problem, UsageError for arguments that are none.
+    Their paths start at the current folder. `options` are what a user typed in place of some of
+    them, which else was `-D` and the override. Raises SceneError with one line per problem,
+    UsageError for arguments that are none.
     """
     if not isinstance(path, str | os.PathLike):
         raise UsageError(f"path: expected that of a scene file, found {type(path).__name__}")
@@ -76,7 +85,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
             raise root.refused("is empty")
         for text in overrides:
             with problems.collecting():
-                override(root, text, problems)
+                override(root, text, problems, options.get(text, f"-D {text}"))
         found = _scene_of(root, path)
     problems.raise_any()
     assert found is not None
@@ -96,8 +105,17 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
 
 def _scene_of(root: Node, path: Path) -> SceneFile:
-    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
+    finish = FINISH | {ViewSource: partial(views_of, up=_up_of(root))}
+    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, finish))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
+
+
+def _up_of(root: Node) -> Triple:
+    """The unit vector along `volume.up`, of a scene that is not read yet."""
+    volume = root.entries().get("volume")
+    said = volume.value.get("up") if volume and isinstance(volume.value, dict) else None
+    up = said.value if said and said.value in ("x", "z") else "y"
+    return float(up == "x"), float(up == "y"), float(up == "z")
 
 
 def _text(path: Path) -> str:
@@ -119,13 +137,12 @@ def _text(path: Path) -> str:
         raise SceneError(f"{path}:{line}:{column}: is not UTF-8 text") from error
 
 
-def override(root: Node, text: str, problems: Problems) -> None:
-    """Puts the value of `text` (`key.path=value`, in YAML) into the tree under `root`.
+def override(root: Node, text: str, problems: Problems, where: str) -> None:
+    """Puts the value of `text` (`key.path=value`, in YAML), typed as `where`, under `root`.
 
     Mappings are made as needed; a list is entered by index. Where keys themselves have dots, as
     those of parameters do, the longest one present or legal is taken. Raises SceneError.
     """
-    where = f"-D {text}"
     path, separator, value = text.partition("=")
     if not separator or not all(path.split(".")):
         raise SceneError(f"{where}: expected key.path=value")
@@ -138,6 +155,7 @@ def override(root: Node, text: str, problems: Problems) -> None:
         child = Node(key, where, where, {} if path else None)
         if not path and value.strip():
             child = parse(value, lambda line, column: where, problems, key)
+            child.folder = Path.cwd()
         if isinstance(parent.value, list):
             at = int(name)
             parent.value[at] = child if not path else parent.value[at]
@@ -211,7 +229,6 @@ def _violations(
 FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
     (Mapping, ParameterSettings): require_parameters,
     (tuple, ViewSection): name_listed,
-    ViewSource: views_of,
 }
 """What is made of all records of a list or mapping, or of one that stands for others."""
 
