@@ -6,7 +6,6 @@ of them it is. Records are told apart by their `type`, others by their first key
 
 from __future__ import annotations
 
-import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
