@@ -120,8 +120,13 @@ def _spread(along: Tensor, sight: Sight) -> Tensor:
     return pixels.index_copy(1, sight.crossing.hit, along)
 
 
-def march_rays(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
-    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2.2, E2.3)."""
+def march_rays(
+    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Radiance [C, P] and mass [K, P] along those of `rays` that are in `crossing` (E2.2, E2.3).
+
+    `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
+    """
     emission, hitting, values = sampler.emission, rays.select(crossing.hit), sampler.values
     sizes = {name: len(field) for name, field in sampler.fields.items()}
 
@@ -130,8 +135,9 @@ def march_rays(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor
         near, far = crossing.near[chunk], crossing.far[chunk]
         sampled, distance = sampler.sample(values, chosen, near, far)
         nodes = Nodes(chosen.origin, chosen.direction, distance)
+        before = None if front is None else front[:, chunk]
         at_nodes = dict(zip(sizes, sampled.split([*sizes.values()], 1), strict=True))
-        return torch.cat(integrate_segments(emission, at_nodes, nodes))
+        return torch.cat(integrate_segments(emission, at_nodes, nodes, before))
 
     count = max(CHUNK_NODES, emission.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
     chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(max(1, count))
@@ -146,15 +152,19 @@ def opacity_of(emission: Emission, mass: Tensor) -> Tensor:
 
 
 def integrate_segments(
-    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes
+    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R]."""
+    """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R].
+
+    `front` [K, R] is the mass between the camera and the first node, 0 if left out.
+    """
     extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
     scattering = extinction if scattering is None else scattering
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
     own = nodes.integral(extinction).cumsum(0)
-    passed = torch.cat([torch.zeros_like(own[:1]), own])
+    first = torch.zeros_like(own[:1]) if front is None else front[None]
+    passed = torch.cat([first, first + own])
     begin, end = passed[:-1], passed[1:]
     # E2.3, E2.11: the integral of tau (kappa_s (L0 + g L1 . w) + j).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]

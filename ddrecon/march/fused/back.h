@@ -13,7 +13,7 @@ template <class F> struct Bars {
     const F *out, *masses;
     const double* mass;
     double* numbers;
-    F *rays, *angles, *coefficients, *table;
+    F *rays, *angles, *coefficients, *table, *fronts;
     F* const* fields;
     int packets;
 };
@@ -313,6 +313,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             put(bars.angles, b, foot_bar[b]);
             put(bars.angles, L::BEAMS + b, across_bar[b]);
         }
+        for (int k = 0; k < L::EXTINCTION && bars.fronts; ++k) put(bars.fronts, k, m_bar[k]);
         for (int k = 0; k < L::BEAMS * L::RAY_TERMS && bars.coefficients; ++k)
             put(bars.coefficients, k, coefficient_bar[k]);
     }

@@ -35,11 +35,13 @@ NEIGHBORS, TURNS = 128, 8
 """Packets that one thread does after each other, at least, as they meet the same cells; and how
 often each thread has its turn, at most.
 """
-NAMES = "rays", "angles", "coefficients", "numbers", "table"
+NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
 """What a walk is given besides fields and what stays, in the order of its arguments."""
 
 
-def march_rays(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
+def march_rays(
+    sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
     emission, ends = sampler.emission, (crossing.hit, crossing.near, crossing.far)
     packed = pack_rays(emission.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
@@ -53,9 +55,12 @@ def march_rays(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor
         along.polynomials,
         numbers_of(emission),
         table_of(emission, layout),
+        packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
         *fields,
     )
-    return _compose(emission, out, along.factors), masses
+    # The walk's masses begin with what is in front.
+    own = masses if front is None else masses - front
+    return _compose(emission, out, along.factors), own
 
 
 def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]) -> Tensor:
@@ -101,13 +106,13 @@ class Integrate(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars_of_made: Tensor | None) -> tuple[Any, ...]:
-        """Cotangents of the tensors that need them; of numbers always."""
+        """Cotangents of the tensors that need them; of numbers and fronts always."""
         masses, *tensors = ctx.saved_tensors
         needs, ends = ctx.needs_input_grad[2:], {"masses": masses}
         rooms = _empty(ctx.layout, tensors[0])
         for name, bar, room in zip(("out_bar", "masses_bar"), bars_of_made, rooms, strict=False):
             ends[name] = room.zero_() if bar is None else bar
-        rays, _, _, numbers, table, *fields = tensors
+        rays, _, _, numbers, table, fronts, *fields = tensors
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
         sums = [table if needs[NAMES.index("table")] else None]
         sums += [
@@ -128,6 +133,7 @@ class Integrate(torch.autograd.Function):
             f"{name}_bar": one.new_empty(one.shape) if is_so else None
             for name, one, is_so in zip(NAMES[:3], tensors, needs, strict=False)
         }
+        bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
         kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs[: len(NAMES)]))
         made = bars | {"numbers_bar": numbers_bar}
         kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
@@ -136,9 +142,9 @@ class Integrate(torch.autograd.Function):
                 if total is not None and part is not None:
                     total += part
         table_bar, *field_bars = shares[0]
-        rays_bar, angles_bar, coefficients_bar = bars.values()
+        rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()
         numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
-        others = numbers_bar, table_bar, *field_bars
+        others = numbers_bar, table_bar, fronts_bar, *field_bars
         return None, None, rays_bar, angles_bar, coefficients_bar, *others
 
     @staticmethod
@@ -152,7 +158,7 @@ class Integrate(torch.autograd.Function):
 
 def _case(layout: Layout, cells: Cells, varied: Sequence[bool]) -> Case:
     """What kernels are compiled for where those of `NAMES` are `varied`."""
-    rays, angles, coefficients, _, table = varied
+    rays, angles, coefficients, _, table, *_ = varied
     turns = any(layout.beams) and (rays or angles)
     return Case(cells.is_sliced, rays, turns, coefficients or table)
 

@@ -16,10 +16,10 @@ from ddrecon.medium.phase_cells import count_tables, is_steep
 from ddrecon.numerics.chebyshev import COEFFICIENTS
 
 _GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table; int *slices, *walked, *dealt;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
 """
-_CHANGES = "F *d_rays, *d_angles, *d_coefficients, *d_numbers, *d_table"
+_CHANGES = "F *d_rays, *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts"
 
 
 class Layout(NamedTuple):
@@ -139,14 +139,14 @@ def adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     """
     given = f"""
     F *out_bar, *masses_bar; double *masses, *numbers_bar;
-    F *rays_bar, *angles_bar, *coefficients_bar, *table_bar, *bars[{layout.channels}];
+    F *rays_bar, *angles_bar, *coefficients_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
     int packets
     """
     text = f"""
     const Bars<F> of_bars = {{{names_of(given)}}};
     Back<F, {_written(layout, case)}>(item, of_all, of_bars).run();
     """
-    made = "numbers_bar rays_bar angles_bar coefficients_bar table_bar bars"
+    made = "numbers_bar rays_bar angles_bar coefficients_bar table_bar fronts_bar bars"
     return _kernel("transpose", layout, 1, text, given, made, "back")
 
 

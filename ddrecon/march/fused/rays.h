@@ -75,11 +75,11 @@ struct Layout {
 // [2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
 // distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E8.7, or what `bundle.py`
 // has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
-// [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `walked` [packets,
-// words]: bits of the segments to be walked, if not all are. Item i is packet i, or `dealt`
-// [packets] says which.
+// [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the
+// mass before the rays, if any. `walked` [packets, words]: bits of the segments to be walked, if
+// not all are. Item i is packet i, or `dealt` [packets] says which.
 template <class F> struct Given {
-    const F *planes, *rays, *angles, *coefficients, *numbers, *table;
+    const F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts;
     const int *slices, *walked, *dealt;
     int ray_count, node_count, depth, rows, columns, words;
     int plane_stride, row_stride, column_stride;
@@ -89,7 +89,7 @@ template <class F> struct Given {
 };
 // The changes of some of that, those left out being 0; the fields' come behind the fields.
 template <class F> struct Changes {
-    const F *rays, *angles, *coefficients, *numbers, *table;
+    const F *rays, *angles, *coefficients, *numbers, *table, *fronts;
 };
 
 // Whether nodes lie in slices; and whether derivatives are asked for by rays, by the angles at
@@ -219,6 +219,10 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             return {value, P::all(changes.numbers[k])};
         else
             return value;
+    }
+    Mass front(int k) const {
+        if (!given.fronts) return P::wide(N(P::all(F(0))));
+        return P::wide(load<N>(given.fronts, changes.fronts, row_of(k)));
     }
 
     // Whether segment n, behind node n - 1, is to be walked; the next stretch of such segments
@@ -489,7 +493,7 @@ void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Ma
     N total[L::OUT];
     typename Rays::Mass m[L::EXTINCTION];
     for (int i = 0; i < L::OUT; ++i) total[i] = N(P::all(F(0)));
-    for (int k = 0; k < L::EXTINCTION; ++k) m[k] = P::wide(N(P::all(F(0))));
+    for (int k = 0; k < L::EXTINCTION; ++k) m[k] = rays.front(k);
     typename Rays::Node nodes[2], *a = nodes, *b = nodes + 1;
     for (int from, to = rays.first_node; rays.next_stretch(from, to);) {
         rays.locate(from, *a);
