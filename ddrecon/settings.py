@@ -73,7 +73,7 @@ def faults_of(record: Any) -> Iterator[Violation]:
                 continue
             if not isinstance(value, Real):
                 yield part.name, f"expected a number, found {value!r}"
-            elif not is_within(value, known[name]):
+            elif not is_within(float(value), known[name]):
                 yield part.name, f"must be {words} {known[name]:g}, found {float(value):g}"
 
 

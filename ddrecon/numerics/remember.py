@@ -79,6 +79,7 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
     """
     kept: dict[Any, _Kept] = {}
     _memories.append(kept)
+    sizes = _bytes_kept  # tensors go later than a module's names do
 
     def recall(*arguments: Any) -> Any:
         tensors = [one for one in arguments if isinstance(one, Tensor)]
@@ -93,14 +94,14 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
             value = function(*arguments)  # type: ignore[call-arg]
             sources = [_Source.of(one, lambda _: forget(key)) for one in tensors]
         size = sum(each.untyped_storage().nbytes() for each in _tensors(value))
-        if size + sum(_bytes_kept.values()) <= MOST_BYTES:
-            kept[key], _bytes_kept[id(kept), key] = _Kept(sources, value), size
+        if size + sum(sizes.values()) <= MOST_BYTES:
+            kept[key], sizes[id(kept), key] = _Kept(sources, value), size
             _results.update((id(each), each) for each in _tensors(value))
         return value
 
     def forget(key: Any) -> None:
         kept.pop(key, None)
-        _bytes_kept.pop((id(kept), key), None)
+        sizes.pop((id(kept), key), None)
 
     return cast("Callable[P, T]", functools.wraps(function)(recall))
 
