@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import mean
 from time import monotonic
@@ -13,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import SceneError, UsageError
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import flush, refusals, remove_temporaries, write_json
+from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -35,10 +34,9 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
-    FIELDS,
     PHASE,
     RESPONSE,
     is_of_volume,
@@ -47,8 +45,8 @@ from ddrecon.variables.kinds import (
 )
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
-CHECKPOINTS = "checkpoints"
-"""Where a run folder keeps its checkpoints."""
+CHECKPOINTS, SCENE = "checkpoints", "scene.yaml"
+"""Where a run folder keeps its checkpoints, and its resolved scene."""
 CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
@@ -71,7 +69,7 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
 def require_run(folder: Path) -> Path:
     """The folder of checkpoints of the run in `folder`; raises UsageError where there is no run."""
     checkpoints = folder / CHECKPOINTS
-    if not (folder / "scene.yaml").is_file() or newest_checkpoint(checkpoints) is None:
+    if not (folder / SCENE).is_file() or newest_checkpoint(checkpoints) is None:
         raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
     return checkpoints
 
@@ -119,8 +117,6 @@ class RunFolder(Checkpoints):
         with refusals(path):
             for name in ("volumes", "previews", CHECKPOINTS):
                 (path / name).mkdir(exist_ok=True)
-                remove_temporaries(path / name)
-            remove_temporaries(path)
         self.log = LossLog(path / "loss.csv")
 
     def start(self, run: Reconstruction) -> None:
@@ -209,6 +205,18 @@ class RunFolder(Checkpoints):
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
+def write_scene(scene_file: SceneFile, folder: Path, *, resume: bool) -> None:
+    """Writes the resolved scene to `folder`, but never over the scene file itself.
+
+    A job that is to `resume` may read the very scene that was written there; UsageError otherwise.
+    """
+    path = folder / SCENE
+    if path.resolve() != scene_file.path.resolve():
+        dump_scene(describe(scene_file), path)
+    elif not resume:
+        raise UsageError(f"{path}: is the scene file itself; choose another folder")
+
+
 def field_key(name: str) -> str:
     """What a volume file calls the field `name`."""
     return split_name(name)[1].removeprefix(PHASE)
@@ -253,57 +261,3 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     if problem.support is not None:
         summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
     return summary
-
-
-CHECKPOINT_FILES = ("checkpoints/last.pt", "checkpoints/previous.pt")
-SAMPLE_FILES = (
-    *("uncertainty.json", "report.html", *CHECKPOINT_FILES),
-    *(f"volumes/*_{kind}.*" for kind in ("std", "mean", "explained")),
-    "samples/[0-9][0-9][0-9][0-9]/*",
-)
-"""What files of `ddrecon uncertainty` are called."""
-RUN_FILES = (
-    *("scene.yaml", "result.yaml", "environment.json", "parameters.json", "summary.json"),
-    *("loss.csv", "report.html", *CHECKPOINT_FILES),
-    *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
-    *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
-)
-"""What files of `ddrecon optimize` are called, but for those named after media and views."""
-
-
-def remove_samples(folder: Path) -> None:
-    """Removes what `ddrecon uncertainty` has written to `folder`; raises FormatError."""
-    remove_files(folder, SAMPLE_FILES, ())
-
-
-def remove_run(folder: Path, scene_file: SceneFile) -> None:
-    """Removes what `ddrecon optimize` has written to `folder`, but for what `scene_file` reads.
-
-    Raises FormatError where the system refuses.
-    """
-    kept = {path.resolve() for path in (scene_file.path, *referenced_files(scene_file))}
-    remove_files(folder, [*RUN_FILES, *_names_by_scene(folder)], kept)
-
-
-def _names_by_scene(folder: Path) -> Iterator[str]:
-    """Files named after the media and the views of the scene that the run in `folder` had."""
-    try:
-        tree = read_scene(folder / "scene.yaml").tree
-    except SceneError:
-        return
-    for medium in ("", *(f"{name}." for name in getattr(tree.volume, "media", ()))):
-        yield from (f"volumes/{medium}{name.removeprefix(PHASE)}.npz" for name in FIELDS)
-    yield from (f"previews/{view.name}.png" for view in tree.views)
-
-
-def remove_files(folder: Path, names: Iterable[str], kept: Iterable[Path]) -> None:
-    """Removes the files of these `names` in `folder`, and the folders within that this empties."""
-    with refusals(folder):
-        found = {path for name in names for path in folder.glob(name) if path.is_file()}
-        for path in found:
-            if path.resolve() not in kept:
-                path.unlink()
-    within = {parent for path in found for parent in path.parents if folder in parent.parents}
-    for parent in sorted(within, reverse=True):
-        with suppress(OSError):  # it holds something else
-            parent.rmdir()

@@ -1,4 +1,7 @@
-"""Writing files so that a reader, or an interrupted run, never sees half of one."""
+"""Writing files so that a reader, or an interrupted run, never sees half of one.
+
+Whatever is written so inside a folder that this process has claimed is noted in its manifest.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,27 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ddrecon.errors import FormatError
 
 _TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
+claimed: dict[Path, Callable[[Path, str], None]] = {}
+"""What notes files, by the absolute paths of the folders that this process has claimed."""
+
+
+def note_written(path: Path, mark: str = "") -> None:
+    """Has the claimed folder nearest above `path`, if any, note that it is written.
+
+    A `mark` of "/" says that it is a folder with a manifest of its own.
+    """
+    absolute = Path(os.path.abspath(path))
+    for folder in filter(claimed.__contains__, absolute.parents):
+        claimed[folder](absolute, mark)
+        break
 
 
 @contextmanager
@@ -26,6 +42,7 @@ def replace_file(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
     with refusals(path):
+        note_written(path)
         try:
             yield temporary
             os.replace(temporary, path)
@@ -48,7 +65,8 @@ def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
                     os.link(path, kept)
                 except OSError:  # of a system without links
                     shutil.copyfile(path, kept)
-    flush(path.parent)
+    with suppress(FormatError):  # Windows and some network drives flush no folders
+        flush(path.parent)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -59,9 +77,14 @@ def write_json(path: Path, content: Any) -> None:
 
 def remove_temporaries(folder: Path) -> None:
     """Removes what processes that were killed while writing have left in `folder`."""
-    for path in folder.iterdir():
-        if _TEMPORARY.fullmatch(path.name):
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if is_temporary(path):
             path.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether `path` is named as what `replace_file` gives a block to write to."""
+    return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def flush(path: Path) -> None:
