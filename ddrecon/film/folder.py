@@ -247,7 +247,7 @@ def open_film(
             is_same = (resume or part is not None) and known.is_file()
             if is_same:
                 _require_same_film(path, describe(read_scene(known)), describe(scene_file))
-            write_scene(scene_file, path, resume=resume)
+            write_scene(scene_file, path)
             if not resume:
                 chosen = choose_frames(film.frames.numbers, part)
                 ends = [f"frames/{n:04d}/" for n in chosen] + [

@@ -48,7 +48,7 @@ def open_run(
     run, path = _begin(scene, scene_file), claimed.path
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
-    write_scene(scene_file, path, resume=resume)
+    write_scene(scene_file, path)
     if loaded is None:
         claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])
     of_run = {"seed": run.seed, "engines": engine_of_scene(scene, has_slabs(scene))}

@@ -34,7 +34,7 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene, scene_text
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     PHASE,
@@ -205,16 +205,17 @@ class RunFolder(Checkpoints):
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
-def write_scene(scene_file: SceneFile, folder: Path, *, resume: bool) -> None:
-    """Writes the resolved scene to `folder`, but never over the scene file itself.
+def write_scene(scene_file: SceneFile, folder: Path) -> None:
+    """Writes the resolved scene to `folder`; UsageError where the scene file itself would go.
 
-    A job that is to `resume` may read the very scene that was written there; UsageError otherwise.
+    One that was written there, and not changed since, may be read and go.
     """
     path = folder / SCENE
-    if path.resolve() != scene_file.path.resolve():
-        dump_scene(describe(scene_file), path)
-    elif not resume:
-        raise UsageError(f"{path}: is the scene file itself; choose another folder")
+    if path.resolve() == scene_file.path.resolve():
+        text = path.read_text(encoding="utf-8")
+        if text != scene_text(describe(read_scene(path))):
+            raise UsageError(f"{path}: would be replaced by what it says; choose another folder")
+    dump_scene(describe(scene_file), path)
 
 
 def field_key(name: str) -> str:

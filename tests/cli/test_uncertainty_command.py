@@ -12,7 +12,6 @@ from test_resume import press_ctrl_c_in
 from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.run.live import LiveRun
-from ddrecon.run.run_folder import remove_samples
 from ddrecon.uncertainty.experiments import Uncertainty
 
 Run = Callable[..., Result]
@@ -62,8 +61,6 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
         "density_mean",
         "density_explained",
     }
-    remove_samples(Path("sure"))
-    assert not any(Path("sure").iterdir())
 
 
 def test_without_experiments_every_figure_has_its_caveat(finished: Path, succeed: Run) -> None:

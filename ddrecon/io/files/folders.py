@@ -61,7 +61,7 @@ class Folder:
             warnings.warn(f"{file}: was not written by ddrecon; now {aside.name}", DataWarning, 2)
         self.names[name] = None
         with (self.path / MANIFEST).open("a", **TEXT) as stream:
-            stream.write(f"{name}\\n")
+            stream.write(f"{name}\n")
 
     def clear(self, kept: Iterable[Path] = (), parts: Sequence[str] = ("",)) -> None:
         """Removes the files that the manifest names, but for those `kept`, and emptied folders.
@@ -119,7 +119,7 @@ class Folder:
         """Writes the manifest."""
         with replace_file(self.path / MANIFEST) as temporary:
             lines = f"ddrecon {self.kind}", *self.names
-            temporary.write_text("".join(f"{line}\\n" for line in lines), **TEXT)
+            temporary.write_text("".join(f"{line}\n" for line in lines), **TEXT)
 
 
 @contextmanager
