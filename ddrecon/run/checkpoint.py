@@ -143,7 +143,7 @@ def require_same(old: Any, new: Any, what: str) -> None:
         if there != now
     ]
     if len(changes) > MOST:
-        changes[MOST:] = [f"{what}: and {len(changes) - MOST} more differ"]
+        changes[MOST:] = [f"{what}: {len(changes) - MOST} more differ"]
     if changes:
         raise UsageError(changes)
 

@@ -31,7 +31,8 @@ def read_json(path: str) -> Any:
     return json.loads(Path(path).read_text())
 
 
-FILES = """scene.yaml result.yaml environment.json loss.csv parameters.json summary.json report.html
+FILES = """ddrecon.manifest scene.yaml result.yaml environment.json loss.csv parameters.json
+summary.json report.html
 volumes volumes/density.npz checkpoints checkpoints/last.pt checkpoints/previous.pt previews
 previews/density.slices.png previews/front.png previews/side.png"""
 
@@ -107,8 +108,8 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
-    names = "notes.txt", "volumes/mine.npz", "previews/mine.png"
-    for path in (Path("out", name) for name in (*names, "lights.1.radiance.npy")):
+    names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "lights.1.radiance.npy"
+    for path in (Path("out", name) for name in names):
         path.write_text(path.name)
     succeed(*OPTIMIZE, "out", "--overwrite")
     succeed(*OPTIMIZE, "fresh")

@@ -24,8 +24,9 @@ CHANGES = {
 }
 """What every command refuses, in place of its scene."""
 TABLE = """
-render scene.yaml -o full => 2 full: the folder is not empty; choose another, or say --overwrite
-optimize scene.yaml -o full => 2 full: the folder is not empty; choose another, or say --overwrite
+render scene.yaml -o full => 2 full: holds notes.txt, which ddrecon did not write; choose another
+optimize scene.yaml -o full --overwrite => 2 full: holds notes.txt, which ddrecon did not write;
+optimize scene.yaml -o . --overwrite => 2 .: holds bad.npz, which ddrecon did not write
 render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
@@ -41,7 +42,7 @@ optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
 optimize scene.yaml -o out --resume => 2 out/checkpoints/last.pt: there is no checkpoint to resume
-optimize scene.yaml -o full --resume => 2 full/checkpoints/last.pt: there is no checkpoint to resume
+optimize scene.yaml -o full --resume => 2 full: holds notes.txt, which ddrecon did not write
 gradcheck scene.yaml --parameter densty => 2 --parameter densty: the scene has no such number; did
 gradcheck scene.yaml --json gone/report.json => 2 gone/report.json: there is no folder
 check gone.yaml --json gone/report.json => 2 gone/report.json: there is no folder
@@ -65,7 +66,7 @@ info bad.npz => 3 bad.npz: is damaged: File is not a zip file
 info gone.vol => 3 gone.vol: cannot be read
 watch . => 2 .: holds no run, as `ddrecon optimize -o` makes it
 uncertainty gone -o sure => 2 gone: holds no run
-uncertainty full -o ./full => 2 Error: -o names the run itself
+uncertainty full -o ./full => 2 full: holds no run
 """
 
 
@@ -109,7 +110,7 @@ def test_a_run_cannot_go_on_as_another(refuse: Refuse, succeed: Callable[..., ob
     again = "optimize", "scene.yaml", "-o", "out", "--iterations", "2"
     succeed(*again)
     (line,) = refuse(2, *again, "--resume", "-D", "volume.g=0.1")
-    assert "belongs to another scene: volume.g is 0.3 there, 0.1 now" in line
+    assert "belongs to another scene; use another output folder: volume.g is 0.3 there" in line
     (line,) = refuse(2, *again[:-1], "1", "--resume")
     assert "2 iterations are made already" in line
     path = Path("out/checkpoints/last.pt")

@@ -8,6 +8,7 @@ it ends, so what a killed process left behind is only a name.
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -85,25 +86,20 @@ class Folder:
             for place in self.places():
                 with suppress(OSError):  # it holds something else
                     place.rmdir()
-        self.names = {name: None for name in self.names if (self.path / name).exists()}
+        left = (n for n in self.names if (self.path / re.sub("/$", f"/{MANIFEST}", n)).is_file())
+        self.names = dict.fromkeys(left)
         self.write()
 
     def places(self) -> list[Path]:
         """The folders within that hold files of the manifest, inner ones first."""
-        paths = [self.path / name for name in self.names]
-        above = {up for path in paths for up in path.parents if self.path in up.parents}
-        return sorted(above, reverse=True)
+        paths = {up for name in self.names for up in (Path(name), *Path(name).parents)}
+        return sorted(self.path / path for path in paths if (self.path / path).is_dir())[:0:-1]
 
     def require(self, may_exist: bool) -> None:
         """Raises UsageError where others' files are, or its own unless these `may_exist`."""
-        others = [
-            path.name
-            for path in sorted(self.path.iterdir())
-            if not (path.name in (LOCK, MANIFEST) or is_temporary(path))
-        ]
-        kind = kind_of_folder(self.path)
-        if kind is None and others:
-            strange = f"holds {others[0]}, which ddrecon did not write"
+        kind, content = kind_of_folder(self.path), self.content()
+        if kind is None and content:
+            strange = f"holds {content[0]}, which ddrecon did not write"
             raise UsageError(f"{self.path}: {strange}; choose another folder")
         if kind not in (None, self.kind):
             raise UsageError(
@@ -114,6 +110,11 @@ class Folder:
             raise UsageError(
                 f"{self.path}: the folder is not empty; choose another, or say --overwrite{also}"
             )
+
+    def content(self) -> list[str]:
+        """The names of all that is in the folder, but for what this class itself writes there."""
+        entries = [entry.name for entry in sorted(self.path.iterdir()) if not is_temporary(entry)]
+        return [name for name in entries if name not in (LOCK, MANIFEST)]
 
     def write(self) -> None:
         """Writes the manifest."""
@@ -160,7 +161,7 @@ def claim_folder(
                 yield folder
             finally:
                 del claimed[key]
-                if not folder.names:
+                if not folder.content():
                     (path / MANIFEST).unlink(missing_ok=True)
     finally:
         for place in lacking:

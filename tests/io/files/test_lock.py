@@ -27,7 +27,10 @@ def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path
         assert first.stdout is not None and first.stdout.readline() == b"in\n"
         line = f"{tmp_path}: process {first.pid} is writing there; wait for it, or choose another"
         for _ in range(2):
-            with pytest.raises(UsageError, match=line), claim_folder(tmp_path, "run", overwrite=True):
+            with (
+                pytest.raises(UsageError, match=line),
+                claim_folder(tmp_path, "run", overwrite=True),
+            ):
                 pass
         first.communicate(b"\n")
     assert list(tmp_path.iterdir()) == []
