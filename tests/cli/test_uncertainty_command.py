@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
+from small_scene import contents
 from test_resume import press_ctrl_c_in
 
 from ddrecon.errors import DataWarning
+from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.run.live import LiveRun
 from ddrecon.uncertainty.experiments import Uncertainty
@@ -61,6 +63,27 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
         "density_mean",
         "density_explained",
     }
+
+
+def test_no_run_is_harmed(finished: Path, succeed: Run, refuse: Refuse) -> None:
+    """Nor is a folder made where there is nothing to go on with; what was written has its names."""
+    assert files_of("run") == set(names_in(finished))
+    (finished / "frames").mkdir()  # which makes no film of it
+    refuse(2, "uncertainty", "run", "-o", "sure", "--resume", *KNOWN)
+    for command in ("uncertainty run", "render scene.yaml"):
+        (line,) = refuse(2, *command.split(), "-o", "run", "--overwrite", "-q")
+        assert line.startswith("run: is the folder of another kind of job, run")
+    light = "--light", "{type: ambient, radiance: 1}"
+    succeed("render", "run", "-o", "seen", "--ring", "2", "--fluence", "--components", *light)
+    succeed("uncertainty", "run", "-o", "sure", "--calibrate", "0", "--keep-samples", *KNOWN)
+    for kind in ("seen", "sure"):
+        assert files_of(kind) == set(names_in(Path(kind))) - {"checkpoints/previous.pt"}
+    (line,) = refuse(2, "optimize", "scene.yaml", "-o", "sure", "--overwrite")
+    assert line.startswith("sure: is the folder of another kind of job, uncertainty")
+
+
+def files_of(folder: str) -> set[str]:
+    return {name for name, data in contents(Path(folder)).items() if data} - {MANIFEST}
 
 
 def test_without_experiments_every_figure_has_its_caveat(finished: Path, succeed: Run) -> None:
