@@ -18,5 +18,11 @@ def main(*arguments: Any, **settings: Any) -> None:
         if end.code == INTERRUPTED:
             os._exit(INTERRUPTED)  # threads that compile kernels are not waited for
         raise
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        # Of a stream, not of a file: what is left in it cannot be written at the end either.
+        os.write(2, f"cannot write to the standard output: {error.strerror}\n".encode())
+        os._exit(3)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done

@@ -37,7 +37,7 @@ def write_page(
     """Writes the page of `sections` under `title`, and `lead`, a sentence, to `path`."""
     text = page_text(title, lead, sections, is_alive=is_alive)
     with replace_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def page_text(

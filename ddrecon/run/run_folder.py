@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import FormatError, UsageError, is_utf8
 from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
@@ -34,7 +34,14 @@ from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene, scene_text
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    dump_scene,
+    read_scene,
+    referenced_files,
+    scene_text,
+)
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     PHASE,
@@ -208,9 +215,13 @@ class RunFolder(Checkpoints):
 def write_scene(scene_file: SceneFile, folder: Path) -> None:
     """Writes the resolved scene to `folder`; UsageError where the scene file itself would go.
 
-    One that was written there, and not changed since, may be read and go.
+    One that was written there, and not changed since, may be read and go. Raises FormatError for
+    files that no scene file can name.
     """
     path = folder / SCENE
+    for file in referenced_files(scene_file):
+        if not is_utf8(file):
+            raise FormatError(file, "cannot be named in scene.yaml: it is not UTF-8; rename it")
     if path.resolve() == scene_file.path.resolve():
         text = path.read_text(encoding="utf-8")
         if text != scene_text(describe(read_scene(path))):

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCENE = "{volume: {bounds: 3, resolution: [1, 1], densty: 1}, views: [{camera: {}}]}"
 TABLE = """
 check missing.yaml
@@ -38,3 +40,12 @@ def test_errors_of_a_scene_file_need_no_torch(folder: Path) -> None:
     assert done.stderr == ""
     assert [line[1:] for line in done.stdout.splitlines()] == [" True"] * len(COMMANDS)
     assert [line[0] for line in done.stdout.splitlines()] == ["2"] * (len(COMMANDS) - 2) + ["3"] * 2
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version"])
+def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
+    command = [sys.executable, "-m", "ddrecon", argument]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    line = "cannot write to the standard output: No space left on device\n"
+    assert (done.returncode, done.stderr) == (3, line)

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import FormatError, is_utf8
 
 _TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
 claimed: dict[Path, Callable[[Path, str], None]] = {}
@@ -38,9 +38,11 @@ def replace_file(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`, with its suffix, for a block to write to.
 
     It becomes `path` when the block ends well, and vanishes when not. Raises FormatError where the
-    system refuses to write.
+    system refuses to write, or where other programs and scene files could not name it.
     """
     temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
+    if not is_utf8(path):
+        raise FormatError(path, "cannot be written: its name is not UTF-8; choose another")
     with refusals(path):
         note_written(path)
         try:
