@@ -39,7 +39,7 @@ COMMON = (
     click.option(
         "--threads",
         type=click.IntRange(min=1),
-        help="Processor threads; OMP_NUM_THREADS or all cores unless given.",
+        help="Processor threads; OMP_NUM_THREADS or all cores it may use unless given.",
     ),
     click.option("--seed", type=click.IntRange(-(2**31), 2**32 - 1), default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),

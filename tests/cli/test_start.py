@@ -5,6 +5,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from ddrecon.cli.session import Session
 
 SCENE = "{volume: {bounds: 3, resolution: [1, 1], densty: 1}, views: [{camera: {}}]}"
 TABLE = """
@@ -49,3 +52,11 @@ def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     line = "cannot write to the standard output: No space left on device\n"
     assert (done.returncode, done.stderr) == (3, line)
+
+
+def test_threads_are_no_more_than_cores_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})
+    session = Session()
+    session.start()
+    assert session.threads == torch.get_num_threads() == 1
