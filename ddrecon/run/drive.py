@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def follow_run(
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
     if cells_are_shared():
-        find_results(run, registers=True)
+        find_results(run, lambda views, _: views)
 
 
 def drive_run(
@@ -130,11 +130,17 @@ def drive_run(
         return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
 
     advance(run, make_iteration, folder, is_quiet, title)
-    if cells_are_shared():
-        return folder.finish(run)
-    # What is left the first rank does by itself.
-    leave_ranks()
-    return folder.finish(run)
+    if not cells_are_shared():
+        leave_ranks()  # what is left the first rank does by itself
+
+    def show(views: Sequence[Any], what: str) -> Iterable[Any]:
+        return tqdm(views, desc=what, leave=False, **bar_settings(is_quiet))
+
+    try:
+        return folder.finish(run, show)
+    except KeyboardInterrupt:
+        made = f"after {run.iteration} iterations"
+        raise KeyboardInterrupt(f"{made}; write its results with --resume") from None
 
 
 def advance(

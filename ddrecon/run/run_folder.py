@@ -17,6 +17,7 @@ from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
+from ddrecon.progress import Progress
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.reconstruct.together import Together
@@ -149,10 +150,10 @@ class RunFolder(Checkpoints):
         """Writes pictures of every view and of the volume, marked with the iteration."""
         self._pictures(find_results(run), f".{run.iteration:06d}")
 
-    def finish(self, run: Reconstruction) -> dict[str, Any]:
+    def finish(self, run: Reconstruction, progress: Progress) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        found = find_results(run, registers=True)
+        found = find_results(run, progress)
         scene = found.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])

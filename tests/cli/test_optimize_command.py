@@ -141,6 +141,7 @@ def test_overwriting_keeps_what_the_new_run_reads(
 def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
     assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
+    assert "register: " in loud.stderr and "1/1" in loud.stderr
     assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
 
 

@@ -12,6 +12,7 @@ from click.testing import Result
 
 from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.run import quality
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
@@ -66,6 +67,18 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     succeed(*OPTIMIZE, "parts", "--resume")
     assert iterations("parts") == [1, 2, 3, 4]
     assert np.array_equal(density_of("parts"), density_of("whole"))
+
+
+def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, quality, "register", 1)
+        result = run(*OPTIMIZE, "out")
+    told = "interrupted after 4 iterations; write its results with --resume\n"
+    assert (result.exit_code, result.stderr) == (130, told)
+    succeed(*OPTIMIZE, "out", "--resume")
+    assert Path("out/report.html").is_file()
 
 
 def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
