@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import chdir
 from itertools import chain, product
@@ -22,7 +23,7 @@ import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.film.drive import share_out, spread_out
-from ddrecon.film.folder import KEPT
+from ddrecon.film.folder import KEPT, Film
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.table import field_names, read_field, write_field
 from ddrecon.reconstruct.divergence import NotFiniteError
@@ -441,6 +442,22 @@ def test_a_folder_that_is_no_films_is_left_alone(film: Path, run: Run, refuse: R
         assert line.startswith("foreign: holds report.html, which ddrecon did not write")
     with pytest.raises(ddrecon.UsageError, match="which ddrecon did not write"):
         next(ddrecon.optimize_sequence("film.yaml", "foreign"))
+
+
+def test_a_part_that_waits_says_so(
+    film: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("ddrecon.io.files.folders.PATIENCE", 0.0)
+    part, told = Film(read_scene("film.yaml"), film / "out", build_scene, is_quiet=False), ""
+    Path("out").mkdir()
+    waiting = threading.Thread(target=lambda: part.claim().__enter__())
+    with part.claim():
+        waiting.start()
+        while not told:
+            waiting.join(0.01)
+            told = capsys.readouterr().err
+    waiting.join()
+    assert told.startswith(f"{film}/out: process ") and "waiting for it" in told
 
 
 def test_frames_are_spread_over_all() -> None:

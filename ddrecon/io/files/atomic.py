@@ -92,7 +92,8 @@ def is_temporary(path: Path) -> bool:
 def flush(path: Path) -> None:
     """Puts the file or folder at `path` on its disk; raises FormatError where the system cannot."""
     with refusals(path):
-        handle = os.open(path, os.O_RDONLY)
+        # Windows puts only what it may write on its disk.
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
         try:
             os.fsync(handle)
         finally:
