@@ -279,8 +279,8 @@ def _require_same_film(path: Path, there: dict[str, Any], now: dict[str, Any]) -
 def _require_free(path: Path, numbers: Sequence[int]) -> None:
     """Raises UsageError where another process does one of the frames `numbers` of the film."""
     for lock in path.glob(f"{PART}.*.lock"):
-        first, last = map(int, lock.name.split(".")[1].split("-"))
-        if any(first <= number <= last for number in numbers):
+        ends = re.fullmatch(r"([0-9]+)-([0-9]+)", lock.name.split(".")[1])
+        if ends and any(int(ends[1]) <= number <= int(ends[2]) for number in numbers):
             with hold(lock):
                 pass
 

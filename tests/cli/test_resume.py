@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+from ddrecon.errors import UsageError
+from ddrecon.io.files.folders import LOCK, hold
 from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.run import quality
+from ddrecon.run import drive, quality
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
@@ -79,6 +81,21 @@ def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
     assert (result.exit_code, result.stderr) == (130, told)
     succeed(*OPTIMIZE, "out", "--resume")
     assert Path("out/report.html").is_file()
+
+
+def test_what_is_resumed_is_read_once_no_other_process_can_write(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    succeed(*OPTIMIZE, "out")
+    load = drive.load_checkpoint
+
+    def load_locked(*arguments: Any) -> Any:
+        with pytest.raises(UsageError, match="is writing there"), hold(Path("out", LOCK)):
+            pass
+        return load(*arguments)
+
+    monkeypatch.setattr(drive, "load_checkpoint", load_locked)
+    succeed(*OPTIMIZE, "out", "--resume")
 
 
 def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
