@@ -1,4 +1,4 @@
-"""Commands of scenes and runs: check, render, optimize, uncertainty, watch.
+"""Commands of scenes and runs: check, render, optimize, uncertainty.
 
 torch is imported inside the commands, after their scene is read: help, and what is wrong with a
 scene file, are shown at once.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -379,27 +378,3 @@ def uncertainty(
     with claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
         record = drive_uncertainty(taken, folder, request, resume=resume, is_quiet=session.is_quiet)
     session.show(record, uncertainty_lines(record, output))
-
-
-@click.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    show_default="8765, or a free one if that is taken",
-    help="Where to serve it; 0 is a free one.",
-)
-@in_session
-def watch(session: Session, run: Path, port: int | None) -> None:
-    """Serve the page of RUN, the folder of a run or a film, on this machine alone, as it goes on.
-
-    Ctrl-C ends it.
-    """
-    from ddrecon.film.report import film_page
-    from ddrecon.io.files.folders import FILM, kind_of_folder
-    from ddrecon.run.live import HOST, LiveRun, serve_page
-
-    page = partial(film_page, run) if kind_of_folder(run) == FILM else LiveRun(run).page
-    with serve_page(page, port) as server:
-        click.echo(f"http://{HOST}:{server.server_port}/  (Ctrl-C ends)")
-        server.serve_forever()

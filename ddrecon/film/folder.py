@@ -23,7 +23,7 @@ from ddrecon.io.files.folders import FILM, RUN, Folder, claim_folder, hold
 from ddrecon.io.volumes.table import read_field
 from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.run.checkpoint import require_same
-from ddrecon.run.run_folder import SCENE, field_key, volume_file, write_scene, write_volume
+from ddrecon.run.run_folder import SCENE, SUMMARY, field_key, volume_file, write_scene, write_volume
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
@@ -91,8 +91,8 @@ class Film:
         return self.path / "frames" / f"{number:04d}"
 
     def done(self) -> list[int]:
-        """The frames that are finished: the report of each is written last."""
-        return [n for n in self.frames.numbers if (self.of(n) / "report.html").is_file()]
+        """The frames that are finished."""
+        return [n for n in self.frames.numbers if (self.of(n) / SUMMARY).is_file()]
 
     def calibrated(self, number: int) -> Path:
         """The folder of the volumes that the frame `number` had in the calibration."""
@@ -208,7 +208,8 @@ def finished_frames(path: Path, part: str | None) -> list[Path]:
 
     Raises UsageError where there are none.
     """
-    runs = {int(report.parent.name): report.parent for report in path.glob("frames/*/report.html")}
+    finished = (file.parent for file in path.glob(f"frames/*/{SUMMARY}"))
+    runs = {int(run.name): run for run in finished if run.name.isdecimal()}
     if not runs:
         raise UsageError(f"{path}: no frame is done")
     return [runs[number] for number in choose_frames(sorted(runs), part)]

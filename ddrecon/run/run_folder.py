@@ -18,6 +18,7 @@ from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.progress import Progress
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.reconstruct.together import Together
@@ -32,7 +33,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import write_run_report
+from ddrecon.run.report import GOES_ON, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
@@ -59,6 +60,10 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
+PAGE_SECONDS = 20.0
+"""Its report is written about this often, within the same part of its time."""
+REPORT, SUMMARY = "report.html", "summary.json"
+"""Its page, and what is written last of all: a run that has it is finished."""
 
 
 def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
@@ -126,6 +131,7 @@ class RunFolder(Checkpoints):
             for name in ("volumes", "previews", CHECKPOINTS):
                 (path / name).mkdir(exist_ok=True)
         self.log = LossLog(path / "loss.csv")
+        self.next_page = monotonic() + PAGE_SECONDS
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run."""
@@ -145,6 +151,23 @@ class RunFolder(Checkpoints):
         """Writes a checkpoint, after the log, which so never lacks rows that it counts."""
         flush(self.log.path)
         super().save(run)
+
+    def save_in_time(self, run: Reconstruction | Together) -> None:
+        """As of all checkpoints; and has the report say how far the run is, unless that is new."""
+        super().save_in_time(run)
+        # Where ranks share cells, all of them would have to render.
+        if isinstance(run, Reconstruction) and run.iteration and not cells_are_shared():
+            start = monotonic()
+            if start >= self.next_page:
+                found = find_results(run)
+                summary = _summary(run) | {"ended": GOES_ON}
+                self._report(found, summary | {"views": found.quality, "diagnoses": []})
+                seconds = (monotonic() - start) / CHECKPOINT_SHARE
+                self.next_page = monotonic() + max(PAGE_SECONDS, seconds)
+
+    def _report(self, found: Findings, summary: Mapping[str, Any]) -> None:
+        rows = self.log.rows(summary["iterations"])
+        write_run_report(self.path / REPORT, found, rows, summary, self.environment)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -167,8 +190,8 @@ class RunFolder(Checkpoints):
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
-        write_json(self.path / "summary.json", summary)
-        write_run_report(self.path / "report.html", found, rows, summary, self.environment)
+        self._report(found, summary)
+        write_json(self.path / SUMMARY, summary)
         return summary
 
     def _store(self, scene: Scene, name: str) -> Any:

@@ -37,7 +37,7 @@ render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
 optimize scene.yaml -o out --iterations 0 => 2 -D optimize.iterations=0: optimize.iterations: must
 optimize scene.yaml -o out --iterations some => 2 -D optimize.iterations=some: optimize.iterations:
-optimize scene.yaml -o out --watch --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
+optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
@@ -64,7 +64,6 @@ export scene.yaml -o none/smoke.xml => 2 none/smoke.xml: there is no folder
 info front.txt => 3 front.txt: unknown image format '.txt'
 info bad.npz => 3 bad.npz: is damaged: File is not a zip file
 info gone.vol => 3 gone.vol: cannot be read
-watch . => 2 .: holds no run, as `ddrecon optimize -o` makes it
 uncertainty gone -o sure => 2 gone: holds no run
 uncertainty full -o ./full => 2 full: holds no run
 """

@@ -14,6 +14,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import LOCK, hold
 from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.report.page import REFRESH
 from ddrecon.run import drive, quality
 
 Run = Callable[..., Result]
@@ -81,6 +82,23 @@ def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
     assert (result.exit_code, result.stderr) == (130, told)
     succeed(*OPTIMIZE, "out", "--resume")
     assert Path("out/report.html").is_file()
+
+
+def test_the_report_is_there_while_a_run_goes_on(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Browsers load it again and again until then."""
+    monkeypatch.setattr("ddrecon.run.run_folder.PAGE_SECONDS", 0.0)
+    succeed(*OPTIMIZE, "whole")
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, Parameter, "step", 3)
+        assert run(*OPTIMIZE, "out").exit_code == 130
+    begun = Path("out/report.html").read_text()
+    assert "It goes on." in begun and REFRESH in begun
+    assert all(f'<section id="{name}">' in begun for name in ("volume", "loss", "views"))
+    succeed(*OPTIMIZE, "out", "--resume")
+    done = Path("out/report.html").read_text()
+    assert "It goes on." not in done and REFRESH not in done
 
 
 def test_what_is_resumed_is_read_once_no_other_process_can_write(
