@@ -19,7 +19,7 @@ def main(*arguments: Any, **settings: Any) -> None:
             os._exit(INTERRUPTED)  # threads that compile kernels are not waited for
         raise
     except OSError as error:
-        if error.filename is not None:
+        if error.filename is not None or error.errno is None:
             raise
         # Of a stream, not of a file: what is left in it cannot be written at the end either.
         os.write(2, f"cannot write to the standard output: {error.strerror}\n".encode())

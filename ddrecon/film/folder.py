@@ -27,7 +27,13 @@ from ddrecon.run.run_folder import SCENE, SUMMARY, field_key, volume_file, write
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
-from ddrecon.scene_file.load import SceneFile, describe, read_described, read_scene
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    read_described,
+    read_scene,
+    referenced_files,
+)
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
@@ -241,7 +247,8 @@ def open_film(
     given = None if shared is None else read_shared(shared)
     with ExitStack() as stack:
         with film.claim(overwrite=overwrite, resume=resume) as folder:
-            _require_free(path, numbers if resume else choose_frames(film.frames.numbers, part))
+            chosen = choose_frames(film.frames.numbers, part)
+            _require_free(path, numbers if resume else chosen)
             if numbers:
                 lock = path / f"{PART}.{numbers[0]:04d}-{numbers[-1]:04d}.lock"
                 stack.enter_context(hold(lock))
@@ -250,20 +257,16 @@ def open_film(
                 _require_same_film(path, describe(read_scene(known)), describe(scene_file))
             write_scene(scene_file, path)
             if not resume:
-                chosen = choose_frames(film.frames.numbers, part)
-                ends = [f"frames/{n:04d}/" for n in chosen] + [
-                    f"{SEQUENCE}/film_{n:04d}." for n in chosen
-                ]
-                kept = scene_file.path, known, *([shared] if shared else [])
-                folder.clear(kept, ends if is_same else [""])
+                frames = [f"frames/{number:04d}/" for number in chosen]
+                frames += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
+                kept = [known, scene_file.path, *referenced_files(scene_file)]
+                kept += [] if shared is None else [shared]
+                folder.clear(kept, frames if is_same else [""])
             if given is not None:
-                if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given[
-                    "values"
-                ]:
-                    raise UsageError(
-                        f"{path / SHARED}: holds another calibration; leave --shared out"
-                    )
-                write_json(path / SHARED, given)
+                taken = path / SHARED
+                if taken.is_file() and read_shared(taken)["values"] != given["values"]:
+                    raise UsageError(f"{taken}: holds another calibration; leave --shared out")
+                write_json(taken, given)
             for number in film.frames.numbers:
                 note_written(film.of(number), "/")
         yield

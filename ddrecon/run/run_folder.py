@@ -249,7 +249,7 @@ def write_scene(scene_file: SceneFile, folder: Path) -> None:
     if path.resolve() == scene_file.path.resolve():
         text = path.read_text(encoding="utf-8")
         if text != scene_text(describe(read_scene(path))):
-            raise UsageError(f"{path}: would be replaced by what it says; choose another folder")
+            raise UsageError(f"{path}: was changed and would be replaced; name a copy elsewhere")
     dump_scene(describe(scene_file), path)
 
 

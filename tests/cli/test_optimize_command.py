@@ -16,6 +16,7 @@ from small_scene import contents
 from ddrecon.reconstruct import tuning
 
 Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
 DensityOf = Callable[[str], np.ndarray]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
 COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr"]
@@ -138,10 +139,20 @@ def test_overwriting_keeps_what_the_new_run_reads(
     succeed(*again, "--resume")
 
 
+def test_a_scene_file_of_the_users_own_stays(succeed: Run, refuse: Refuse) -> None:
+    """Even where it was a run's once."""
+    succeed(*OPTIMIZE, "out", "--iterations", "1")
+    with Path("out/scene.yaml").open("a") as stream:
+        stream.write("# why 4 iterations are enough\n")
+    for how in ("--overwrite", "--resume"):
+        (line,) = refuse(2, "optimize", "out/scene.yaml", "-q", "-o", "out", how)
+        assert line.startswith("out/scene.yaml: was changed and would be replaced")
+
+
 def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
     assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
-    assert "register: " in loud.stderr and "1/1" in loud.stderr
+    assert "register: " in loud.stderr
     assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
 
 

@@ -154,7 +154,8 @@ def claim_folder(
             folder.require(overwrite or resume)
             for place in (path, *folder.places()):
                 remove_temporaries(place)
-            note_written(path, "/")
+            with refusals(path):
+                note_written(path, "/")
             claimed[key] = folder.note
             try:
                 folder.write()
@@ -195,7 +196,8 @@ def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None
     except OSError as error:
         raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
     try:
-        lock.write_text(str(os.getpid()))
+        with suppress(OSError):  # a full disk
+            lock.write_text(str(os.getpid()))
         yield
     finally:
         # Before the lock goes: whoever waits for a file without a name has to begin again.
