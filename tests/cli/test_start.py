@@ -50,7 +50,7 @@ def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
     command = [sys.executable, "-m", "ddrecon", argument]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
-    line = "cannot write to the standard output: No space left on device\n"
+    line = "cannot write: No space left on device\n"
     assert (done.returncode, done.stderr) == (3, line)
 
 
