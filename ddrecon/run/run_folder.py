@@ -60,8 +60,8 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
-PAGE_SECONDS = 20.0
-"""Its report is written about this often, within the same part of its time."""
+PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
+"""Its report is written about this often, and takes at most this part of its time."""
 REPORT, SUMMARY = "report.html", "summary.json"
 """Its page, and what is written last of all: a run that has it is finished."""
 
@@ -162,8 +162,8 @@ class RunFolder(Checkpoints):
                 found = find_results(run)
                 summary = _summary(run) | {"ended": GOES_ON}
                 self._report(found, summary | {"views": found.quality, "diagnoses": []})
-                seconds = (monotonic() - start) / CHECKPOINT_SHARE
-                self.next_page = monotonic() + max(PAGE_SECONDS, seconds)
+                seconds = monotonic() - start
+                self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
 
     def _report(self, found: Findings, summary: Mapping[str, Any]) -> None:
         rows = self.log.rows(summary["iterations"])
