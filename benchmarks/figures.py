@@ -46,7 +46,7 @@ COMMANDS = {
     "solvers": "python benchmarks/solver.py",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
-    "gpu": "python benchmarks/gpu.py",
+    "gpu": "python benchmarks/gpu_check.py speed",
     "scale": "python benchmarks/scaling.py",
     "speed": "ddrecon bench --quick",
     "hard": "ddrecon bench --hard",

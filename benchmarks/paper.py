@@ -25,7 +25,16 @@ import paper_path_replay
 import path_replay
 import yaml
 from paper_figures import Log, draw, pace, read_log
-from paper_page import CONFIGS, PICTURES, ROOT, as_options, ddrecon, read_table, rewrite_table
+from paper_page import (
+    CONFIGS,
+    PICTURES,
+    ROOT,
+    SHAPES,
+    as_options,
+    ddrecon,
+    read_table,
+    rewrite_table,
+)
 from paper_shown import (
     Run,
     Runs,
@@ -77,7 +86,7 @@ class Experiment:
 
 
 G_ALONE = (
-    *(f"volume.{name}={{file: ../../data/shapes/cloud.npz}}" for name in ("sigma_a", "sigma_s")),
+    *(f"volume.{name}={{file: {SHAPES}/cloud.npz}}" for name in ("sigma_a", "sigma_s")),
     "optimize.parameters={g: {init: 0.67, lr: 0.1}}",
     "optimize.iterations=100",
 )
@@ -116,7 +125,7 @@ EXPERIMENTS = (
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
     Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),
     Experiment(
-        "fig14", "", show_photograph, (FINE, "views.0.image=../../data/cumulus/cumulus.webp")
+        "fig14", "", show_photograph, (FINE, f"views.0.image={ROOT}/data/cumulus/cumulus.webp")
     ),
 )
 """In the order of docs/experiments.md."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 
 import torch
-from paper_page import CONFIGS, rewrite_table
+from paper_page import CONFIGS, SHAPES, rewrite_table
 
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
@@ -30,7 +30,7 @@ FIELDS, NUMBERS = (
     for more in (", field: true, tv: 1e-4", "")
 )
 TRUE = [
-    *(f"volume.{name}={{file: ../../data/shapes/cloud.npz}}" for name in STARTS),
+    *(f"volume.{name}={{file: {SHAPES}/cloud.npz}}" for name in STARTS),
     "optimize.parameters={g: {init: 0.67, lr: 0.1}}",
 ]
 ALIKE = [f"views.{index}.weight=1" for index in range(4)]

@@ -155,7 +155,7 @@ def draw_parts(runs: Runs) -> None:
         },
     )
     for name in parts:
-        run, bunny = runs[name], ["volume.density={file: ../../data/shapes/bunny.npz}"]
+        run, bunny = runs[name], [f"volume.density={{file: {SHAPES}/bunny.npz}}"]
         places = {"start": (CONFIGS / "fig09.yaml", bunny), "end": (run.folder, [])}
         for place, (scene, overrides) in places.items():
             folder = run.folder / f"derivative_{place}"

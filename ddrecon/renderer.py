@@ -235,7 +235,9 @@ def _find_light(
     source = received.source
     if sky is not None:
         source = source.plus(sky.weighted(remaining_moments(cells)))
-    outside = medium.index**2 * ambient_radiance(lights, cells.g)
+    outside = ambient_radiance(lights, cells.g)
+    if medium.index != 1:
+        outside = medium.index**2 * outside
     # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(cells, source, outside, settings, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.

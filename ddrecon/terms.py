@@ -9,6 +9,7 @@ from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import (
+    BRIGHTNESS,
     AmbientLight,
     BeamLight,
     DirectionalLight,
@@ -31,12 +32,11 @@ def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
     medium, phase = scale_medium(scene.volume, scene.diffusion.angles), scene.volume.phase
     is_diffuse = multiply_scatters(medium, scene.diffusion)
-    colors = medium.extinction.scale.shape[0]
     samples = _count(scene.render.steps, "sample")
     means = _listed(phase.moments(2)[:, 1], phase.cells is not None)
     depth = greatest_depth(scene.volume) / scene.diffusion.times
     return [
-        f"{colors} color channels" if colors > 1 else "1 color channel (all is gray)",
+        _color_term(scene),
         f"phase function {phase.NAME}, mean cosine {means}",
         *_period_terms(scene.volume.grid),
         *_light_terms(scene, is_diffuse),
@@ -82,6 +82,28 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
         "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
     }
     return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
+
+
+def _color_term(scene: Scene) -> str:
+    """How many color channels there are, and what has as many."""
+    volume, ground = scene.volume, scene.ground
+    lights = [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS]
+    views = [v for each in scene.views for v in (each.exposure, each.offset, each.background)]
+    colors = {
+        "the medium": _count_colors(volume.sigma_a, volume.sigma_s),
+        "the phase function": volume.phase.colors,
+        "what glows": _count_colors(volume.emission, volume.black_body),
+        "lights": _count_colors(*lights),
+        "the ground": _count_colors(None if ground is None else ground.albedo),
+        "views": _count_colors(*views),
+    }
+    colored = ", ".join(name for name, count in colors.items() if count > 1)
+    return f"3 color channels ({colored})" if colored else "1 color channel (all is gray)"
+
+
+def _count_colors(*values: Tensor | None) -> int:
+    """Of `values` [C, ...], numbers and Nones the largest C, or 1."""
+    return max((len(value) for value in values if value is not None and value.ndim), default=1)
 
 
 def _face_terms(index: float) -> list[str]:

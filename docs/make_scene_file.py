@@ -33,7 +33,7 @@ Every key, with what it takes, its limits and its default, made from the program
 - Vectors are x, y, z.
 - Lengths are in a world unit u of your choice.
 - `1e-3` is a number.
-- Paths are relative to the scene file.
+- Paths are relative to the scene file; those of `-D` and `--light` to the current folder.
 - Three equal colors are rendered as one, unless they are optimized.
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
@@ -282,7 +282,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg, .webp and "
                 "films (.mp4, .mov, .mkv, .webm) are decoded from sRGB; alpha 0 is empty."
             ),
-            "mask": "A picture of the same size, black where pixels are ignored.",
+            "mask": "A picture of the same size, white where pixels count, else black.",
             "frame": (
                 "Of a film, which frame is taken, counted from 0. With `frames`, the one that the "
                 "scene's frame 0 is."

@@ -15,7 +15,8 @@ from ddrecon.variables.values import with_values
 ROOT = Path(__file__).parents[1]
 CAMERA = "type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28"
 TRACED = [
-    *("volume.density={file: ../data/plume/density.npz}", "volume.sigma_t=10", "volume.albedo=0.9"),
+    f"volume.density={{file: {ROOT}/data/plume/density.npz}}",
+    *("volume.sigma_t=10", "volume.albedo=0.9"),
     *("volume.g=0", "diffusion={}", "optimize=", "render.samples_per_pixel=4"),
     f"views=[{{name: view, camera: {{{CAMERA}, resolution: [64, 64]}}}}]",
 ]

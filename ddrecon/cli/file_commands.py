@@ -58,6 +58,11 @@ def export(
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
     _require_volumes(sources)
     from ddrecon.io.files.folders import require_free_files
+    from ddrecon.run.result import require_no_film
+
+    for source in sources:
+        sequence = f"optimize {source}/scene.yaml -o {source} --resume --export vdb"
+        require_no_film(source, f"; `ddrecon {sequence}` writes the volumes of all")
     from ddrecon.io.volumes.table import WRITTEN, raise_z, read_together, write_fields
 
     kind, known = output.suffix.lower(), (".xml", ".json", *WRITTEN)

@@ -115,7 +115,8 @@ def render(
     if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
-        session = session.with_override(f"lights=[{', '.join(lights)}]")
+        typed = " ".join(f"--light {light}" for light in lights)
+        session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
     from ddrecon.io.files.folders import FILM, RENDER, claim_folder, kind_of_folder
     from ddrecon.ranks import is_first
 
@@ -176,7 +177,7 @@ def _choose_views(
     from ddrecon.run.render_folder import remove_targets, require_variation
 
     loaded = session.build(scene_file)
-    if choice.has_fluence and scene_file.tree.diffusion.transport_rounds is None:
+    if choice.has_fluence and not _are_rounds_said(session, scene_file):
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
@@ -207,6 +208,17 @@ def _render_views(
         report["ring"] = write_ring(views, output)
     write_json(output / "render.json", report)
     return report, render_lines(report, output)
+
+
+def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
+    """Whether a user said how many transport rounds there are, of a result in the run's scene."""
+    from ddrecon.run.result import RESULT
+
+    of_run = scene_file.path.with_name("scene.yaml")
+    if scene_file.path.name == RESULT and of_run.is_file():
+        said = tuple(each for each in session.overrides if each.startswith("diffusion"))
+        scene_file = replace(session, overrides=said).read(of_run)
+    return scene_file.tree.diffusion.transport_rounds is not None
 
 
 @click.command()
@@ -255,8 +267,17 @@ def optimize(
     exported: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
+    from ddrecon.run.result import RESULT
+
+    of_run = (scene.parent if scene.name == RESULT else scene) / "scene.yaml"
+    if of_run.is_file() and of_run.with_name(RESULT).is_file():
+        raise UsageError(
+            f"{scene}: a finished run leaves nothing to optimize; name its scene, {of_run}, "
+            "and another folder or --resume --iterations N"
+        )
     if iterations is not None:
-        session = session.with_override(f"optimize.iterations={iterations}")
+        typed = f"--iterations {iterations}"
+        session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
     from ddrecon.ranks import alone, from_first, is_first
 
@@ -357,12 +378,14 @@ def uncertainty(
     from ddrecon.io.files.folders import UNCERTAINTY, claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
+    from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
     if tolerance is not None:
         warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
+    require_no_film(run)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):
         raise UsageError(

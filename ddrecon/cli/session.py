@@ -8,8 +8,8 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
-from ddrecon.run.result import RESULT
+from ddrecon.run.result import RESULT, require_no_film
 from ddrecon.scene_file.load import SceneFile, read_scene
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ class Session:
     report: Path | None = None
     share: str = "views"
     place: torch.device | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def start(self) -> torch.device:
         """Sets torch and the engine up as the options say; the device to compute on.
@@ -101,18 +102,22 @@ class Session:
         """Whether no progress is shown; of several ranks the first alone shows it."""
         return self.quiet or not is_first()
 
-    def with_override(self, override: str) -> Session:
-        """The same session with one more override of the scene file."""
-        return replace(self, overrides=(*self.overrides, override))
+    def with_override(self, override: str, option: str) -> Session:
+        """The same session with one more override of the scene file, which an `option` says."""
+        options = {**self.options, override: option}
+        return replace(self, overrides=(*self.overrides, override), options=options)
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
         if os.path.isdir(path) and not (path / RESULT).is_file():
+            require_no_film(path)
+            is_run = (path / "scene.yaml").is_file() and (path / "loss.csv").is_file()
+            advice = "finish the run with --resume" if is_run else "name a scene file"
             raise UsageError(
-                f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; "
-                "name a scene file, or finish the run with --resume"
+                f"{path}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; {advice}"
             )
-        return read_scene(path / RESULT if os.path.isdir(path) else path, self.overrides)
+        file = path / RESULT if os.path.isdir(path) else path
+        return read_scene(file, self.overrides, self.options)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.

@@ -28,11 +28,14 @@ from ddrecon.numerics.autodiff import keep, run_plainly
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative."""
+    """A solve of a `kind`: forward, adjoint or tangent; `residual` is relative.
+
+    That of rounds is a tensor, since reading it makes a processor wait for a GPU.
+    """
 
     kind: str
     iterations: int
-    residual: float
+    residual: float | Tensor
     seconds: float
 
 

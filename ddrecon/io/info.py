@@ -11,29 +11,36 @@ import numpy as np
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images.oiio import is_stack
 from ddrecon.io.images.table import READERS, read_image
-from ddrecon.io.volumes.field import Fields
-from ddrecon.io.volumes.table import FORMATS, field_names, read_field
+from ddrecon.io.volumes.field import EMPTY, Fields, prune
+from ddrecon.io.volumes.table import FORMATS, read_fields
+
+FILLED = f"more than {EMPTY:g} of the largest"
+"""How cells count as filled, in words."""
 
 
 def describe(path: Path) -> dict[str, Any]:
     """The contents of the volume or image at `path`, for `lines` or JSON.
 
-    Raises FormatError when it is neither, or damaged. A .tif of several pages is a volume.
+    Raises FormatError when it is neither, or holds nothing that can be read. A .tif of several
+    pages is a volume.
     """
     with guard_reading(path):
         suffix = path.suffix.lower()
         is_image = suffix not in FORMATS or (suffix in READERS and not is_stack(path))
     if not is_image:
-        fields = {name: read_field(path, name) for name in field_names(path)}
+        fields, reasons = read_fields(path)
         bounds = next((field.bounds for field in fields.values()), None)
-        return describe_medium({name: each.values for name, each in fields.items()}, {}, bounds)
+        report = describe_medium({name: each.values for name, each in fields.items()}, {}, bounds)
+        for name, field in fields.items():
+            report["fields"][name] |= {"unit": field.unit} if field.unit else {}
+        return report | ({"no_fields": reasons} if reasons else {})
     image = read_image(path)
     height, width = image.size
     is_gray = bool((image.pixels == image.pixels[..., :1]).all())
     return {
         "pixels": [width, height],
         "has_alpha": image.coverage is not None,
-        **_summarize(image.pixels, is_gray),
+        **_summarize(image.pixels, image.pixels, is_gray),
     }
 
 
@@ -46,15 +53,18 @@ def describe_medium(fields: Fields, constants: Fields, bounds: np.ndarray | None
     report = {
         "resolution": list(shapes[0][2::-1]) if shapes else None,
         "bounds": None if bounds is None else bounds.tolist(),
-        "fields": {name: _summarize(values, values.ndim == 3) for name, values in fields.items()},
+        "fields": {
+            name: _summarize(values, prune(values), values.ndim == 3)
+            for name, values in fields.items()
+        },
     }
     everywhere = {name: value.tolist() for name, value in constants.items()}
     return report | ({"constants": everywhere} if everywhere else {})
 
 
-def _summarize(values: np.ndarray, is_gray: bool) -> dict[str, float]:
-    """Extremes and mean of `values`, and the part of cells or pixels that is `filled`: not 0."""
-    places = values if values.ndim != 4 else values.any(-1)
+def _summarize(values: np.ndarray, kept: np.ndarray, is_gray: bool) -> dict[str, float]:
+    """Extremes and mean of `values`, and the part of cells or pixels that is `filled` in `kept`."""
+    places = kept if kept.ndim != 4 else kept.any(-1)
     return {
         "colors": 1 if is_gray else 3,
         "min": float(values.min()),
@@ -68,7 +78,7 @@ def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     if "pixels" in report:
         about = "with alpha, " * report["has_alpha"] + "linear radiance "
-        return [f"image: {sizes_text(report['pixels'])} pixels, {_values(report, about)}"]
+        return [f"image: {sizes_text(report['pixels'])} pixels, {_values(report, 'not 0', about)}"]
     if not report["fields"]:
         return ["no fields"]
     box = ", no box: the scene's volume.bounds will be taken"
@@ -78,19 +88,24 @@ def lines(report: dict[str, Any]) -> list[str]:
         box = f" of {sizes_text(sides)} u, from {low} to {high}"
     return [
         f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
-        *(f"{name}: {_values(each)}" for name, each in report["fields"].items()),
+        *(
+            f"{name}: {_values(each, FILLED, unit=each.get('unit', ''))}"
+            for name, each in report["fields"].items()
+        ),
         *(
             f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
             for name, value in report.get("constants", {}).items()
         ),
+        *(f"no field: {reason}" for reason in report.get("no_fields", {}).values()),
     ]
 
 
-def _values(report: dict[str, Any], about: str = "") -> str:
+def _values(report: dict[str, Any], filled: str, about: str = "", unit: str = "") -> str:
     """Whether values have colors, what else there is to say `about` them, and their range."""
+    numbers = f"{report['min']:.4g} to {report['max']:.4g}{unit and ' ' + unit}"
     return (
-        f"{'gray' if report['colors'] == 1 else 'RGB'}, {about}{report['min']:.4g} to "
-        f"{report['max']:.4g}, mean {report['mean']:.4g}, not 0 in {100 * report['filled']:.3g} %"
+        f"{'gray' if report['colors'] == 1 else 'RGB'}, {about}{numbers}, "
+        f"mean {report['mean']:.4g}, {filled} in {100 * report['filled']:.3g} %"
     )
 
 

@@ -74,7 +74,7 @@ def launch(
         return
     load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
-    stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
+    stream = _stream(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
         given = arguments(i) if callable(arguments) else arguments
@@ -153,6 +153,12 @@ def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -
         call.set_param_at_index_from_ctype(place, one)
     call.launch(stream)
     calls.append(call)
+
+
+@functools.cache
+def _stream(stream: Any) -> Any:
+    """Warp's name of a stream of torch: finding it anew takes as long as a launch."""
+    return wp.stream_from_torch(stream)
 
 
 @functools.cache

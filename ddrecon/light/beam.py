@@ -89,7 +89,9 @@ def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int
         beam_moments(attenuate(cells, one, weight, is_kept=True).mean, direction, degree).weighted(
             remaining_moments(cells)
         )
-        for one, weight, direction in zip(directions.split(1), weights.split(1), each, strict=True)
+        for one, weight, direction in zip(
+            split_directions(directions, 1), weights.split(1), each, strict=True
+        )
     )
     return reduce(Moments.plus, received)
 
@@ -99,6 +101,12 @@ def unit_directions(*directions: Tensor) -> tuple[Tensor, ...]:
     """Unit `directions` (z, y, x) beside each other, [L, 3], and one by one."""
     each = [torch.nn.functional.normalize(array_order(one), dim=0) for one in directions]
     return torch.stack(each), *each
+
+
+@remember
+def split_directions(directions: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Groups of so many `directions`: the same tensors each time, so that shears are remembered."""
+    return tuple(group.clone() for group in directions.split(count))
 
 
 @remember
@@ -126,7 +134,7 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool 
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
     else:
         count = max(1, quarter // 8)
-    parts = zip(directions.split(count), weights.split(count), strict=True)
+    parts = zip(split_directions(directions, count), weights.split(count), strict=True)
     return Moments.of_sums(
         reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
     )

@@ -28,6 +28,10 @@ STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that
 are marched by slices.
 """
+NEARLY_EQUAL = 1e-5
+"""Mean speeds that differ by less, relatively, may do so by rounding: slices then lie across the
+first of these axes, on every machine.
+"""
 THICK = 0.75
 """Cells of more optical depths than this get two samples along a ray (docs/accuracy.md)."""
 
@@ -47,7 +51,8 @@ class Way:
 def choose_way(grid: Grid, rays: Rays, crossing: Crossing) -> Way:
     """Slices where every ray crosses them in one sense and steeply enough, from outside the box."""
     speed = normalize(rays.direction[crossing.hit] / rays.direction.new_tensor(grid.spacing), dim=1)
-    axis = int(speed.abs().mean(0).argmax())
+    mean = speed.abs().mean(0)
+    axis = int((mean > (1 - NEARLY_EQUAL) * mean.max()).byte().argmax())
     along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):

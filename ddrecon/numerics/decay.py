@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.constants import constant
 
 SERIES_BELOW = 0.1
 """Below this depth eta is its series."""
-TERMS = 9
-"""Of the series: the next one, and its slope, are below rounding."""
+SERIES = [(k + 1) / (2 * math.factorial(k + 3)) for k in range(9)]
+"""Coefficients of the series in -depth: the next one, and its slope, are below rounding."""
 
 
 def decay_mean(depth: Tensor) -> Tensor:
@@ -58,7 +59,7 @@ def decay_terms(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _eta(depth: Tensor, phi: Tensor) -> Tensor:
     """eta, given `phi`; or as the sum over k of (-`depth`)^k (k + 1) / (2 (k + 3)!)."""
-    *others, last = (depth.new_tensor((k + 1) / (2 * math.factorial(k + 3))) for k in range(TERMS))
+    *others, last = constant(SERIES, depth)
     series = last.expand_as(depth)
     for factor in reversed(others):
         series = torch.addcmul(factor, depth, series, value=-1)

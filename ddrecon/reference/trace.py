@@ -16,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.extras import load_extra
+from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
@@ -152,13 +153,11 @@ def pick_color(scene: Scene, color: int) -> Scene:
         sigma_s=_pick(volume.sigma_s, color),
         phase=_pick_phase(volume.phase, color),
     )
-    names = ("irradiance", "radiance", "intensity")
-    lights = [
-        replace(light, **{name: _pick(getattr(light, name), color)})  # type: ignore[arg-type]
-        for light in scene.lights
-        for name in names
-        if hasattr(light, name)
-    ]
+    lights = []
+    for light in scene.lights:
+        colors = {k: v for k, v in vars(light).items() if k in BRIGHTNESS and v.ndim}
+        picked: Any = {name: _pick(value, color) for name, value in colors.items()}
+        lights.append(replace(light, **picked))
     ground = scene.ground
     if ground is not None:
         ground = replace(ground, albedo=_pick(ground.albedo, color))

@@ -6,7 +6,7 @@ Each function returns a sentence, with what to do, or None where there is nothin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from statistics import mean, median
 
@@ -92,7 +92,7 @@ def find_exposure(
         return None
     return (
         "exposure? pictures brighter or darker, as a whole, than the others say: "
-        f"{_name_worst(odd, '.2f', 'times')}; give "
+        f"{_name_worst(odd, '.2f', 'times', lambda gain: abs(math.log(gain)))}; give "
         "all one exposure and white balance, or optimize them (views.*.exposure)"
     )
 
@@ -110,8 +110,8 @@ def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float
     if not moves:
         return None
     return (
-        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels')}; check "
-        "poses and intrinsics, or optimize the poses (views.NAME.camera)"
+        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels', abs)}; "
+        "check poses and intrinsics, or optimize the poses (views.NAME.camera)"
     )
 
 
@@ -201,7 +201,9 @@ def _weight(view: View) -> Tensor:
     return torch.ones_like(target_of(view)[:1]) if view.mask is None else view.mask[None]
 
 
-def _name_worst(numbers: Mapping[str, float], form: str, unit: str) -> str:
-    """At most four of `numbers`, by name: those farthest from 1 as factors."""
-    worst = sorted(numbers.items(), key=lambda item: -abs(math.log(item[1])))[:4]
+def _name_worst(
+    numbers: Mapping[str, float], form: str, unit: str, size: Callable[[float], float]
+) -> str:
+    """At most four of `numbers`, by name: those of the largest `size`, that one first."""
+    worst = sorted(numbers.items(), key=lambda item: -size(item[1]))[:4]
     return ", ".join(f"{name} ({number:{form}} {unit})" for name, number in worst)

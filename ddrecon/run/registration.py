@@ -8,21 +8,20 @@ given, by differences: shifts are small. The volume stays as it is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, project
-from ddrecon.grid import Grid
 from ddrecon.losses import Target
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.renderer import LightField, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import pose_rate
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import extinction_of, with_values
 
 STEPS = 8
 """At most; they end when one makes nothing better."""
@@ -37,8 +36,7 @@ def register(
 ) -> dict[str, Any]:
     """PSNR [dB] and SSIM of `view` registered to the volume of `scene`, lit by `light_field`.
 
-    And by how many pixels it moved, the mean of the box's corners. `sizes` are as for
-    `fit_held_out`.
+    And by how many pixels its smoke moved. `sizes` are as for `fit_held_out`.
     """
     name = f"views.{view.name}.camera"
     unit = pose_rate(scene, name, view.camera.pose)
@@ -50,6 +48,7 @@ def register(
 
     change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
     moved, picture = see_by(change)
+    camera = moved.camera
     ways = (tuning.APART * unit).diag()
     changes = torch.stack([see_by(way)[1] - picture for way in ways]) / tuning.APART
     for _ in range(STEPS):
@@ -57,8 +56,7 @@ def register(
         psnr = float(target.psnr_of(fitted))
         if best and psnr <= best["psnr"]:
             break
-        shift = shift_between(view.camera, moved.camera, scene.volume.grid)
-        best = {"psnr": psnr, "ssim": float(target.ssim_of(fitted)), "shift": shift}
+        best, camera = {"psnr": psnr, "ssim": float(target.ssim_of(fitted))}, moved.camera
         # Errors are those that PSNR counts, of values as they are compared.
         given = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
         slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / given
@@ -73,11 +71,19 @@ def register(
         step = step / (step.abs().max() / FARTHEST).clamp(min=1)
         change = change + step.to(unit) * unit
         moved, picture = see_by(change)
-    return best
+    return best | {"shift": shift_between(view.camera, camera, scene.volume)}
 
 
-def shift_between(camera: Camera, other: Camera, grid: Grid) -> float:
-    """By how many pixels the corners of `grid` lie elsewhere in the image of `other`: the mean."""
-    corners = camera.pose.new_tensor([*product(*zip(*grid.bounds_xyz, strict=True))])
-    (one, _), (moved, _) = (project(each, corners) for each in (camera, other))
-    return float((one - moved).norm(dim=1).nanmean())
+def shift_between(camera: Camera, other: Camera, volume: Volume) -> float:
+    """By how many pixels what is in `volume` lies elsewhere in the image of `other`: the mean.
+
+    Cells count by their extinction, all alike where there is none.
+    """
+    weight = (extinction_of(volume).amax(0) * volume.density).flatten()
+    weight = weight if bool(weight.any()) else torch.ones_like(weight)
+    z, y, x = torch.broadcast_tensors(*volume.grid.centers(weight))
+    centers = torch.stack([x, y, z], -1).flatten(0, 2)[weight > 0].to(camera.pose)
+    (one, _), (moved, _) = (project(each, centers) for each in (camera, other))
+    shift = (one - moved).norm(dim=1).to(weight)
+    weight = weight[weight > 0] * shift.isfinite()
+    return float((weight * shift).nansum() / weight.sum())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -31,6 +31,8 @@ from ddrecon.variables.values import component_names, value_of, variable_names
 
 GRADIENT = ".gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
+AT_REST = 0.01
+"""Light that a transport round changes by a smaller part has come to rest."""
 PARTS = (".reduced", ".single", ".multiple")
 
 
@@ -71,10 +73,7 @@ def render_to_folder(
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
                 quality[view.name] = float(target.psnr_of(images[""]))
-    solves = [
-        {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
-        for r in memory.records
-    ]
+    solves = [{**asdict(r), "residual": float(r.residual)} for r in memory.records]
     report: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
         "solves": solves,
@@ -84,7 +83,11 @@ def render_to_folder(
         "psnr": quality,
     }
     if rounds := [r for r in memory.records if r.kind == "rounds"]:
-        report["rounds"] = {"count": rounds[-1].iterations, "residual": rounds[-1].residual}
+        report["rounds"] = {
+            "count": rounds[-1].iterations,
+            "residual": float(rounds[-1].residual),
+            "tolerance": scene.diffusion.transport_tolerance,
+        }
     if fluence_files:
         report["fluence"] = fluence_files
     if parameter is not None:
@@ -150,14 +153,28 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
     if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
         lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
     if "rounds" in report:
-        count, residual = report["rounds"]["count"], report["rounds"]["residual"]
-        lines.append(f"transport rounds: {count}, residual {residual:.2g}")
+        lines.append(rounds_text(**report["rounds"]))
     if "fluence" in report:
         lines.append(f"fluence: {', '.join(report['fluence'])}")
     if "ring" in report:
         files, white = ", ".join(report["ring"]["files"]), report["ring"]["white"]
         lines.append(f"around: {files} (radiance {white:.3g} is white)")
     return [*lines, f"written to {folder}"]
+
+
+def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
+    """How many transport rounds there were, and whether light has come to rest in them (E7.3).
+
+    That is where the last one changed it by less than the `tolerance`, or `AT_REST`.
+    """
+    if residual < (tolerance or AT_REST):
+        verdict = "at rest"
+    elif count == 1:
+        verdict = "what diffusion alone lacks; a second round tells what is left"
+    else:
+        verdict = "not at rest; more may help (diffusion.transport_rounds)"
+    changed = f"{100 * residual:.2g} %"
+    return f"transport rounds: {count}, the last changed light by {changed}: {verdict}"
 
 
 def _images(

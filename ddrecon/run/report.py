@@ -210,4 +210,4 @@ def _quality_text(quality: Mapping[str, Any]) -> str:
 def registered_text(registered: Mapping[str, float]) -> str:
     """How good a view held out is by a camera fitted to the volume, and how far that moved."""
     psnr, ssim, shift = (registered[key] for key in ("psnr", "ssim", "shift"))
-    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, moved by {shift:.2f} pixels"
+    return f"{psnr:.2f} dB, SSIM {ssim:.4f}, smoke moved by {shift:.2f} pixels"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ddrecon.errors import UsageError
 from ddrecon.scene_file.load import SceneFile, describe
 from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import PAIRS, PHASE, RESPONSE, is_of_volume, split_name
@@ -17,6 +19,16 @@ if TYPE_CHECKING:
 
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
+
+
+def require_no_film(folder: Path, more: str = "") -> None:
+    """Raises UsageError where `folder` is that of a film, not of a run; it says `more` to do."""
+    from ddrecon.io.files.folders import FILM, kind_of_folder
+
+    frames = sorted(folder.glob(f"frames/*/{RESULT}"))
+    if frames and kind_of_folder(folder) == FILM:
+        what = f"is the folder of a film; name that of a frame, such as {frames[0].parent}"
+        raise UsageError(f"{folder}: {what}{more}")
 
 
 def result_names(parameters: list[str]) -> list[str]:

@@ -98,7 +98,7 @@ def load_scene(
 ) -> Scene:
     """The scene in the file at `path`, as tensors of `dtype` on `device`.
 
-    `overrides` (`key.path=value`) are put in first.
+    `overrides` (`key.path=value`) are put in first; their paths start at the current folder.
 
     Raises SceneError with one line per problem of the scene, FormatError for a file it names that
     cannot be used, or UsageError for another `dtype` than `DTYPES` and a `device` that is not here.

@@ -18,6 +18,7 @@ from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
+from ddrecon.io.volumes.units import GRAMS, KELVIN, MICROMETERS, size_of
 from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mie import scatter_droplets
@@ -44,6 +45,12 @@ from ddrecon.variables.values import cross_sections
 RADIUS = "effective_radius"
 EXTINCTION = 1.5
 """Of 1 g/m3 of droplets with an effective radius of 1 micrometer [1/m]: 3 Q / (4 rho r), Q = 2."""
+UNITS = {
+    "density": ("g/m3, which sigma_t: {meters: ...} takes (kg/kg times air's density)", GRAMS),
+    RADIUS: ("micrometers", MICROMETERS),
+    "temperature": ("kelvin", KELVIN),
+}
+"""What is expected in a unit: its name, and the spellings of its multiples in files."""
 FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
 
@@ -133,10 +140,18 @@ def _read_fields(
     for variable, (name, value) in _quantities(section).items():
         if isinstance(value, FieldFile):
             called = value.name or variable.removeprefix(PHASE)
-            read = partial(read_quantity, name=_kind_name(variable), called=called)
+            is_free = variable == "density" and not isinstance(section.sigma_t, Water)
+            unit = None if is_free else UNITS.get(variable)
+            read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
             with problems.collecting():
                 at = f"volume.{prefix}{name}.file"
-                found[variable] = at, read_referenced(scene_file, at, value.file, read)
+                field = read_referenced(scene_file, at, value.file, read)
+                found[variable] = at, field
+                if isinstance(section.sigma_t, Water):
+                    said = section.sigma_t.meters
+                    if field.meters not in (None, said):
+                        what = f"is {said:g}, but u of {value.file.name} has {field.meters:g} m"
+                        raise scene_file.refused(f"volume.{prefix}sigma_t.meters", what)
     problems.raise_any()
     return found
 
@@ -191,9 +206,18 @@ def cells_of(field: Field) -> Tensor:
     return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
 
 
-def read_quantity(path: Path, name: str, called: str) -> Field:
-    """The quantity `name`, which the file has as `called`; raises FormatError."""
+def read_quantity(
+    path: Path, name: str, called: str, unit: tuple[str, Mapping[str, float]] | None = None
+) -> Field:
+    """The quantity `name`, which the file has as `called`, in this `unit`; raises FormatError."""
     field, kind = read_field(path, called), kind_of(name)
+    if unit and field.unit == "":
+        warnings.warn(f"{path}: {called} says no unit; taken in {unit[0]}", DataWarning, 2)
+    elif unit and field.unit:
+        size = size_of(field.unit, unit[1])
+        if size is None:
+            raise FormatError(path, f"{called} is in {field.unit}, not {unit[0]}; convert it first")
+        field = replace(field, values=field.values * np.float32(size))
     if not kind.is_color and field.values.ndim != 3:
         raise FormatError(
             path,

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
@@ -59,10 +60,15 @@ class SceneFile:
         return SceneError(f"{self.marks[nearest]}: {key}: {what}")
 
 
-def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
+def read_scene(
+    path: str | os.PathLike[str],
+    overrides: Iterable[str] = (),
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> SceneFile:
     """The scene file at `path` with `overrides` (`key.path=value`) put in, its box in numbers.
 
-    Raises SceneError with one line per problem.
+    Their paths start at the current folder. `options` are what a user typed in place of some of
+    them, which else was `-D` and the override. Raises SceneError with one line per problem.
     """
     path, problems = Path(path), Problems()
     found = None
@@ -72,7 +78,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
             raise root.refused("is empty")
         for text in overrides:
             with problems.collecting():
-                override(root, text, problems)
+                override(root, text, problems, options.get(text, f"-D {text}"))
         found = _scene_of(root, path)
     problems.raise_any()
     assert found is not None
@@ -115,13 +121,12 @@ def _text(path: Path) -> str:
         raise SceneError(f"{path}:{line}:{column}: is not UTF-8 text") from error
 
 
-def override(root: Node, text: str, problems: Problems) -> None:
-    """Puts the value of `text` (`key.path=value`, in YAML) into the tree under `root`.
+def override(root: Node, text: str, problems: Problems, where: str) -> None:
+    """Puts the value of `text` (`key.path=value`, in YAML), typed as `where`, under `root`.
 
     Mappings are made as needed; a list is entered by index. Where keys themselves have dots, as
     those of parameters do, the longest one present or legal is taken. Raises SceneError.
     """
-    where = f"-D {text}"
     path, separator, value = text.partition("=")
     if not separator or not all(path.split(".")):
         raise SceneError(f"{where}: expected key.path=value")
@@ -134,6 +139,7 @@ def override(root: Node, text: str, problems: Problems) -> None:
         child = Node(key, where, where, {} if path else None)
         if not path and value.strip():
             child = parse(value, lambda line, column: where, problems, key)
+            child.folder = Path.cwd()
         if isinstance(parent.value, list):
             at = int(name)
             parent.value[at] = child if not path else parent.value[at]

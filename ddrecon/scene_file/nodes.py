@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import yaml
 
@@ -30,12 +31,16 @@ Locate = Callable[[int, int], str]
 
 @dataclass
 class Node:
-    """A value at the dotted path `key`, written at `where` (its key at `key_where`)."""
+    """A value at the dotted path `key`, written at `where` (its key at `key_where`).
+
+    Relative paths in it start at `folder`, None for that of what is around it.
+    """
 
     key: str
     where: str
     key_where: str
     value: Scalar | list[Node] | dict[str, Node]
+    folder: Path | None = None
 
     def refused(self, what: str) -> SceneError:
         """The error that says `what` is wrong with this value."""

@@ -91,7 +91,7 @@ def _describe(kind: Any, kinds: Sequence[Any]) -> str:
 
 def read_value(node: Node, rule: Rule) -> Any:
     """The value of `node` by `rule`; raises SceneError with everything wrong in it."""
-    kinds = alternatives(rule.hint)
+    kinds, rule = alternatives(rule.hint), rule._replace(folder=node.folder or rule.folder)
     match node.value:
         case None if NoneType in kinds:
             return None

@@ -48,6 +48,8 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
     """The views that `source` stands for, which `node` of a scene in `folder` says."""
     entries = node.entries()
     every = source.test_every
+    if "images" in entries:
+        folder = entries["images"].folder or folder
     if source.transforms is not None:
         files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
         return name_by_images(read_transforms(entries["transforms"], files, every))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from click.testing import Result
 
-from ddrecon.io.volumes.table import write_field
+from ddrecon.io.volumes.table import field_names, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -24,8 +24,36 @@ def test_a_volume(succeed: Run, suffix: str) -> None:
     write_field(Path(f"smoke.albedo{suffix}"), "albedo", colored(), BOUNDS)
     assert succeed("info", f"smoke.albedo{suffix}").stdout.splitlines() == [
         "cells: 4 x 3 x 2 (x, y, z) of 0.5 x 1 x 2 u, from [-1.0, -2.0, -3.0] to [1.0, 1.0, 1.0]",
-        "albedo: RGB, 0 to 1, mean 0.08333, not 0 in 16.7 %",
+        "albedo: RGB, 0 to 1, mean 0.08333, more than 0.0001 of the largest in 16.7 %",
     ]
+
+
+def test_what_is_no_field_of_the_same_cells_is_named(succeed: Run, refuse: Refuse) -> None:
+    """And left out of an export, with a warning; a file of nothing else is refused."""
+    others = {"origin": np.zeros(3), "velocity_x": -np.ones((2, 2, 2)), "finer": np.ones((4, 4, 4))}
+    np.savez("all.npz", density=np.ones((2, 2, 2)), bounds=BOUNDS, **others)
+    cells, density, *told = succeed("info", "all.npz").stdout.splitlines()
+    assert cells.startswith("cells: 2 x 2 x 2") and density.startswith("density: gray, 1 to 1")
+    starts = [
+        f"no field: {name} {why}"
+        for name, why in zip(others, ("has shape [3]", "is negative", "has 4 x 4"), strict=True)
+    ]
+    assert all(line.startswith(start) for line, start in zip(told, starts, strict=True))
+    said = json.loads(succeed("info", "all.npz", "--json").stdout)
+    assert list(said["fields"]) == ["density"] and list(said["no_fields"]) == list(others)
+    result = succeed("export", "all.npz", "-o", "out.vdb")
+    assert [line.split()[4] for line in result.stderr.splitlines()] == list(others)
+    assert field_names(Path("out.vdb")) == ["density"]
+    np.savez("none.npz", origin=others["origin"])
+    assert "origin has shape [3]" in refuse(3, "info", "none.npz")[-1]
+
+
+def test_a_haze_counts_as_empty(succeed: Run) -> None:
+    """Of less than a ten thousandth of the largest, as an optimization leaves it."""
+    haze = np.geomspace(1e-19, 0.9e-4, 24).reshape(2, 3, 4)
+    haze[0, 0, :2] = 1, 1.1e-4
+    write_field(Path("smoke.npz"), "density", 7 * haze, BOUNDS)
+    assert "more than 0.0001 of the largest in 8.33 %" in succeed("info", "smoke.npz").stdout
 
 
 def test_json(succeed: Run) -> None:

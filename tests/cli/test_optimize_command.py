@@ -65,7 +65,7 @@ def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     assert density.min() >= 0 and density.max() > 0
     with np.load("out/volumes/density.npz", allow_pickle=False) as archive:
         assert archive["bounds"].tolist() == [[-0.5] * 3, [0.5] * 3]
-    found = "-D", "volume.density={file: volumes/density.npz}"
+    found = "-D", "volume.density={file: out/volumes/density.npz}"
     succeed("render", "out/scene.yaml", "-o", "pictures", "-q", *found)
     rendered = read_json("pictures/render.json")["psnr"]
     told = {name: view["psnr"] for name, view in summary["views"].items()}
@@ -129,7 +129,7 @@ def test_overwriting_keeps_what_the_new_run_reads(
         raise KeyboardInterrupt
 
     again = ["optimize", "out/scene.yaml", "-q", "-o", "out", "--iterations", "1"]
-    again += ["-D", "optimize.parameters.density.init={file: volumes/density.npz}"]
+    again += ["-D", "optimize.parameters.density.init={file: out/volumes/density.npz}"]
     with monkeypatch.context() as patch:
         patch.setattr("ddrecon.reconstruct.objective.render_each", stopped)
         assert run(*again, "--overwrite").exit_code == 130

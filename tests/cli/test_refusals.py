@@ -11,6 +11,7 @@ from click.testing import Result
 from small_scene import SCENE
 
 from ddrecon.errors import SceneError
+from ddrecon.io.files.folders import FILM, MANIFEST
 from ddrecon.io.volumes.table import write_field
 
 Refuse = Callable[..., list[str]]
@@ -32,17 +33,23 @@ optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for 
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
 render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
 render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range x>=2
-render scene.yaml -o out --light '{type: sun}' => 2 -D lights=[{type: sun}]: lights.0.type: expected
+render scene.yaml -o out --light '{type: sun}' => 2 --light {type: sun}: lights.0.type: expected
 render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
-optimize scene.yaml -o out --iterations 0 => 2 -D optimize.iterations=0: optimize.iterations: must
-optimize scene.yaml -o out --iterations some => 2 -D optimize.iterations=some: optimize.iterations:
+optimize scene.yaml -o out --iterations 0 => 2 --iterations 0: optimize.iterations: must
+optimize scene.yaml -o out --iterations some => 2 --iterations some: optimize.iterations:
 optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
+optimize done -o out => 2 done: a finished run leaves nothing to optimize; name its scene, done/sc
+optimize done/result.yaml -o out --iterations 9 => 2 done/result.yaml: a finished run leaves noth
+optimize film -o out => 2 film: is the folder of a film; name that of a frame, such as film/frames/
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
 optimize scene.yaml -o out --resume => 2 out/checkpoints/last.pt: there is no checkpoint to resume
 optimize scene.yaml -o full --resume => 2 full: holds notes.txt, which ddrecon did not write
+check full => 2 full: holds no result.yaml, as `ddrecon optimize` writes it at its end; name a
+check begun => 2 begun: holds no result.yaml, as `ddrecon optimize` writes it at its end; finish
+check film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003
 gradcheck scene.yaml --parameter densty => 2 --parameter densty: the scene has no such number; did
 gradcheck scene.yaml --json gone/report.json => 2 gone/report.json: there is no folder
 check gone.yaml --json gone/report.json => 2 gone/report.json: there is no folder
@@ -61,10 +68,13 @@ export density.npz -o smoke.nc => 2 -o smoke.nc: unknown format '.nc'; known: .x
 export scene.yaml scene.yaml -o smoke.xml => 2 Error: one scene at a time is written as .xml
 export scene.yaml -o a.xml --up z => 2 Error: --up z turns volumes only
 export scene.yaml -o none/smoke.xml => 2 none/smoke.xml: there is no folder
+export film -o a.vdb => 2 film: is the folder of a film; name that of a frame, such as film/frames/
+info film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003
 info front.txt => 3 front.txt: unknown image format '.txt'
 info bad.npz => 3 bad.npz: is damaged: File is not a zip file
 info gone.vol => 3 gone.vol: cannot be read
 uncertainty gone -o sure => 2 gone: holds no run
+uncertainty film -o sure => 2 film: is the folder of a film; name that of a frame, such as film/fr
 uncertainty full -o ./full => 2 full: holds no run
 """
 
@@ -81,9 +91,13 @@ def test_what_cannot_be_done_is_refused(
 ) -> None:
     del folder
     Path("plain.yaml").write_text(SCENE.partition("optimize:")[0])
-    Path("full").mkdir()
-    for name in ("full/notes.txt", "file", "front.txt", "bad.npz"):
-        Path(name).write_text("mine")
+    texts = dict.fromkeys(["full/notes.txt", "file", "front.txt", "bad.npz"], "mine")
+    runs = "done/scene.yaml", "done/result.yaml", "film/frames/0003/result.yaml", "begun/scene.yaml"
+    texts |= dict.fromkeys(runs, SCENE) | {"begun/loss.csv": ""}
+    texts |= {f"film/{MANIFEST}": f"ddrecon {FILM}\n"}
+    for name, text in texts.items():
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(text)
     assert refuse(code, *shlex.split(command))[-1].startswith(line)
 
 

@@ -106,15 +106,55 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
     assert read_field(Path("out/volumes/fluence.npz"), "fluence").values.shape == (4, 5, 6)
 
 
-def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run) -> None:
-    succeed(*RENDER, "--fluence", "-D", "diffusion.transport_rounds=null")
-    found = read_field(Path("out/volumes/fluence.npz"), "fluence").values
-    one, two = (
-        ddrecon.fluence(ddrecon.load_scene("scene.yaml", overrides=[key])).permute(1, 2, 3, 0)
-        for key in ("diffusion.transport_rounds=1", "diffusion.transport_rounds=2")
-    )
-    np.testing.assert_allclose(found, two.numpy(), rtol=1e-4)
-    assert not np.allclose(found, one.numpy(), rtol=1e-3)
+@pytest.mark.parametrize("of", ["scene.yaml", "run"])
+def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run, of: str) -> None:
+    """Of a run's result, which always says how many, unless the scene of the run did."""
+
+    def fluence(*options: str) -> np.ndarray:
+        succeed("render", of, "-o", "out", "-q", "--overwrite", "--fluence", *options)
+        return read_field(Path("out/volumes/fluence.npz"), "fluence").values
+
+    for said, options, rounds in (("null", (), 2), ("null", ROUND, 1), ("1", (), 1)):
+        text = Path("scene.yaml").read_text().replace("rounds: 0", "rounds: null")
+        Path("scene.yaml").write_text(text.replace("rounds: null", f"rounds: {said}"))
+        path = of
+        if of == "run":
+            succeed("optimize", "scene.yaml", "-o", of, "-q", "--iterations", "1", "--overwrite")
+            path = "run/result.yaml"
+        one, two = (
+            ddrecon.fluence(
+                ddrecon.load_scene(path, overrides=[f"diffusion.transport_rounds={count}"])
+            ).permute(1, 2, 3, 0)
+            for count in (1, 2)
+        )
+        assert not np.allclose(one.numpy(), two.numpy(), rtol=1e-3)
+        np.testing.assert_allclose(fluence(*options), (one, two)[rounds - 1].numpy(), rtol=1e-4)
+
+
+REST = [("1", "null", "what diffusion alone lacks"), ("16", "0.01", "at rest")]
+REST += [("2", "0.1", "at rest"), ("2", "1e-6", "not at rest"), ("3", "null", "at rest")]
+
+
+@pytest.mark.parametrize(("rounds", "tolerance", "verdict"), REST)
+def test_it_is_said_whether_light_has_come_to_rest(
+    succeed: Run, rounds: str, tolerance: str, verdict: str
+) -> None:
+    said = "-D", f"diffusion={{transport_rounds: {rounds}, transport_tolerance: {tolerance}}}"
+    out = succeed(*RENDER, "--view", "side", *said).stdout
+    report = json.loads(Path("out/render.json").read_text())["rounds"]
+    changed = f"changed light by {100 * report['residual']:.2g} %: {verdict}"
+    assert f"transport rounds: {report['count']}, the last {changed}" in out
+    least = 0.01 if tolerance == "null" else float(tolerance)
+    assert (report["residual"] < least) == (verdict == "at rest")
+
+
+def test_a_run_is_relit_by_a_picture_in_the_current_folder(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
+    np.save("sky.npy", np.ones((4, 8, 3), np.float32))
+    sky, ambient = "{type: environment, file: sky.npy}", "{type: ambient, radiance: 1}"
+    for name, light in (("sky", sky), ("ambient", ambient)):
+        succeed("render", "run", "-o", name, "-q", "--view", "front", "--light", light)
+    np.testing.assert_allclose(np.load("sky/front.npy"), np.load("ambient/front.npy"), rtol=1e-3)
 
 
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:

@@ -84,6 +84,12 @@ def files_of(folder: str) -> set[str]:
     return {name for name, data in contents(Path(folder)).items() if data} - {MANIFEST}
 
 
+def test_what_is_not_there_is_not_gone_on_with(finished: Path, refuse: Refuse) -> None:
+    del finished
+    (line,) = refuse(2, "uncertainty", "run", "-o", "gone", "--resume")
+    assert line.startswith("gone/checkpoints/last.pt: there is no checkpoint to resume from")
+
+
 def test_without_experiments_every_figure_has_its_caveat(finished: Path, succeed: Run) -> None:
     del finished
     found = succeed("uncertainty", "run", "-o", "sure", "--calibrate", "0", *KNOWN)

@@ -130,7 +130,8 @@ def test_fields_come_back_in_their_place(
 ) -> None:
     """Sides differ, mostly; 8 is that of a leaf of OpenVDB's tree."""
     path = tmp_path_factory.mktemp("field") / f"smoke.albedo{suffix}"
-    values = np.random.default_rng(seed).random(shape + (3,) * has_colors, np.float32)
+    values = np.random.default_rng(seed).uniform(0.01, 1, shape + (3,) * has_colors)
+    values = values.astype(np.float32)
     write_field(path, "albedo", values, BOUNDS)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     (name,) = field_names(path)

@@ -1,17 +1,22 @@
 """Deviations by experiments: what is reconstructed next, and what follows of known errors."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from media import random_values
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.pictures.noise import Noise
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.settings import ParameterSettings
+from ddrecon.renderer import render
+from ddrecon.scene import View
+from ddrecon.settings import OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty.deviations import SHORT, Deviations, Field
 from ddrecon.uncertainty.experiments import Uncertainty
 
@@ -32,6 +37,41 @@ def found_of(values: dict[str, Tensor], information: float = 1e12) -> Uncertaint
     found.run, found.trial = SimpleNamespace(iteration=1), None
     found.seed, found.count, found.errors = 0, 0, []
     return found
+
+
+def finished_run() -> Reconstruction:
+    """One iteration from two pictures, an eighth off, of a medium that scatters many times."""
+    eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
+    rounds = {"transport_rounds": 1, "tolerance": 1e-6}
+    world = make_scene(1 + random_values(3, 4, 3), sigma_a=(0.1,), sigma_s=(6.0,), **rounds)
+    views = [View(name, make_camera(eye, (5, 6))) for name, eye in eyes.items()]
+    images = render(replace(world, views=views))
+    images = images * (0.75 + 0.5 * random_values(*images.shape))
+    shown = [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+    sought = OptimizeSettings(parameters={"density": ParameterSettings()}, iterations=1)
+    run = Reconstruction(replace(world, views=shown, optimize=sought))
+    run.step()
+    return run
+
+
+def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does() -> None:
+    """By what the run leaves, or by noise that is known; at first the other way around."""
+    run = finished_run()
+    scene, diffusion = run.current_scene(), run.current_scene().diffusion
+    near, far = (
+        render(replace(scene, diffusion=replace(diffusion, transport_rounds=rounds)))
+        for rounds in (1, 12)
+    )
+    wrong = float((near - far).abs().mean())
+    for noise in (None, Noise(0.08, 0.0)):
+        found = Uncertainty(run, 0, noise)
+        for found.count, signs in ((0, [-1]), (1, [-1, 1])):
+            views = found._begin().problem.train.views
+            for view, given, as_run, true in zip(views, scene.views, near, far, strict=True):
+                left = given.image - as_run
+                left = left if noise is None else left * noise.read / left.square().mean().sqrt()
+                errors = [float((view.image - sign * left - true).abs().mean()) for sign in signs]
+                assert min(errors) < 0.3 * min(wrong, float(left.abs().mean()))
 
 
 def reconstruct_by(

@@ -9,9 +9,10 @@ import torch
 
 from ddrecon.errors import DivergenceError, FormatError, SceneError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -44,6 +45,23 @@ def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
     spoiled = replace(ball_scene, views=views)
     one, other = (optimize(scene, iterations=3).scene.volume for scene in (ball_scene, spoiled))
     assert torch.equal(one.density, other.density)
+
+
+def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
+    settings = replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
+    first, second = ball_scene.views[:2]
+    second = replace(second, image=first.image.flip(2))  # as bright, which is the unit of losses
+
+    def found(*views: View) -> Result:
+        return optimize(replace(ball_scene, views=[*views], optimize=settings), iterations=2)
+
+    heavy = found(replace(first, weight=6.0), replace(second, weight=3.0))
+    twice, once = found(first, replace(first, name="again"), second), found(first, second)
+    for one, other in zip(heavy.rows, twice.rows, strict=True):
+        assert one.data_loss == pytest.approx(other.data_loss, rel=1e-5)
+    densities = [each.scene.volume.density for each in (heavy, twice, once)]
+    torch.testing.assert_close(densities[0], densities[1], rtol=1e-3, atol=1e-5)
+    assert not torch.allclose(densities[0], densities[2], rtol=1e-3, atol=1e-5)
 
 
 def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:

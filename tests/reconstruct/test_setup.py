@@ -8,10 +8,11 @@ import torch
 
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
+from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.setup import choose_loss, start_parameters
+from ddrecon.reconstruct.setup import Problem, choose_loss, start_parameters, targets_of
 from ddrecon.scene import Scene
-from ddrecon.settings import ParameterSettings
+from ddrecon.settings import NoiseSettings, ParameterSettings
 
 
 def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: Scene) -> None:
@@ -74,3 +75,18 @@ def test_pictures_of_both_kinds_need_a_loss(ball_scene: Scene) -> None:
     with pytest.raises(SceneError, match="say how to compare them"):
         choose_loss(ball_scene.optimize, mixed)
     assert choose_loss(replace(ball_scene.optimize, loss="photon"), mixed) == "photon"
+
+
+def test_photon_counts_errors_in_units_of_the_noise_that_is_given(ball_scene: Scene) -> None:
+    """By the view, else by the scene: the mean square error over read^2 + shot times radiance."""
+    said, of_view, level = NoiseSettings(read=0.3, shot=0.2), Noise(0.1, 0.7), 0.5
+    flat = torch.full_like(ball_scene.views[0].image, level)
+    one, other, *_ = (replace(view, image=flat) for view in ball_scene.views)
+    settings = replace(ball_scene.optimize, loss="photon", noise=said)
+    views = [replace(one, noise=of_view), other]
+    problem = Problem.of(replace(ball_scene, views=views, optimize=settings))
+    targets = targets_of(problem.train, problem.loss, problem.noises)
+    for view, noise in zip(views, (of_view, said), strict=True):
+        variance = noise.read**2 + noise.shot * level
+        loss = targets[view.name].loss_of(flat + 0.3)
+        assert float(loss) == pytest.approx(0.3**2 / variance, rel=1e-5)

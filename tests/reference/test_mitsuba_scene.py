@@ -11,7 +11,13 @@ from torch import Tensor
 
 from ddrecon.errors import SceneError
 from ddrecon.light.ground import Ground, Plane
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.lights import (
+    AmbientLight,
+    BeamLight,
+    DirectionalLight,
+    EnvironmentLight,
+    PointLight,
+)
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
@@ -103,6 +109,15 @@ def test_one_color_of_a_scene_is_that_color() -> None:
         np.testing.assert_array_equal(
             one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1)
         )
+
+
+def test_a_beam_is_refused_of_all_colors_and_of_one() -> None:
+    beam = BeamLight(*random_values(3, 3).unbind(), random_values(1)[0])
+    scene = replace(make_scene(random_values(*SHAPE)), lights=[*every_light(beam.power), beam])
+    for one in (scene, *(pick_color(scene, color) for color in range(3))):
+        assert [type(light) for light in one.lights] == [type(light) for light in scene.lights]
+        with pytest.raises(SceneError, match=r"lights\.5: Mitsuba has no Gaussian beams"):
+            described(one)
 
 
 def test_ambient_light_is_part_of_an_environment_map() -> None:

@@ -31,6 +31,7 @@ from ddrecon.report.page import (
 )
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
+from ddrecon.run.report import curves
 
 NASTY = '<script>alert("&")</script>'
 VOID = {"meta", "img"}
@@ -98,6 +99,21 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
     (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
     assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
+
+
+def test_each_curve_of_a_run_is_what_its_name_says() -> None:
+    """Of each the slope, in a plot's own unit, by the color of its name."""
+    rows = [
+        Row(i, 0.0, 9.0, 3.0 * i, 2.0 * i, 0, 0, 8, data_loss=10.0 ** (-i), penalty=10.0 ** (i / 4))
+        for i in range(5)
+    ]
+    for svg, (one, other), ratio in zip(
+        curves(rows), [("images", "penalties"), ("trained on", "held out")], (-4, 1.5), strict=True
+    ):
+        colors = re.findall(r'<polyline [^>]*stroke="([^"]*)"', svg)
+        slopes = dict(zip(colors, (line[-1][1] - line[0][1] for line in places(svg)), strict=True))
+        names = {name: color for color, name in re.findall(r'fill="([^"]*)"[^>]*>([^<]*)<', svg)}
+        assert slopes[names[one]] / slopes[names[other]] == pytest.approx(ratio, rel=0.01)
 
 
 def embedded(*fields: Shown) -> list[dict]:

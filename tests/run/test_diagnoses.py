@@ -1,5 +1,6 @@
 """Each diagnosis is made of a scene that has the fault, and of none of the others."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,14 @@ from ddrecon.losses import Target
 from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render
-from ddrecon.run.diagnoses import best_shift, diagnose, find_falling, promised
+from ddrecon.run.diagnoses import (
+    best_shift,
+    diagnose,
+    find_exposure,
+    find_falling,
+    find_shift,
+    promised,
+)
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
@@ -122,17 +130,47 @@ def test_nobody_is_accused_of_what_going_on_would_mend(
     assert kinds_at(wrong, 60)[-1] == ["exposure"]
 
 
+def blob(right: float = 0.0, down: float = 0.0) -> torch.Tensor:
+    """A smooth picture, moved by so many pixels."""
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(50.0), indexing="ij")
+    return torch.exp(-((x - 24 - right) ** 2 + (y - 19 - down) ** 2) / 60).expand(3, -1, -1)
+
+
+def views_of(**images: torch.Tensor) -> list[View]:
+    mask = (torch.arange(50) > 5).float().expand(40, 50)
+    return [View(name, None, image=x, mask=mask) for name, x in images.items()]  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("move", [(0.3, -0.2), (-0.15, 0.25)])
 def test_the_shift_of_a_smooth_picture_is_found(move: tuple[float, float]) -> None:
     """To first order: a picture and its copy a part of a pixel to the right and down."""
-    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(50.0), indexing="ij")
-
-    def blob(right: float, down: float) -> torch.Tensor:
-        return torch.exp(-((x - 24 - right) ** 2 + (y - 19 - down) ** 2) / 60).expand(3, -1, -1)
-
-    view = View("front", None, image=blob(*move), mask=(x > 5).float())  # type: ignore[arg-type]
-    found, explained = best_shift(view, blob(0, 0))
+    (view,) = views_of(front=blob(*move))
+    found, explained = best_shift(view, blob())
     assert found == pytest.approx(move, abs=0.01) and explained > 0.99
+
+
+GAINS = {"a": 1.1, "b": 1.2, "c": 0.5, "d": 1.5, "e": 1 / 1.1, "f": 0.8, "g": 1.9}
+MOVES = {"a": 0.4, "b": 0.6, "c": 1.3, "d": -1.0, "e": 0.8, "f": -1.1}
+
+
+@pytest.mark.parametrize(
+    ("views", "told"),
+    [
+        (views_of(**{name: gain * blob() for name, gain in GAINS.items()}), "cgdf"),
+        (views_of(a=1.1 * blob(), b=1.2 * blob(), c=blob() / 1.1, d=blob() / 1.3), "db"),
+        (views_of(a=1.1 * blob(), c=blob() / 1.1), ""),
+        (views_of(**{name: blob(right) for name, right in MOVES.items()}), "cfde"),
+        (views_of(a=blob(0.4), b=blob(0.3, 0.5)), "b"),
+        (views_of(a=blob(0.4), b=blob(0.3, 0.3)), ""),
+    ],
+)
+def test_what_is_off_by_15_percent_or_half_a_pixel_is_told_the_four_worst_first(
+    views: Sequence[View], told: str
+) -> None:
+    images = {view.name: blob() for view in views}
+    texts = find_exposure(views, images, 1.0, 0.3), find_shift(views, images, 0.3)
+    found = "".join(re.findall(r"(\w) \([0-9.]+ (?:times|pixels)\)", " ".join(filter(None, texts))))
+    assert found == told
 
 
 def rows_of(losses: Sequence[float], cells: int = 8) -> list[Row]:

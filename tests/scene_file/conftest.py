@@ -10,8 +10,9 @@ from ddrecon.scene_file.load import SceneFile, read_scene
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[[str], Path]:
-    """Writes text to scene.yaml and returns its path."""
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Writes text to scene.yaml in the current folder and returns its path."""
+    monkeypatch.chdir(tmp_path)
 
     def write_text(text: str) -> Path:
         path = tmp_path / "scene.yaml"

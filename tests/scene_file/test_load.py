@@ -8,7 +8,7 @@ import pytest
 import yaml
 from example_scene import CAMERA, SCENE, changed
 
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene, referenced_files
 from ddrecon.scene_file.schema import AmbientSection, Bounds, DirectionalSection, VolumeSection
 from ddrecon.settings import FieldFile, OptimizeSettings, ParameterSettings, RenderSettings
 
@@ -95,6 +95,39 @@ def test_overrides_replace_add_and_reach_into_lists(read: Read):
     tree = read(SCENE, *overrides).tree
     assert tree.volume.g == 0.6 and tree.lights[1] == AmbientSection((1, 2, 3))
     assert tree.optimize is not None and tree.optimize.parameters["density"].lr == 0.01
+
+
+RING = {"count": 1, "radius": 3, "fov": 30}
+OWN = ["shoot/own.npz", "shoot/r0.npy"]
+"""Files of a scene in the folder `shoot`."""
+TYPED = {
+    "volume.g=0": OWN,
+    "volume.density={file: a.npz}": ["a.npz", OWN[1]],
+    "volume.density.file=b/../a.npz": ["b/../a.npz", OWN[1]],
+    "lights=[{type: ambient, radiance: 1}, {type: environment, file: sky.npy}]": ["sky.npy", *OWN],
+    "optimize.parameters={density: {init: {file: a.npz}}}": ["a.npz", *OWN],
+    f"views=[{{image: front.npy, camera: {CAMERA}}}]": ["front.npy", OWN[0]],
+    f"views={{ring: {RING}, images: 'r*.npy'}}": ["r0.npy", OWN[0]],
+    f"views.ring={RING}": OWN,
+    "views.images=r?.npy": ["r0.npy", OWN[0]],
+}
+
+
+@pytest.mark.parametrize(("override", "files"), TYPED.items())
+def test_paths_that_are_typed_start_at_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, override: str, files: list[str]
+) -> None:
+    """Those of the scene start at its folder, as ever."""
+    monkeypatch.chdir(tmp_path)
+    Path("shoot").mkdir()
+    for picture in ("r0.npy", "shoot/r0.npy"):
+        Path(picture).touch()
+    volume = yaml.safe_load(SCENE)["volume"] | {"density": {"file": "own.npz"}}
+    Path("shoot/scene.yaml").write_text(
+        changed(volume=volume, views={"ring": RING, "images": "r*.npy"})
+    )
+    found = referenced_files(read_scene("shoot/scene.yaml", [override]))
+    assert {*found} == {tmp_path / file for file in files}
 
 
 @pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])

@@ -1,5 +1,6 @@
 """The section volume.phase: what it becomes, what is written back, and what is refused."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.errors import DataWarning
+from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
@@ -171,3 +172,78 @@ def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None
         exact = 1e-12 if place in (0, 2) else 4e-3
         torch.testing.assert_close(own.phase.moments(9)[0], found[:, place], rtol=0, atol=exact)
         assert own.sigma_s.item() == pytest.approx(1500 / size)
+
+
+UNITS = {"density": "g/m3", "effective_radius": "um", "temperature": "K"}
+
+
+def water_of_file(path: Path, **units: str) -> str:
+    """A scene of droplets: density 2 and radius 1 in these units, heat 300, from a netCDF file."""
+    netcdf = pytest.importorskip("netCDF4", reason="needs the extra `netcdf`")
+    known = {"density": 2.0, "effective_radius": 1.0, "temperature": 300.0}
+    with netcdf.Dataset(path, "w") as file:
+        for axis, count in zip("zyx", (4, 3, 2), strict=True):
+            file.createDimension(axis, count)
+        for name, value in known.items():
+            file.createVariable(name, "f4", tuple("zyx"))[:] = value
+            file.variables[name].units = (UNITS | units)[name]
+    volume = {name: VOLUME[name] for name in ("bounds", "resolution")}
+    volume |= {"sigma_t": {"meters": 1000}, "albedo": 1} | {n: {"file": path.name} for n in known}
+    droplets = {"type": "mie", "wavelength": 0.67, "refractive_index": 1.33}
+    return changed(volume=volume | {"phase": droplets | {"effective_variance": 0.1}})
+
+
+@pytest.mark.parametrize(
+    ("units", "expected"),
+    [
+        ({}, 3000),
+        ({"density": "g m-3", "effective_radius": "µm", "temperature": "kelvin"}, 3000),
+        ({"density": "kg/m^3", "effective_radius": "microns"}, 3e6),
+        ({"density": "mg m**-3", "effective_radius": "micrometers"}, 3),
+    ],
+)
+def test_files_of_droplets_are_read_in_their_units(
+    units: dict[str, str], expected: float, write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """A gram in a cubic meter extinguishes 1500 / radius [micrometers] in a kilometer."""
+    pytest.importorskip("miepython")
+    text = water_of_file(tmp_path / "les.nc", **units)
+    medium = load_scene(write(text)).volume
+    assert (medium.density * medium.sigma_s).amax().item() == pytest.approx(expected)
+
+
+def test_a_unit_that_a_file_does_not_say_is_taken_with_a_warning(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    pytest.importorskip("miepython")
+    with pytest.warns(DataWarning, match="les.nc: density says no unit; taken in g/m3"):
+        load_scene(write(water_of_file(tmp_path / "les.nc", density="")))
+
+
+def test_a_file_of_droplets_whose_box_is_in_another_unit_is_refused(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    text = water_of_file(tmp_path / "les.nc")
+    with pytest.importorskip("netCDF4").Dataset(tmp_path / "les.nc", "a") as file:
+        for axis, count in zip("zyx", (4, 3, 2), strict=True):
+            file.createVariable(axis, "f4", (axis,))[:] = np.arange(count)
+            file.variables[axis].units = "m"
+    told = "volume.sigma_t.meters: is 1000, but u of les.nc has 1 m"
+    with pytest.raises(SceneError, match=re.escape(told)):
+        load_scene(write(text))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "expected"),
+    [
+        *(("density", unit, "g/m3") for unit in ("kg/kg", "g kg-1", "1", "kg m-2", "m-3")),
+        ("effective_radius", "1", "micrometers"),
+        ("temperature", "degC", "kelvin"),
+    ],
+)
+def test_files_in_units_of_other_quantities_are_refused(
+    name: str, unit: str, expected: str, write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    text = water_of_file(tmp_path / "les.nc", **{name: unit})
+    with pytest.raises(FormatError, match=f"les.nc: {name} is in {unit}, not {expected}"):
+        load_scene(write(text))

@@ -188,6 +188,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def in_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+
+
 def rows(table: str) -> list[tuple[str, str]]:
     return [
         (one, other) for one, _, other in (row.partition(" => ") for row in table.split("\n")[1:-1])

@@ -23,6 +23,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.light.shear import cross_grid
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import NEARLY, Slicing, across
 from ddrecon.slabs.slab import Slab, whole_of
@@ -133,7 +134,7 @@ def radiance_along(
         course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
     )
     # what the cell emits along the ray, and by how much more at its end than at its beginning
-    rise = torch.tensordot(gradient.new_tensor(course.moved), gradient, 1)
+    rise = torch.tensordot(constant(course.moved, gradient), gradient, 1)
     e, r = strength * course.lay(scatters), strength * course.lay(rise)
     phi, psi, eta = decay_terms(depth)
     passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
@@ -193,9 +194,11 @@ def _follow_once(
     """I_in and I_out by slice, for what is `arriving` at the first; and what leaves the box."""
     entered, left, gone = list[Tensor](), list[Tensor](), (list[Tensor](), list[Tensor]())
     ways = list(zip((1, 2), sides, gone, course.drift, course.wraps[1:], strict=True))
+    # All slices at once: the adjoint of one by its number is an array of zeros as large as all.
+    sources, shares = source.unbind(), passed.unbind()
     for k in range(len(source))[:: course.forward]:
         entered.append(arriving)
-        arriving = torch.addcmul(source[k], passed[k], arriving)
+        arriving = torch.addcmul(sources[k], shares[k], arriving)
         left.append(arriving)
         # Part of each row goes on to the next, and of the last leaves the box; so of columns.
         for dim, side, beyond, drift, is_around in ways:

@@ -80,14 +80,14 @@ def run_rounds(
 
 
 @torch.no_grad()
-def _residual(new: Tensor, old: Tensor, grid: Grid) -> float:
+def _residual(new: Tensor, old: Tensor, grid: Grid) -> Tensor:
     """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
     squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
     if isinstance(grid, Slab):
         # halos count as well, alike in both
         squares = squares.new_tensor(sum_numbers(squares.flatten().tolist())).view_as(squares)
     changed, whole = squares
-    return float((changed / whole.clamp(min=1e-300)).amax().sqrt())
+    return (changed / whole.clamp(min=1e-300)).amax().sqrt()
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
 
 FILMS = {".mp4": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska"}
 """What ffmpeg takes a suffix for: by itself it would go by content, and follow playlists."""
+OTHER_CURVES = re.compile("arib-std-b67|smpte2084|smpte428|linear|log100|log316")
+"""As ffmpeg calls them: HLG, PQ, that of cinemas, none and logarithms."""
 
 
 def read_frame(path: Path, number: int = 0, time: float = 0.0) -> np.ndarray:
@@ -30,6 +33,9 @@ def read_frame(path: Path, number: int = 0, time: float = 0.0) -> np.ndarray:
     try:
         about = next(read(path, input_params=asked))
         (width, height), rate = about["size"], about["fps"]
+        if curve := OTHER_CURVES.search(about["pix_fmt"]):
+            what = f"is encoded by {curve[0]}, not by a curve near sRGB's"
+            raise FormatError(path, f"{what}; convert it to SDR (BT.709) first")
         number += round(time * rate)
         check_size(4 * width * height, path, f"a film of {width} x {height} pixels")
         # Half a frame early: the times of frames are rounded.

@@ -1,6 +1,6 @@
 """EXR, HDR, float TIFF and PNG of 16 bits a channel, through OpenImageIO (extra `exr`).
 
-All but PNG are linear; alpha, where present, is premultiplied by convention.
+All but PNG are linear, and multiplied by their alpha: that of EXR is so by convention.
 """
 
 from __future__ import annotations
@@ -17,6 +17,12 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.images.color import (
+    TOP_LEFT,
+    doubt_chromaticities,
+    doubt_primaries,
+    read_profile,
+)
 
 PACKAGE = "OpenImageIO"
 BEGINNINGS = {
@@ -27,8 +33,9 @@ BEGINNINGS = {
 }
 """How files of a kind begin: OpenImageIO alone would go on to try all that it knows."""
 FLOATS = ("half", "float", "double")
+GRAY = ("Y", "gray", "grey", "luminance")
+"""What a single channel is called that is a picture: others are depth, a matte, or anything."""
 BLACK_IS_ZERO, RGB = 1, 2
-TOP_LEFT = 1
 HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
 """Its lines, then the size, then how the first row of pixels begins."""
 STACK_MARK = "bounds="
@@ -38,24 +45,21 @@ STACK_MARK = "bounds="
 def read_exr(path: Path) -> np.ndarray:
     """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4].
 
-    Raises FormatError where it is cropped, or has other channels.
+    Of several parts, those of the one with R, G and B. Raises FormatError where it is cropped, or
+    has other channels.
     """
     with opened(path, "EXR") as (file, spec):
         window = spec.x, spec.y, spec.width, spec.height
         if window != (spec.full_x, spec.full_y, spec.full_width, spec.full_height):
             raise FormatError(path, "its data window is not its display window; save it uncropped")
-        if str(spec.format) not in FLOATS:
-            raise FormatError(path, f"holds samples of type {spec.format}; save it as half floats")
-        names = spec.channelnames
-        if {"R", "G", "B"} <= set(names):
-            kept = ["R", "G", "B", "A"] if "A" in names else ["R", "G", "B"]
-        elif len(names) == 1 or set(names) == {"Y", "A"}:
-            kept = [*names] if len(names) == 1 else ["Y", "Y", "Y", "A"]
-        else:
-            known = "expected R, G, B, optionally A, or a single one"
-            raise FormatError(path, f"has the channels {', '.join(names)}; {known}")
-        pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, kept)]]
-    return pixels[..., 0] if len(kept) == 1 else pixels
+        places = [*map(spec.channelindex, _channels_of_picture(spec))]
+        kinds = {str(spec.channelformat(place)) for place in places}
+        if kinds - {*FLOATS}:
+            told = ", ".join(sorted(kinds))
+            raise FormatError(path, f"holds samples of type {told}; save it as half floats")
+        doubt_chromaticities(path, spec.getattribute("chromaticities"))
+        pixels = read_pixels(path, file, "float")[..., places]
+    return pixels[..., 0] if len(places) == 1 else pixels
 
 
 def read_hdr(path: Path) -> np.ndarray:
@@ -105,6 +109,8 @@ def read_tiff(path: Path) -> np.ndarray:
         raise FormatError(path, "is a volume (several pages); an image is a single page")
     with opened(path, "TIFF") as (file, spec):
         kind = spec.getattribute("tiff:PhotometricInterpretation")
+        kept, profile = _channels_of_picture(spec), spec.getattribute("ICCProfile")
+        said = None if profile is None else read_profile(bytes(profile))
         reason = None
         if spec.get_int_attribute("Orientation", TOP_LEFT) != TOP_LEFT:
             reason = "has turned rows"
@@ -112,12 +118,17 @@ def read_tiff(path: Path) -> np.ndarray:
             reason = f"holds samples of type {spec.format}"
         elif kind not in (BLACK_IS_ZERO, RGB):
             reason = f"has photometric interpretation {kind}"
+        elif {*kept} != {*spec.channelnames}:
+            reason = "has samples that are neither colors nor marked as alpha (ExtraSamples)"
+        elif said and not said.is_linear:
+            reason = f"is not linear by its {said.source}"
         if reason:
-            raise FormatError(
-                path, f"{reason}; only float TIFF, gray or RGB, is read: save it so, or as .exr"
-            )
-        pixels = read_pixels(path, file, "float")
-    return pixels[..., 0] if pixels.shape[2] == 1 else pixels
+            only = "only float TIFF, linear, gray or RGB, is read: save it so, or as .exr"
+            raise FormatError(path, f"{reason}; {only}")
+        if said and not said.has_srgb_primaries:
+            doubt_primaries(path, said.source)
+        pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, kept)]]
+    return pixels[..., 0] if len(kept) == 1 else pixels
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
@@ -136,11 +147,13 @@ def write_exr(path: Path, pixels: np.ndarray) -> None:
 def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     """The file at `path` and what its header says, for a block that reads it.
 
-    Raises FormatError unless it is of this `kind`, and small enough.
+    Of EXR the part that is a picture. Raises FormatError unless it is of this `kind`, and small
+    enough.
     """
     module = load_for_file(PACKAGE, path)
     settings = module.ImageSpec()
-    settings.attribute("oiio:UnassociatedAlpha", 1)
+    # Alpha is multiplied into colors that are linear.
+    settings.attribute("oiio:UnassociatedAlpha", int(kind == "PNG"))
     with path.open("rb") as stream:
         if not stream.read(4).startswith(BEGINNINGS[kind]):
             raise FormatError(path, f"is no {kind} image")
@@ -148,7 +161,7 @@ def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     if file is None:
         raise FormatError(path, f"is damaged: {_line(module.geterror())}")
     try:
-        spec = file.spec()
+        spec = _seek_picture(path, file) if kind == "EXR" else file.spec()
         width, height, size = spec.width, spec.height, max(spec.nchannels, 4) * 4
         check_size(size * width * height, path, f"an image of {width} x {height} pixels")
         if spec.deep or spec.depth > 1:
@@ -158,6 +171,40 @@ def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
         yield file, spec
     finally:
         file.close()
+
+
+def _seek_picture(path: Path, file: Any) -> Any:
+    """Goes to the one part that is a picture, and returns what its header says.
+
+    Raises FormatError where none or several are: those with R, G and B, else gray ones.
+    """
+    specs = list[Any]()
+    while file.seek_subimage(len(specs), 0):
+        specs.append(file.spec())
+    file.geterror()  # that there is no other part is none
+    pictures = [index for index, spec in enumerate(specs) if _channels_of_picture(spec)]
+    colored = [index for index in pictures if len(_channels_of_picture(specs[index])) > 2]
+    chosen = colored or pictures
+    if len(chosen) != 1:
+        parts = [
+            f"{spec.get_string_attribute('oiio:subimagename')}: {', '.join(spec.channelnames)}"
+            for spec in specs
+        ]
+        what = "several parts that are pictures" if chosen else "no picture among its channels"
+        known = "expected R, G, B, optionally A, or Y, in one part"
+        raise FormatError(path, f"has {what} ({'; '.join(parts).lstrip(': ')}); {known}")
+    file.seek_subimage(chosen[0], 0)
+    return specs[chosen[0]]
+
+
+def _channels_of_picture(spec: Any) -> list[str]:
+    """The names of channels that are colors and alpha, or a gray one; none if others are meant."""
+    names = spec.channelnames
+    if {"R", "G", "B"} <= {*names}:
+        return ["R", "G", "B", "A"] if "A" in names else ["R", "G", "B"]
+    if {*names} == {"Y", "A"}:
+        return ["Y", "Y", "Y", "A"]
+    return [*names] if len(names) == 1 and names[0] in GRAY else []
 
 
 def read_pixels(path: Path, file: Any, dtype: str) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Images by suffix, in linear radiance. Row 0 is the top.
 
-Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and
-16-bit ones (.png, .jpg, .webp, frames of films) are decoded from sRGB and multiplied by their
-alpha. Either way a pixel of alpha 0 is empty: black. Previews have exposure 1.
+Float formats (.exr, .hdr, .npy, .tif) are linear; 8- and 16-bit ones (.png, .jpg, .webp, frames of
+films) are decoded from sRGB unless they say that they are linear. All are multiplied by their
+alpha: a pixel of alpha 0 is empty: black. Previews have exposure 1.
 """
 
 from __future__ import annotations
@@ -19,6 +19,12 @@ from ddrecon.extras import is_there
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images.color import (
+    ORIENTATION,
+    TOP_LEFT,
+    doubt_orientation,
+    has_linear_samples,
+)
 from ddrecon.io.images.films import FILMS, read_frame
 from ddrecon.io.images.oiio import (
     PACKAGE,
@@ -41,7 +47,10 @@ Pillow alone would go by content whatever the suffix, and run Ghostscript on Pos
 SECONDS = 4.0
 """How long a movie takes from its first frame back to it."""
 COLORS = ("LA", "RGB", "RGBA")
-"""Pillow's modes of several channels."""
+MODES = ("1", "L", "P", "I", "I;16", *COLORS)
+"""Pillow's modes that are read: in PNG, I is 16 bits."""
+SPREAD = {"1": 255, "L;2": 85, "L;4": 17}
+"""By what Pillow spreads samples of few bits over 8, but not always the one that is transparent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,15 +76,51 @@ def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
 
     Raises FormatError where it is unknown, damaged, or not finite.
     """
-    reader, step = READERS.get(path.suffix.lower()), 0.0
+    with guard_reading(path):
+        stored = _read_stored(path, frame, time)
+        if stored.dtype.kind == "f":
+            return _image_of(path, stored)
+        if path.suffix.lower() == ".npy":
+            what = f"holds whole numbers ({stored.dtype}), not radiance"
+            raise FormatError(path, f"{what}; save it as float32, or 8 bits of sRGB as .png")
+        if path.suffix.lower() not in FILMS and has_linear_samples(path):
+            return _image_of(path, _decode(stored, np.asarray))
+        return _image_of(path, _decode(stored), 1 / np.iinfo(stored.dtype).max)
+
+
+def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
+    """The mask at `path`: 1 where it is more than half white and half opaque, else 0.
+
+    Half is meant as stored, by whatever curve: what lossy files leave around edges does not count.
+    Arrays and PNGs may have whole numbers 0 and 1. Raises FormatError where it is dark, but not
+    black.
+    """
+    suffix = path.suffix.lower()
+    with guard_reading(path):
+        stored = _read_stored(path, frame, time)
+        has_bits = suffix in (".npy", ".png") and stored.max(initial=0) <= 1
+        is_plain = has_bits or stored.dtype.kind in "fb"
+        image = _image_of(path, stored if is_plain else _decode(stored, np.asarray))
+    white = image.pixels.max(axis=2)
+    alpha = np.ones_like(white) if image.coverage is None else image.coverage
+    counts = (white > alpha / 2) & (alpha > 0.5)
+    if suffix not in FILMS and white.any() and not counts.any():  # which may leave black noisy
+        what = f"is nowhere more than half white (at most {white.max():.3g}) and half opaque"
+        raise FormatError(path, f"{what}; a mask is white where pixels count")
+    return Image(as_float32(counts[..., None]))
+
+
+def _read_stored(path: Path, frame: int, time: float) -> np.ndarray:
+    """Linear values as floats, or whole numbers as the file has them."""
+    reader = READERS.get(path.suffix.lower())
     if reader is None:
         known = ", ".join(READERS)
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {known}")
-    with guard_reading(path):
-        values = read_frame(path, frame, time) if reader is read_frame else reader(path)
-        if reader in (read_frame, _read_encoded):
-            step = 1 / 65535 if values.dtype == np.uint16 else 1 / 255
-            values = _decode(values)
+    return read_frame(path, frame, time) if reader is read_frame else reader(path)
+
+
+def _image_of(path: Path, values: np.ndarray, step: float = 0.0) -> Image:
+    """The image of linear `values`, which are to be checked."""
     if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,), (4,)) or not values.size:
         legal = "expected [h, w], [h, w, 3] or [h, w, 4]"
         raise FormatError(path, f"has shape {list(values.shape)}; {legal}")
@@ -94,12 +139,6 @@ def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
     coverage = values[..., 3]
     pixels = np.where(coverage[..., None] > 0, values[..., :3], np.float32(0))
     return Image(pixels, coverage, step)
-
-
-def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
-    """The mask at `path`: 0 where its image is black or empty, and ignored, else 1."""
-    image = read_image(path, frame, time)
-    return Image(as_float32(image.pixels.max(axis=2, keepdims=True) > 0))
 
 
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
@@ -160,8 +199,7 @@ def _read_array(path: Path) -> np.ndarray:
 
 
 def _read_encoded(path: Path) -> np.ndarray:
-    """The values as stored: 8 or 16 bits of sRGB, or one."""
-    import imageio.v3 as iio
+    """The values as stored, of 8 or 16 bits."""
     from PIL import Image as Pillow
 
     with path.open("rb") as stream:
@@ -170,25 +208,46 @@ def _read_encoded(path: Path) -> np.ndarray:
         raise FormatError(path, "is no PNG, JPEG or WebP image")
     with Pillow.open(path) as picture:
         (width, height), mode = picture.size, picture.mode
-        is_deep = any("16B" in str(tile[3]) for tile in picture.tile)
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
-        if is_deep and mode in COLORS:  # which Pillow reads as 8 bits
+        if mode not in MODES:
+            raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
+        if "16B" in str(picture.tile) and mode in COLORS:  # which Pillow reads as 8 bits
             picture.verify()  # of its checksums libpng would tell stderr as well
             with opened(path, "PNG") as (file, _):
-                return read_pixels(path, file, "uint16")
-    stored = iio.imread(path, plugin="pillow", index=0)
-    if mode not in {"1", "L", "P", *COLORS} and stored.dtype != np.uint16:
-        raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
+                stored = read_pixels(path, file, "uint16")
+        else:
+            stored = _samples_of(picture)
+        # Other ways to ask for EXIF would decode a PNG for it.
+        doubt_orientation(path, Pillow.Image.getexif(picture).get(ORIENTATION, TOP_LEFT))
     return stored
 
 
-def _decode(stored: np.ndarray) -> np.ndarray:
+def _samples_of(picture: Any) -> np.ndarray:
+    """uint8 or uint16 [h, w] or [h, w, c]: colors of palettes, and what is said to be transparent
+    with an alpha of 0.
+    """
+    clear, packing = picture.info.get("transparency"), str(picture.tile and picture.tile[0][3])
+    if picture.mode in ("P", "RGB"):
+        return np.asarray(picture.convert("RGB" if clear is None else "RGBA"))
+    samples = np.asarray(picture.convert("L") if picture.mode == "1" else picture)
+    samples = samples.astype(np.uint16) if picture.mode.startswith("I") else samples
+    if clear is None:
+        return samples
+    spread = SPREAD.get(packing, 1)
+    clear = clear * spread if clear <= 255 // spread else clear
+    alpha = np.where(samples == clear, 0, np.iinfo(samples.dtype).max)
+    return np.stack([samples, alpha.astype(samples.dtype)], axis=2)
+
+
+def _decode(
+    stored: np.ndarray, curve: Callable[[np.ndarray], np.ndarray] = srgb.decode
+) -> np.ndarray:
     """Linear values of `stored` [h, w] or [h, w, c], multiplied by alpha: the last of 2 or 4 c."""
-    values = stored / (1 if stored.dtype == bool else np.iinfo(stored.dtype).max)
+    values = stored / np.iinfo(stored.dtype).max
     if values.ndim == 2 or values.shape[2] == 3:
-        return srgb.decode(values)
+        return curve(values)
     alpha = values[..., -1:]
-    colors = srgb.decode(values[..., :-1]) * alpha
+    colors = curve(values[..., :-1]) * alpha
     return np.concatenate([np.broadcast_to(colors, (*alpha.shape[:2], 3)), alpha], axis=2)
 
 

@@ -22,23 +22,36 @@ VECTORS = ("velocity",)
 """What fields are called whose three numbers are along x, y and z, not colors."""
 SIGNED = ("g", *VECTORS)
 """What fields are called that may be negative."""
+EMPTY = 1e-4
+"""Of the largest: cells with less count as empty. An optimization leaves no cell at exactly 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
     """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0, in a box.
 
-    `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them.
+    `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
+    so is how many `meters` a u has; `unit` is that of the values, as it spells it, "" where it
+    could say one.
     """
 
     values: np.ndarray
     bounds: np.ndarray | None = None
+    unit: str | None = None
+    meters: float | None = None
 
     @property
     def resolution(self) -> tuple[int, int, int]:
         """Cells along (x, y, z)."""
         z, y, x = self.values.shape[:3]
         return x, y, z
+
+
+def prune(values: np.ndarray) -> np.ndarray:
+    """`values` [z, y, x] or [z, y, x, 3] with 0 in cells of less than `EMPTY` of the largest."""
+    sizes = np.abs(values).reshape(*values.shape[:3], -1).max(-1, keepdims=True)
+    is_empty = sizes <= EMPTY * sizes.max()  # nowhere if any is NaN
+    return np.where(is_empty.reshape(*values.shape[:3], *[1] * (values.ndim - 3)), 0, values)
 
 
 def require_only_field(path: Path, fields: Fields) -> np.ndarray:
@@ -52,7 +65,14 @@ def require_only_field(path: Path, fields: Fields) -> np.ndarray:
 
 
 def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:
-    """The field of `values` and `bounds` in the file at `path`; raises FormatError unless legal."""
+    """The field of `values` and `bounds` in the file at `path`; raises FormatError unless legal.
+
+    Axes of one entry behind or before those of cells and colors go.
+    """
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    while values.ndim > 3 + (values.shape[-1:] == (3,)) and len(values) == 1:
+        values = values[0]
     if values.ndim not in (3, 4) or values.shape[3:] not in ((), (3,)) or values.size == 0:
         legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
         raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")

@@ -1,12 +1,15 @@
 """Atmospheric fields in netCDF, read through `netCDF4` (extra `netcdf`).
 
-A field is a variable on axes x, y and z in any order. An axis is known by the attribute `axis` of
-its coordinate (CF conventions), else by its name. Coordinates are centers of cells, evenly spaced,
+A field is a variable on axes x, y and z in any order, in any group. An axis is known by what its
+coordinate says (CF conventions), else by its name. Coordinates are centers of cells, evenly spaced,
 in the unit of x, which is taken for the scene's unit of length.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,97 +19,196 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import check_size
 from ddrecon.io.volumes.field import Field, check_field
+from ddrecon.io.volumes.units import METERS, size_of
 
+LEVELS = "[pim]?lev|(model|pressure)_?lev|(air_)?pres|p$|isobaric|sigma|eta$|hybrid|atmosphere_"
+"""How the names of axes begin that are no length but pressures, or numbers of levels."""
 NAMES = {
-    "x": ("x", "west_east", "nx"),
-    "y": ("y", "south_north", "ny"),
-    "z": ("z", "height", "altitude", "bottom_top", "lev", "nz"),
+    "t": ".*time",
+    "x": "n?x|n?i(p1)?$|ni_|west_east|easting|projection_x|(grid_|r)?lon",
+    "y": "n?y(?!r|ear)|n?j(p1)?$|nj_|south_north|northing|projection_y|(grid_|r)?lat",
+    "z": f"n?z(?!en)|n?k(p1)?$|nk_|bottom_top|height|alt|depth|{LEVELS}",
 }
-"""What the names of axes begin with."""
-METERS = {
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
-    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
-}
+"""How the names of axes begin."""
 EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
+
+
+Coordinates = Mapping[str, Any]
+"""Variables that say where cells lie, by dimension."""
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Cells along a `dimension`.
+
+    `step` is -1 where they go down, else 1; `ends` [2] are where they begin and end, in units of
+    `meters`, where the file says so.
+    """
+
+    dimension: str
+    step: int = 1
+    ends: np.ndarray | None = None
+    meters: float | None = None
 
 
 def netcdf_names(path: Path) -> list[str]:
     """The variables of the file at `path` that have axes x, y and z; there must be some."""
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        names = [
-            name
-            for name, variable in file.variables.items()
-            if set("xyz") <= {_axis_of(file, dimension) for dimension in variable.dimensions}
-        ]
+        axes = {name: _axes(variable, seen) for name, variable, seen in _variables(file)}
+        names = [name for name in axes if set("xyz") <= set(axes[name].values())]
         if not names:
-            axes = ", ".join(file.dimensions)
-            raise FormatError(path, f"has the dimensions {axes}; name some of them x, y and z")
+            known = ", ".join(dict.fromkeys(axis for each in axes.values() for axis in each))
+            raise FormatError(path, f"has the dimensions {known}; name some of them x, y and z")
         return names
 
 
+def _variables(
+    group: Any, prefix: str = "", above: Coordinates | None = None
+) -> Iterator[tuple[str, Any, Coordinates]]:
+    """The path of each variable in `group`, itself, and the coordinates that it sees.
+
+    A coordinate has the name of its dimension, or else is the only length along it alone; those
+    `above` are of dimensions of groups around this one.
+    """
+    known = {name: one for name, one in (above or {}).items() if name not in group.dimensions}
+    lengths, others = dict[str, list[Any]](), dict[str, Any]()
+    for name, variable in group.variables.items():
+        if not np.issubdtype(variable.dtype, np.number):
+            continue
+        if name in variable.dimensions:
+            known[name] = variable
+            continue
+        others[name] = variable
+        if variable.ndim == 1 and size_of(_says(variable, "units"), METERS) is not None:
+            axis, (along,) = _axis_of(name, variable), variable.dimensions
+            if axis and _axis_of(along, None) in ("", axis):
+                lengths.setdefault(along, []).append(variable)
+    known = {along: each[0] for along, each in lengths.items() if len(each) == 1} | known
+    for name, variable in others.items():
+        yield prefix + name, variable, known
+    for name, inner in group.groups.items():
+        yield from _variables(inner, f"{prefix}{name}/", known)
+
+
 def read_netcdf(path: Path, name: str) -> Field:
-    """The variable `name` of the file at `path`.
+    """The variable `name` of the file at `path`, with its unit.
 
     Raises FormatError when it is damaged, unevenly spaced or not a legal field.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        variable = file.variables[name]
-        check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
-        # What is masked (_FillValue) is NaN, which `check_field` refuses.
-        values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
-        axes = dict[str, str]()
-        for dimension, count in zip(variable.dimensions, values.shape, strict=True):
-            axis = _axis_of(file, dimension)
-            if axis and axis not in axes:
+        variable, known = next(each[1:] for each in _variables(file) if each[0] == name)
+        values, axes = _numbers(path, variable), dict[str, str]()
+        sizes = dict(zip(variable.dimensions, values.shape, strict=True))
+        for dimension, axis in sorted(
+            _axes(variable, known).items(), key=lambda one: -sizes[one[0]]
+        ):
+            if axis in [*"xyz"] and axis not in axes:
                 axes[axis] = dimension
-            elif count > 1:
-                advice = f"choose one (ncks -d {dimension},0)"
-                raise FormatError(path, f"{name} has {count} entries along {dimension!r}; {advice}")
+            elif sizes[dimension] != 1:
+                what = f"{name} has {sizes[dimension]} entries along {dimension!r}"
+                raise FormatError(path, f"{what}; choose one (ncks -d {dimension},0)")
         kept = [axes[axis] for axis in "zyx"]
         order = sorted(variable.dimensions, key=lambda one: [*kept, one].index(one))
         values = values.transpose([variable.dimensions.index(one) for one in order])
-        sides = [_side(path, file, dimension) for dimension in kept]
-    flips = tuple(slice(None, None, step) for step, _ in sides)
-    known = [edges for _, edges in sides if edges is not None]
-    bounds = np.array(known[::-1]).T if len(known) == 3 else None
-    return check_field(path, name, values.reshape(values.shape[:3])[flips], bounds)
+        sides = [_side(path, axis, axes[axis], known.get(axes[axis])) for axis in "xyz"]
+        bounds, unit = _box(path, sides), _says(variable, "units")
+    flips = tuple(slice(None, None, side.step) for side in reversed(sides))
+    values = values.reshape(values.shape[:3])[flips]
+    meters = None if bounds is None else sides[0].meters
+    return replace(check_field(path, name, values, bounds), unit=unit, meters=meters)
 
 
-def _axis_of(file: Any, dimension: str) -> str | None:
-    """Which of x, y and z the `dimension` is."""
-    attribute = str(getattr(file.variables.get(dimension), "axis", "")).lower()
-    if attribute in NAMES:
-        return attribute
-    return next(
-        (axis for axis, names in NAMES.items() if dimension.lower().startswith(names)), None
-    )
+def _numbers(path: Path, variable: Any) -> np.ndarray:
+    """The values of `variable`, NaN where masked (_FillValue), which `check_field` refuses."""
+    size = int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize
+    check_size(size, path, variable.name)
+    return np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
 
 
-def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:
-    """-1 where cells along `dimension` go down, else 1; where they begin and end, if it is said."""
-    if dimension not in file.variables:
-        return 1, None
-    coordinate = file.variables[dimension]
-    centers = np.asarray(coordinate[:], np.float64)
-    steps = np.diff(centers)
-    even = np.linspace(centers[0], centers[-1], len(centers))
-    if len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
-        spacing = f"{np.abs(steps).min():g} to {np.abs(steps).max():g}"
-        advice = "interpolate it first (xarray: .interp)"
-        raise FormatError(path, f"{dimension} is not evenly spaced ({spacing}); {advice}")
-    step = -1 if centers[-1] < centers[0] else 1
+def _says(variable: Any, attribute: str) -> str:
+    return str(getattr(variable, attribute, "")).strip()
+
+
+def _axes(variable: Any, known: Coordinates) -> dict[str, str]:
+    """Which of x, y, z and t each dimension of `variable` is, "" where that is unknown."""
+    return {name: _axis_of(name, known.get(name)) for name in variable.dimensions}
+
+
+def _axis_of(dimension: str, coordinate: Any) -> str:
+    axis = _says(coordinate, "axis").lower()
+    if axis in NAMES:
+        return axis
+    if " since " in _says(coordinate, "units"):
+        return "t"
+    if _says(coordinate, "positive"):
+        return "z"
+    names = _says(coordinate, "standard_name"), dimension, _says(coordinate, "name")
+    return next((a for name in names for a, begins in NAMES.items() if _begins(name, begins)), "")
+
+
+def _begins(name: str, pattern: str) -> bool:
+    return re.match(pattern, name, re.IGNORECASE) is not None
+
+
+def _side(path: Path, axis: str, dimension: str, coordinate: Any) -> _Side:
+    """Where cells lie along the `axis`, a `dimension`, by its `coordinate`; raises FormatError."""
+    unit, positive = _says(coordinate, "units"), _says(coordinate, "positive").lower()
+    meters, names = size_of(unit, METERS), (_says(coordinate, "standard_name"), dimension)
+    is_depth = not positive and any(_begins(name, "depth") for name in names)
+    are_levels = any(_begins(name, LEVELS) for name in names) or (is_depth and coordinate is None)
+    if meters is None and (unit or (are_levels and axis == "z")):
+        what = f"is in {unit}, which is no known length" if unit else "says no unit of length"
+        drop = f"leave it out (ncks -C -x -v {dimension}) and say volume.bounds"
+        advice = "interpolate to heights in m" if axis == "z" else f"project it to m, or {drop}"
+        raise FormatError(path, f"{dimension} {what}; {advice}")
+    if coordinate is None:
+        return _Side(dimension)
+    centers = _centers(path, coordinate, dimension)
+    if is_depth and centers.min() < 0:
+        advice = f"say which way it counts (ncatted -a positive,{dimension},o,c,up)"
+        raise FormatError(path, f"{dimension} has depths below 0; {advice}")
+    sign = -1 if axis == "z" and (is_depth or positive.startswith("down")) else 1
+    step = sign * (-1 if centers[-1] < centers[0] else 1)
     # The two ends of a cell come in either order, whichever way the axis goes.
-    corners = file.variables.get(getattr(coordinate, "bounds", ""))
+    corners, ends = coordinate.group().variables.get(_says(coordinate, "bounds")), None
     if corners is not None:
-        edges = np.asarray(corners[:], np.float64)
-    elif len(steps):
-        edges = centers[[0, -1]] + steps.mean() / 2 * np.array([-1, 1])
-    else:
-        return step, None
-    # In the unit of the first axis of x, where both are known.
-    along_x = [name for name in file.dimensions if _axis_of(file, name) == "x"]
-    first = next((file.variables[name] for name in along_x if name in file.variables), coordinate)
-    own, unit = (METERS.get(str(getattr(one, "units", "")).lower()) for one in (coordinate, first))
-    scale = own / unit if own and unit else 1.0
-    return step, np.array([edges.min(), edges.max()]) * scale
+        ends = _numbers(path, corners)
+    elif len(centers) > 1:
+        half = (centers[-1] - centers[0]) / (len(centers) - 1) / 2
+        ends = np.array([centers[0] - half, centers[-1] + half])
+    if ends is not None:
+        ends = np.sort([sign * ends.min(), sign * ends.max()]) + 0.0
+    return _Side(dimension, step, ends, meters)
+
+
+def _centers(path: Path, coordinate: Any, dimension: str) -> np.ndarray:
+    """The centers of cells along `dimension`; raises FormatError where they are no even profile."""
+    numbers = _numbers(path, coordinate)
+    columns = np.moveaxis(numbers, coordinate.dimensions.index(dimension), 0)
+    columns = columns.reshape(len(columns), -1)
+    centers = columns.mean(1)
+    steps, even = np.diff(centers), np.linspace(centers[0], centers[-1], len(centers))
+    reason = None
+    if np.ptp(columns, 1).max() > EVEN * np.abs(steps).min(initial=np.inf):
+        reason = "differs from column to column"
+    elif len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
+        spacing = f"{np.abs(steps).min():g} to {np.abs(steps).max():g}"
+        reason = f"is not evenly spaced ({spacing})"
+    if reason:
+        raise FormatError(path, f"{dimension} {reason}; interpolate it first (xarray: .interp)")
+    return centers
+
+
+def _box(path: Path, sides: list[_Side]) -> np.ndarray | None:
+    """The corners of the box [2, 3], in the unit of x, where the file says all `sides`."""
+    ends = [side.ends for side in sides if side.ends is not None]
+    if len(ends) < len(sides):
+        return None
+    meters = [side.meters for side in sides if side.meters is not None]
+    if meters and len(meters) < len(sides):
+        silent = next(side.dimension for side in sides if side.meters is None)
+        advice = f"say it (ncatted -a units,{silent},o,c,m)"
+        raise FormatError(path, f"{silent} says no unit of length, others do; {advice}")
+    scales = np.divide(meters, meters[0]) if meters else np.ones(len(sides))
+    return np.stack(ends, 1) * scales

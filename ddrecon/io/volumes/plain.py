@@ -77,7 +77,6 @@ def read_vol(path: Path, name: str) -> Field:
         said = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
         raise FormatError(path, f"is damaged: its header says {said}")
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
-    values = values[..., 0] if colors == 1 else values
     return check_field(path, name, values, np.array(corners).reshape(2, 3))
 
 

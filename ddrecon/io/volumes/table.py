@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
@@ -68,6 +69,28 @@ def read_field(path: Path, name: str) -> Field:
         return kind.read(path, name)
 
 
+def read_fields(path: Path) -> tuple[dict[str, Field], dict[str, str]]:
+    """The fields of the same cells in the volume at `path`, and why all else in it is none.
+
+    Both are by name. Raises FormatError where nothing in the file is a field.
+    """
+    fields, reasons, read = dict[str, Field](), dict[str, str](), _format_of(path).read
+    for name in (names := field_names(path)):
+        try:
+            with guard_reading(path):
+                field = read(path, name)
+        except FormatError as error:
+            if name == names[-1] and not fields:
+                raise
+            reasons[name] = error.reason
+            continue
+        if fields and _place(field) != (first := _place(next(iter(fields.values())))):
+            reasons[name] = f"{name} has {_place(field)}, not {first}"
+        else:
+            fields[name] = field
+    return fields, reasons
+
+
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
     """Writes `values` [z, y, x] or [z, y, x, 3], as float32, in the format of `path`'s suffix.
 
@@ -101,10 +124,13 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
     """
     fields: dict[str, Field] = {}
     for path in sources:
-        for name in field_names(path):
+        found, reasons = read_fields(path)
+        for reason in reasons.values():
+            warnings.warn(f"{path}: left out: {reason}", DataWarning, 2)
+        for name, field in found.items():
             if name in fields:
                 raise FormatError(path, f"has a field {name!r}, and so has a file before it")
-            field = fields[name] = read_field(path, name)
+            fields[name] = field
             if field.bounds is None:
                 raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
             places = {_place(each) for each in fields.values()}
@@ -119,7 +145,8 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
 
 def _place(field: Field) -> str:
     cells = " x ".join(map(str, field.resolution))
-    return f"{cells} cells (x, y, z) in the box {np.asarray(field.bounds).tolist()}"
+    box = "no box" if field.bounds is None else f"the box {field.bounds.tolist()}"
+    return f"{cells} cells (x, y, z) in {box}"
 
 
 def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:

@@ -8,6 +8,7 @@ Its box is in ImageJ's calibration, and in full precision in an entry `bounds` o
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,6 @@ def read_stack(path: Path, name: str) -> Field:
     """The field at `path`, taken for `name`; raises FormatError if damaged or no legal field."""
     with opened(path, "TIFF") as (file, spec):
         description = spec.get_string_attribute("ImageDescription")
-        facts = dict(line.split("=", 1) for line in description.splitlines() if "=" in line)
         pages = list[np.ndarray]()
         while file.seek_subimage(len(pages), 0):
             pages.append(read_pixels(path, file, "unknown"))
@@ -55,19 +55,51 @@ def read_stack(path: Path, name: str) -> Field:
         if (said := file.geterror()) and "could not seek" not in said and said != f"Err: {path}":
             raise FormatError(path, f"is damaged: {said}")
         per_unit = [spec.get_float_attribute(f"{axis}Resolution", 1.0) for axis in "XY"]
+    values = np.stack(pages)
+    facts = _facts(path, description, values.shape[3])
     if len(pages) != int(facts.get("images", len(pages))):
         raise FormatError(path, f"is damaged: {len(pages)} of {facts['images']} pages are there")
     if int(facts.get("frames", 1)) > 1:
         raise FormatError(path, f"has {facts['frames']} frames; save a stack of one")
-    values = np.stack(pages)
     if (channels := int(facts.get("channels", 1))) > 1:
         values = np.stack([values[index::channels, ..., 0] for index in range(channels)], -1)
-    values = values[..., 0] if values.shape[3] == 1 else values
     bounds = None
     if "bounds" in facts:
         bounds = np.array(json.loads(facts["bounds"]), np.float64)
     elif "spacing" in facts:
-        size = np.array([1 / per_unit[0], 1 / per_unit[1], float(facts["spacing"])])
-        low = -size * [float(facts.get(f"{axis}origin", 0)) for axis in "xyz"]
+        sides = facts.get("width", 1 / per_unit[0]), facts.get("height", 1 / per_unit[1])
+        size = np.array([*sides, facts["spacing"]], np.float64)
+        low = 0.0 - size * [float(facts.get(f"{axis}origin", 0)) for axis in "xyz"]
         bounds = np.stack([low, low + size * values.shape[2::-1]])
     return check_field(path, name, values, bounds)
+
+
+def _facts(path: Path, description: str, samples: int) -> dict[str, str]:
+    """What the `description` of a stack, a page of which has so many `samples`, says of it.
+
+    It is in ImageJ's words, into which OME's are put. Raises FormatError for OME's and tifffile's
+    stacks of several channels, times or images, and for sizes of voxels in different units.
+    """
+    facts = dict(line.split("=", 1) for line in description.splitlines() if "=" in line)
+    units = {facts[name] for name in ("unit", "yunit", "zunit") if name in facts}
+    several = ""
+    if re.search(r"<(\w+:)?OME\b", description):
+        images = re.findall(r"<(?:\w+:)?Pixels\b[^>]*>", description)
+        said = dict(re.findall(r'(\w+)="([^"]*)"', "".join(images)))
+        slices, channels, times = (int(said.get(f"Size{axis}", 1)) for axis in "ZCT")
+        if len(images) != 1 or channels != samples or times > 1:
+            several = f"{len(images)} images of {channels} channels and {times} frames"
+        facts, units = {"images": str(slices)}, set()
+        if all(f"PhysicalSize{axis}" in said for axis in "XYZ"):
+            units = {said.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"}
+            words = zip(("width", "height", "spacing"), "XYZ", strict=True)
+            facts |= {word: said[f"PhysicalSize{axis}"] for word, axis in words}
+    elif description.startswith('{"shape":'):
+        shape = json.loads(description)["shape"]
+        if sum(count > 1 for count in shape[: -2 - (samples > 1)]) > 1:
+            several = f"the shape {shape}"
+    if several:
+        raise FormatError(path, f"has {several}; save a stack of one, [z, y, x]")
+    if len(units) > 1:
+        raise FormatError(path, f"has sizes of voxels in {' and '.join(sorted(units))}; take one")
+    return facts

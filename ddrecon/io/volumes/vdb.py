@@ -2,8 +2,8 @@
 
 Each field is a fog volume of its own name, of type float, or vec3s for colors. Voxel (i, j, k) of a
 file is our cell (i, j, k) along x, y, z; its center is where the grid's transform puts that index.
-The background is 0, and active is what is not 0. How many cells the box has, which a sparse grid
-does not say, is its metadata `ddrecon_resolution`.
+The background is 0, and active is what `prune` leaves. How many cells the box has, which a sparse
+grid does not say, is its metadata `ddrecon_resolution`.
 
 What we write is of the plainest kind: not compressed, no tiles. No other file is read: those of
 other programs are converted by OpenVDB's own Python module, which pip does not have.
@@ -22,7 +22,7 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import Field, Fields, check_field
+from ddrecon.io.volumes.field import Field, Fields, check_field, prune
 
 RESOLUTION = "ddrecon_resolution"
 MAGIC, FILE_VERSION, LIBRARY_VERSION = 0x56444220, 224, (10, 0)
@@ -39,19 +39,19 @@ TREES = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 """Values of a voxel, by the kind of tree."""
 ADVICE = (
     "is of another program, and needs the Python module openvdb once: Blender's Python has it, and "
-    "Debian's (apt-get install python3-openvdb); docs/formats.md has the line that makes it .npz"
+    "Debian's (apt-get install python3-openvdb); docs/formats.md has the lines that make it .npz"
 )
 
 
 def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes.
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes, pruned.
 
     `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform.
     """
     data = HEADER.pack(MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1)
     data += str(uuid.uuid4()).encode() + _metadata({}) + struct.pack("<I", len(fields))
     for name, values in fields.items():
-        data += _grid(name, as_float32(values), bounds, len(data))
+        data += _grid(name, prune(as_float32(values)), bounds, len(data))
     with replace_file(path) as temporary:
         temporary.write_bytes(data)
 
@@ -185,7 +185,7 @@ def read_vdb(path: Path, name: str) -> Field:
         values[own] = block[:x, :y, :z].transpose(2, 1, 0, 3)
     low = first - size / 2
     box = np.stack([low, low + size * cells])
-    return check_field(path, name, values[..., 0] if components == 1 else values, box)
+    return check_field(path, name, values, box)
 
 
 class _Stream(io.BytesIO):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from image_files import COLORS, write_png, write_tiff
 from image_files import write_exr as save_exr
-from image_files import write_tiff
 from PIL import Image as Pillow
 
 from ddrecon.errors import FormatError
@@ -34,7 +34,6 @@ WRITERS = {".exr": write_exr, ".tif": write_tiff, ".npy": np.save}
 
 @pytest.mark.parametrize("name", ["a.npy", "a.tif", "Y", "gray"])
 def test_gray_becomes_three_equal_channels(tmp_path: Path, name: str):
-    """In EXR whatever a single channel is called."""
     gray, path = pixels_of(1, 3, 4).astype(np.float16).astype(np.float32), tmp_path / name
     if path.suffix:
         WRITERS[path.suffix](path, gray)
@@ -54,12 +53,6 @@ def test_float_alpha_empties_pixels_and_leaves_premultiplied_ones(tmp_path: Path
     assert image.pixels[0, 0].tolist() == [0, 0, 0] and image.pixels[0, 1].tolist() == [1, 1, 1]
 
 
-def test_exr_of_other_channels_lists_them(tmp_path: Path):
-    planes = np.ones((2, 2, 2), np.float32)
-    with pytest.raises(FormatError, match="depth, normal"):
-        read_image(save_exr(tmp_path / "a.exr", ["depth", "normal"], planes))
-
-
 @pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
 def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, what: str):
     pixels = np.zeros((4, 5, 3), np.float32)
@@ -67,6 +60,13 @@ def test_flawed_pixels_are_located_and_counted(tmp_path: Path, value: float, wha
     np.save(tmp_path / "a.npy", pixels)
     told = rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
     with pytest.raises(FormatError, match=told):
+        read_image(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int64, bool])
+def test_whole_numbers_are_no_radiance(tmp_path: Path, dtype: type):
+    np.save(tmp_path / "a.npy", np.ones((2, 2, 3), dtype))
+    with pytest.raises(FormatError, match=f"whole numbers .*{np.dtype(dtype)}.*; save it as float"):
         read_image(tmp_path / "a.npy")
 
 
@@ -129,12 +129,44 @@ def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
     assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
 
 
-def test_gray_with_alpha_palette_and_single_bits_are_read(tmp_path: Path):
-    for mode, color in (("LA", (255, 51)), ("P", 0), ("1", 1), ("L", 255)):
-        Pillow.new(mode, (3, 2), color).save(tmp_path / f"{mode}.png")
-        assert read_image(tmp_path / f"{mode}.png").pixels.shape == (2, 3, 3)
-    assert np.allclose(read_image(tmp_path / "LA.png").pixels, 0.2)
-    assert np.allclose(read_image(tmp_path / "1.png").pixels, 1)
+DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8)}
+
+
+@pytest.mark.parametrize("is_clear", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "depth"), [(kind, depth) for kind in DEPTHS for depth in DEPTHS[kind]]
+)
+def test_transparent_colors_of_png_are_alpha(tmp_path: Path, kind: int, depth: int, is_clear: bool):
+    """Gray and RGB have one that is, palettes an alpha of each, in full to a last one."""
+    if (kind, depth) == (2, 16):
+        pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
+    rng, most = np.random.default_rng(depth), 2**depth - 1
+    samples = rng.integers(0, most + 1, (5, 7, COLORS[kind]))
+    clear, chunks = samples[2, 3], dict[str, bytes]()
+    colors, alpha = samples / most, np.ones((5, 7))
+    if kind == 3:
+        palette, alphas = rng.integers(0, 256, (most + 1, 3)), rng.integers(0, 256, most + 1)
+        alphas[-1] = 255
+        chunks = {"PLTE": palette.astype(np.uint8).tobytes()}
+        chunks |= {"tRNS": alphas[:-1].astype(np.uint8).tobytes()} if is_clear else {}
+        colors = palette[samples[..., 0]] / 255
+        alpha = alphas[samples[..., 0]] / 255
+    elif is_clear:
+        chunks = {"tRNS": clear.astype(">u2").tobytes()}
+        alpha = (samples != clear).any(axis=2).astype(float)
+    image = read_image(write_png(tmp_path / "a.png", samples, depth, kind, **chunks))
+    assert (image.coverage is not None) == is_clear
+    if is_clear:
+        assert np.allclose(image.coverage, alpha, atol=1e-6)
+        colors = srgb.decode(colors) * alpha[..., None]
+    else:
+        colors = srgb.decode(colors)
+    assert np.allclose(image.pixels, np.broadcast_to(colors, (5, 7, 3)), atol=1e-6)
+
+
+def test_gray_with_alpha_is_read(tmp_path: Path):
+    Pillow.new("LA", (3, 2), (255, 51)).save(tmp_path / "a.png")
+    assert np.allclose(read_image(tmp_path / "a.png").pixels, 0.2)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -160,11 +192,58 @@ def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
         read_image(tmp_path / "a.jpg")
 
 
-def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
-    stored = [[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]
+def save_mask(path: Path, inside: np.ndarray, mode: str) -> np.ndarray:
+    """Saves `inside` [h, w] as a mask of Pillow's `mode`, or the dtype of an array."""
+    if path.suffix == ".npy":
+        np.save(path, inside.astype(mode) * (255 if mode == "uint8" else 1))
+    elif mode == "alpha":  # white all over, but empty outside
+        Pillow.fromarray(np.stack([np.full_like(inside, 255), 255 * inside], -1)).save(path)
+    else:
+        level = 1 if mode == "bits" else 255
+        picture = Pillow.fromarray(level * inside)
+        picture.convert({"bits": "L"}.get(mode, mode)).save(path, quality=75)
+
+
+MASKS = [
+    *((".png", mode) for mode in ("L", "1", "P", "RGB", "RGBA", "alpha", "bits")),
+    *((".jpg", mode) for mode in ("L", "RGB")),
+    *((".webp", mode) for mode in ("RGB", "RGBA")),
+    *((".npy", dtype) for dtype in ("bool", "uint8", "int64", "f4")),
+]
+
+
+@pytest.mark.parametrize(("suffix", "mode"), MASKS)
+def test_a_mask_is_the_same_in_every_format(tmp_path: Path, suffix: str, mode: str):
+    """Also where compression leaves traces in black."""
+    inside = np.zeros((64, 64), np.uint8)
+    inside[21:43, 19:45] = 1
+    save_mask(tmp_path / f"m{suffix}", inside, mode)
+    mask = read_mask(tmp_path / f"m{suffix}").pixels
+    assert mask.dtype == np.float32 and np.array_equal(mask[..., 0], inside)
+
+
+def test_a_mask_counts_from_half_on_as_stored(tmp_path: Path):
+    """Whatever curve it names."""
+    stored = [[127, 0, 0, 255], [128, 0, 0, 200], [255, 255, 255, 127], [255, 255, 255, 128]]
     iio.imwrite(tmp_path / "m.png", np.array([stored], np.uint8))
-    mask = read_mask(tmp_path / "m.png").pixels[..., 0]
-    assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
+    assert read_mask(tmp_path / "m.png").pixels[0, :, 0].tolist() == [0, 1, 0, 1]
+    write_png(tmp_path / "n.png", np.array([[[127], [128]]]), 8, 0, gAMA=bytes([0, 0, 200, 0]))
+    assert read_mask(tmp_path / "n.png").pixels[0, :, 0].tolist() == [0, 1]
+    np.save(tmp_path / "m.npy", np.array([[0.49, 0.51, 7, -1]]))
+    assert read_mask(tmp_path / "m.npy").pixels[0, :, 0].tolist() == [0, 1, 1, 0]
+
+
+@pytest.mark.parametrize("level", [2, 127])
+def test_a_mask_of_labels_is_refused_but_a_black_one_is_none(tmp_path: Path, level: int):
+    stored = np.zeros((2, 3), np.uint8)
+    iio.imwrite(tmp_path / "m.png", stored)
+    assert not read_mask(tmp_path / "m.png").pixels.any()
+    stored[0] = level
+    iio.imwrite(tmp_path / "m.png", stored)
+    Pillow.new("L", (16, 16), 1).save(tmp_path / "m.jpg")  # no bits, but what is left of black
+    for name in ("m.png", "m.jpg"):
+        with pytest.raises(FormatError, match="nowhere more than half white"):
+            read_mask(tmp_path / name)
 
 
 def test_a_movie_keeps_its_frames_in_order_and_what_is_white(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """TIFF stacks: what Fiji and napari are told, what theirs become, and stacks told from images."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,6 +67,59 @@ def test_stacks_of_other_programs(
     assert describe(tmp_path / "f.tif")["resolution"] == [4, 5, 3]
 
 
+OME = {f"PhysicalSize{axis}": size for axis, size in zip("XYZ", (0.5, 0.25, 2.0), strict=True)}
+
+
+@pytest.mark.parametrize(("axes", "colors"), [("ZYX", 1), ("ZYXS", 3), ("TCZYX", 1)])
+def test_stacks_of_ome_have_the_box_of_their_voxels(tmp_path: Path, axes: str, colors: int) -> None:
+    values = VALUES if colors == 3 else VALUES[..., 0]
+    form = {"photometric": "rgb" if colors == 3 else "minisblack", "ome": True}
+    values = values[None, None] if axes.startswith("T") else values
+    tifffile.imwrite(tmp_path / "f.tif", values, **form, metadata={"axes": axes, **OME})
+    field = read_field(tmp_path / "f.tif", "density")
+    assert np.array_equal(field.values, VALUES if colors == 3 else VALUES[..., 0])
+    assert field.bounds is not None and field.bounds.tolist() == [[0, 0, 0], [2, 1.25, 6]]
+
+
+@pytest.mark.parametrize(
+    ("axes", "options", "told"),
+    [
+        ("CZYX", {"ome": True}, "has 1 images of 2 channels and 1 frames; save a stack of one"),
+        ("ZCYX", {"ome": True}, "has 1 images of 2 channels and 1 frames; save a stack of one"),
+        ("TZYX", {"ome": True}, "has 1 images of 1 channels and 2 frames; save a stack of one"),
+        ("ZYX", {"description": "<OME><BinaryOnly/></OME>"}, "has 0 images of 1 channels"),
+        ("QZYX", {}, "has the shape [2, 3, 5, 4]; save a stack of one"),
+        ("ZCYX", {"imagej": True}, "has shape [3, 5, 4, 2]"),
+        ("TZYX", {"imagej": True}, "has 2 frames; save a stack of one"),
+    ],
+)
+def test_channels_and_times_are_no_slices(
+    tmp_path: Path, axes: str, options: dict[str, Any], told: str
+) -> None:
+    values = np.ones([{"Z": 3, "Y": 5, "X": 4}.get(axis, 2) for axis in axes], np.float32)
+    metadata = None if "description" in options else {"axes": axes} if options else {}
+    tifffile.imwrite(
+        tmp_path / "f.tif", values, photometric="minisblack", metadata=metadata, **options
+    )
+    assert told in refusal(tmp_path / "f.tif")
+
+
+@pytest.mark.parametrize("form", ["ome", "imagej"])
+def test_sizes_of_voxels_are_in_one_unit(tmp_path: Path, form: str) -> None:
+    unit = {
+        "ome": {**OME, "PhysicalSizeZUnit": "nm"},
+        "imagej": {"spacing": 2.0, "unit": "um", "zunit": "nm"},
+    }
+    tifffile.imwrite(
+        tmp_path / "f.tif",
+        VALUES[..., 0],
+        photometric="minisblack",
+        metadata={"axes": "ZYX", **unit[form]},
+        **{form: True},
+    )
+    assert "has sizes of voxels in nm and" in refusal(tmp_path / "f.tif")
+
+
 def test_a_stack_is_told_from_an_image(tmp_path: Path) -> None:
     write_field(tmp_path / "one.tif", "density", VALUES[:1, ..., 0], BOUNDS)
     assert describe(tmp_path / "one.tif")["resolution"] == [4, 5, 1]
@@ -78,9 +132,5 @@ def test_a_stack_is_told_from_an_image(tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "f.tif"
-    tifffile.imwrite(
-        path, np.ones((2, 3, 4, 5), np.float32), imagej=True, metadata={"axes": "TZYX"}
-    )
-    assert "has 2 frames; save a stack of one" in refusal(path)
     tifffile.imwrite(path, np.ones((2, 3, 4), np.complex64), photometric="minisblack")
     assert "is damaged" in refusal(path)

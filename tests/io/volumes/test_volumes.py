@@ -23,6 +23,18 @@ def test_every_real_type_is_read_as_float32(tmp_path: Path, dtype: type) -> None
     assert field.values.dtype == np.float32 and field.values.min() == 1 and field.bounds is None
 
 
+@pytest.mark.parametrize("before", [(), (1,), (1, 1)])
+@pytest.mark.parametrize("behind", [(), (1,), (1, 1), (3,), (3, 1)])
+def test_axes_of_one_entry_beside_those_of_cells_go(
+    tmp_path: Path, before: tuple[int, ...], behind: tuple[int, ...]
+) -> None:
+    """As of ScalarFlow's [z, y, x, 1], or of a batch of one."""
+    values = np.random.default_rng(0).random((2, 3, 4, *behind), np.float32)
+    np.savez(tmp_path / "f.npz", data=values.reshape(*before, *values.shape))
+    found = read_field(tmp_path / "f.npz", "data").values
+    assert np.array_equal(found, values.reshape((2, 3, 4, 3) if 3 in behind else (2, 3, 4)))
+
+
 def flawed(value: float) -> np.ndarray:
     values = np.zeros((2, 3, 4))
     values[1, 2, 3] = value
@@ -30,7 +42,7 @@ def flawed(value: float) -> np.ndarray:
 
 
 PLACE = "at cell (x, y, z) = (3, 2, 1) (1 such values)"
-SHAPES = (), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2)
+SHAPES = (), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 2), (0, 2, 2)
 BOXES = BOUNDS[::-1], BOUNDS[:1], np.full((2, 3), np.nan), BOUNDS.T
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"lwc": CUBE, "reff": CUBE, "bounds": BOUNDS}, "has no field 'density'; it has 'lwc', 'reff'"),
