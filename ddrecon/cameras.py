@@ -184,19 +184,26 @@ def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:
     the middle.
     """
     right, up, backward, origin = camera.pose.unbind(1)
-    places = [image_places(camera, offset) for offset in offsets or [(0.5, 0.5)]]
-    x, y = torch.cat(places).unbind(1)
+    places = torch.cat([image_places(camera, offset) for offset in offsets or [(0.5, 0.5)]])
     if not camera.is_perspective:
+        x, y = places.unbind(1)
         plane = x[:, None] * right - y[:, None] * up
         return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)
+    direction = array_order(_look_through(camera, places))
+    eye = array_order(origin)
+    return Rays(eye.expand_as(direction), direction, eye)
+
+
+def _look_through(camera: Camera, places: Tensor) -> Tensor:
+    """Unit directions (x, y, z) from a perspective camera through `places` [R, 2]."""
+    right, up, backward, _ = camera.pose.unbind(1)
+    x, y = places.unbind(1)
     if camera.lens is None or camera.distortion is None:
         way = x[:, None] * right - y[:, None] * up - backward
     else:
         seen = ray_through(camera.lens, camera.distortion, torch.stack([x, y], 1))
         way = seen @ torch.stack([right, -up, -backward])
-    direction = array_order(torch.nn.functional.normalize(way, dim=-1))
-    eye = array_order(origin)
-    return Rays(eye.expand_as(direction), direction, eye)
+    return torch.nn.functional.normalize(way, dim=-1)
 
 
 def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Tensor:
@@ -205,6 +212,18 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
     To the right and down; of an orthographic camera in its image plane, in world units. `offset` is
     as for `cast_rays`.
     """
+    y, x = torch.meshgrid(*_lines_of_pixels(camera, offset), indexing="ij")
+    return torch.stack([x, y], -1).view(-1, 2)
+
+
+def edge_places(camera: Camera) -> Tensor:
+    """Those of `image_places` that lie along the edges of the image."""
+    y, x = _lines_of_pixels(camera, (0.5, 0.5))
+    return torch.cat([torch.cartesian_prod(x, y[[0, -1]]), torch.cartesian_prod(x[[0, -1]], y)])
+
+
+def _lines_of_pixels(camera: Camera, offset: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """How far down rows and to the right columns of pixels lie, as `image_places` has them."""
     height, width = camera.size
     like, middle = camera.pose, camera.principal_point
     row, column = (
@@ -212,12 +231,8 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
         for count, part in zip((height, width), offset, strict=True)
     )
     step = camera.half_width * 2 / width
-    y, x = torch.meshgrid(
-        (row - middle[1] * height) * (step * camera.pixel_aspect),
-        (column - middle[0] * width) * step,
-        indexing="ij",
-    )
-    return torch.stack([x, y], -1).view(-1, 2)
+    rows = (row - middle[1] * height) * (step * camera.pixel_aspect)
+    return rows, (column - middle[0] * width) * step
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,7 +251,8 @@ def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
         places = ray[:, :2] / ray[:, 2:]
         if camera.lens is not None and camera.distortion is not None:
             places = distort(camera.lens, camera.distortion.detach(), ray)
-        cosine = -(cast_rays(camera).direction.flip(1) @ backward)
+        # The farthest from the axis are at the image's edges.
+        cosine = -(_look_through(camera, edge_places(camera)).detach() @ backward)
         is_seen = ray[:, 2] / away.norm(dim=1) >= cosine.min() - 1e-6
     step = 2 * float(camera.half_width) / width
     x, y = places.unbind(1)

@@ -177,9 +177,18 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
     side = min(grid.extent)
     square = torch.full_like(field, ROUNDING**2)
     for axis, spacing in zip((-3, -2, -1), grid.spacing, strict=True):
-        slope = (field.diff(dim=axis) * (side / spacing)) ** 2
-        square = square + torch.cat([slope, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
+        square = square + (rise_to_next(field, axis, grid) * (side / spacing)) ** 2
     return (square.sqrt() - ROUNDING).mean()
+
+
+def rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
+    """By how much `field` [..., z, y, x] is more in the next cell along `axis`, -3 to -1.
+
+    After the last cell of a period comes its first; in a box the last has no next, and 0.
+    """
+    if axis % 3 in grid.periodic:
+        return field.roll(-1, axis) - field
+    return torch.cat([field.diff(dim=axis), torch.zeros_like(field.narrow(axis, 0, 1))], axis)
 
 
 def compress(field: Tensor, knee: float) -> Tensor:

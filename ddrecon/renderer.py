@@ -390,20 +390,14 @@ def view_image(
     """
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
-    nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    parts = [
-        (replace(light_field, diffuse=nothing, turned=(), outside=None), scene, camera, behind),
-        (
-            replace(_without_glow(light_field), beams=(), skies=(), ground=None),
-            _without_background(scene),
-            camera,
-            None,
-        ),
-    ]
-    varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
-        rest = _image(*fixed).detach()
-    return _image(*varied) + rest
+        image = _image(light_field, scene, camera, behind).detach()
+    if derivatives == "single":
+        half = _image(_without_diffuse(light_field), scene, camera, behind)
+    else:
+        diffusing = replace(_without_glow(light_field), beams=(), skies=(), ground=None)
+        half = _image(diffusing, _without_background(scene), camera, None)
+    return image + (half - half.detach())
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -412,6 +406,15 @@ def _without_background(scene: Scene) -> Scene:
 
 def _without_glow(light_field: LightField) -> LightField:
     return replace(light_field, medium=replace(light_field.medium, emission=None))
+
+
+def _without_diffuse(light_field: LightField) -> LightField:
+    """What comes in through faces is then what the medium would emit there."""
+    nothing, outside = torch.zeros_like(light_field.diffuse.mean), light_field.outside
+    dark, received = Moments(nothing), Received(Moments(nothing), nothing)
+    outside = None if outside is None else torch.zeros_like(outside)
+    given = replace(light_field, diffuse=dark, received=received, turned=(), outside=outside)
+    return replace(given, reflected=None)
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:

@@ -52,7 +52,8 @@ class Scene(Displayed):
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from; `ground` lies under the volume, where there is any. `reason`:
-    which settings of `diffusion` its file leaves out, and what of the medium decides them.
+    which settings of `diffusion` its file leaves out, and what of the medium decides them. `up`:
+    which of x, y, z (0, 1, 2) points up; None where cameras tell.
     """
 
     volume: Volume
@@ -65,6 +66,7 @@ class Scene(Displayed):
     path: Path | None = None
     ground: Ground | None = None
     reason: str = ""
+    up: int | None = None
 
     def view(self, name: str) -> View:
         """The view called `name`; raises UsageError with the known names."""

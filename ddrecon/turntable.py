@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -13,9 +12,15 @@ from ddrecon.grid import Triple
 from ddrecon.scene import Scene, View
 
 
-def upright_axis(cameras: Sequence[Camera]) -> int:
-    """Which of x, y, z (0, 1, 2) points up: the one nearest to the sum of `cameras`' up vectors."""
-    return int(torch.stack([camera.pose[:, 1] for camera in cameras]).sum(0).abs().argmax())
+def upright_axis(scene: Scene) -> int:
+    """Which of x, y, z (0, 1, 2) points up in `scene`.
+
+    Where it does not say, it is the one nearest to the sum of its cameras' up vectors.
+    """
+    if scene.up is not None:
+        return scene.up
+    upward = torch.stack([view.camera.pose[:, 1] for view in scene.views])
+    return int(upward.sum(0).abs().argmax())
 
 
 def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
@@ -31,7 +36,7 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
 
     They are called `ring_000`, which is that of `view`, `ring_001` and so on.
     """
-    axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
+    axis, center = upright_axis(scene), scene.volume.grid.center_xyz
     turned = (
         turn_camera(view.camera, axis, 2 * math.pi * index / count, center)
         for index in range(count)

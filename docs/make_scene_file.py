@@ -63,7 +63,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Cells along x, y and z; those of the field's file where left out. `auto`: two "
                 "pixels wide."
             ),
-            "up": "The axis along which heights count, those of a `ground` and of `heights`.",
+            "up": (
+                "The axis along which heights count, those of a `ground`, of `heights` and of "
+                "rings, and that `export --up` turns."
+            ),
             "index": (
                 "Refractive index inside the box, whose flat faces refract and reflect light; "
                 "outside it is 1. Not with a ground, point lights or cameras inside."
@@ -311,8 +314,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
             "colmap": "Folder of COLMAP's sparse model, such as `sparse/0`; text or binary.",
             "images": (
-                "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, "
-                "belong to the cameras in turn. For COLMAP: the folder of its pictures."
+                "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted by the "
+                "numbers in their names, belong to the cameras in turn. For COLMAP: the folder of "
+                "its pictures."
             ),
             "test_every": (
                 "One view in this many, the first of them, is a test view, where transforms do "
@@ -323,14 +327,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "views: {ring: ...}",
         schema.RingSection,
-        "Cameras around `target`, the first towards +z of it, the next towards +x.",
+        "Cameras around `target`: where y is up, the first towards +z of it, the next towards +x.\n"
+        "Where z is up they are +x and +y.",
         {
             "count": "How many.",
             "radius": "Of the circle [u].",
             "fov": "Horizontal field of view, in degrees.",
-            "height": "Of the circle above the target [u].",
+            "height": "Of the circle above the target, along `up` [u].",
             "target": "What they look at [u].",
-            "up": "The direction that is up in their images.",
+            "up": "What the circle lies around, and up in their images; `volume.up` unless given.",
             "resolution": "Width and height in pixels; left out where there are images.",
         },
     ),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 from collections.abc import Iterator
 from typing import Any
 from unittest.mock import patch
@@ -140,10 +139,10 @@ def near_kernels() -> Iterator[None]:
     import warp as wp
 
     from ddrecon.diffusion.rounds import sweep
+    from ddrecon.diffusion.solvers import multigrid
     from ddrecon.kernels import launch
 
     own_array, own_device = wp.from_torch, launch._device
-    multigrid = importlib.import_module("ddrecon.diffusion.solvers.multigrid")
 
     def array(tensor: Tensor, **options: Any) -> Any:
         return own_array(tensor.near if isinstance(tensor, Far) else tensor, **options)

@@ -10,7 +10,7 @@ from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import use_engine
+from ddrecon.engine import ENGINES, use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
@@ -140,11 +140,22 @@ def test_torch_func_finds_the_same_tangents(name: str) -> None:
     torch.testing.assert_close(by_func[1], known, rtol=1e-12, atol=0)
 
 
-def test_a_reverse_pass_works_beside_forward_mode() -> None:
-    """Of tensors that have no tangent, while others may have one."""
-    scene = scene_of("gray")
+@pytest.mark.parametrize("engine", ENGINES)
+def test_gradients_do_not_depend_on_where_forward_mode_begins_and_ends(engine: str) -> None:
+    """Value, tangent and gradient may come of one pass."""
+    scene, change = scene_of("backward, degree 3"), random_values(*SHAPE, seed=5)
     leaf = scene.volume.density.clone().requires_grad_()
-    known = torch.autograd.grad(image(scene, {"density": leaf}, "warp").sum(), leaf)[0]
+
+    def gradient(seen: Tensor) -> Tensor:
+        return torch.autograd.grad(seen.sum(), leaf)[0]
+
+    before = image(scene, {"density": leaf}, engine)
+    known = gradient(image(scene, {"density": leaf}, engine))
     with forward.dual_level():
-        found = torch.autograd.grad(image(scene, {"density": leaf}, "warp").sum(), leaf)[0]
-    assert torch.equal(found, known)
+        beside = image(scene, {"density": leaf}, engine)
+        dual = image(scene, {"density": forward.make_dual(leaf, change)}, engine)
+        seen, along = forward.unpack_dual(dual)
+        found = [gradient(before), gradient(beside)]
+    for one in (*found, gradient(seen)):
+        torch.testing.assert_close(one, known, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(along.sum(), (known * change).sum(), rtol=1e-10, atol=0)

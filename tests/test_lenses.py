@@ -7,7 +7,7 @@ import pytest
 import torch
 from media import make_camera, make_scene
 
-from ddrecon.cameras import Camera, cast_rays, image_places
+from ddrecon.cameras import Camera, cast_rays, image_places, project
 from ddrecon.lenses import distort, ray_through
 from ddrecon.renderer import render
 from ddrecon.settings import RenderSettings
@@ -94,6 +94,18 @@ def test_rays_of_pixels(model: str) -> None:
     torch.testing.assert_close(found, image_places(camera), rtol=0, atol=1e-14)
     coarse = cast_rays(camera.resize(2), (0.0, 0.0)).direction[19]
     torch.testing.assert_close(coarse, cast_rays(camera, (0.0, 0.0)).direction[36 * 2 + 2])
+
+
+@pytest.mark.parametrize("model", [None, *LENSES])
+def test_a_point_is_found_in_the_largest_picture(model: str | None) -> None:
+    """Of 2^28 pixels, whose rays alone would take gigabytes."""
+    whole = lens_camera(model, size=(1, 1), principal_point=(0.45, 0.53))
+    side = 2.0**14
+    places = torch.tensor([[0.5, 0.5], [side - 0.5, 0.5], [9e3, 4e3]], dtype=torch.float64)
+    rays = cast_rays(whole, *((row, column) for column, row in (places / side).tolist()))
+    points = (rays.origin + 2 * rays.direction).flip(1)
+    seen, _ = project(replace(whole, size=(2**14, 2**14)), points)
+    torch.testing.assert_close(seen, places, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("model", LENSES)

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from media import half_empty, make_scene, render_tangent
+from media import half_empty, make_scene, render_tangent, tensor
 from torch import Tensor
 
 from ddrecon import load_scene
 from ddrecon.balance import find_balance
-from ddrecon.cameras import Camera, look_at
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
 from ddrecon.renderer import fluence, render
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")
@@ -49,7 +50,7 @@ def repeated(
     pose = look_at(middle + torch.tensor([0.3, 1.8, 0.5]), middle, up)
     camera = Camera(pose, (6, 7), 0.5 if is_perspective else 0.7, is_perspective)
     has_ground, is_map = kind.pop("has_ground", False), kind.pop("is_map", False)
-    kind |= {"sigma_a": (0.5,), "sigma_s": (8.0,)}
+    kind = {"sigma_a": (0.5,), "sigma_s": (8.0,)} | kind
     scene = make_scene(density.roll(shift, (0, 2)), grid=grid, camera=camera, **kind)
     if has_ground:
         scene.ground = Ground(density.new_tensor([0.5]), Plane(-0.1, 1))
@@ -79,6 +80,20 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
     known = fluence(one)
     twofold = torch.cat([known, known], 1).roll(shift, (1, 3))
     assert_near(fluence(two), twofold, close)
+
+
+@pytest.mark.parametrize("cells", [4, 8])
+def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_begins(
+    cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Moved by half a period, which is whole cells of both grids."""
+    monkeypatch.setattr("ddrecon.renderer.MOST_CELLS", cells)
+    shape, shift = (6, 5, 12), (3, 6)
+    one, moved = (repeated(half_empty(*shape), by, **KINDS["ground"]) for by in ((0, 0), shift))
+    for scene in (one, moved):  # so flat that no light crosses cells sideways fastest
+        scene.volume.grid = replace(scene.volume.grid, upper=(CELL * 6, 0.06, CELL * 12))
+    assert_near(render(moved), render(one), 1e-12)
+    assert_near(fluence(moved), fluence(one).roll(shift, (1, 3)), 1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -142,6 +157,21 @@ def test_an_even_layer_has_one_dimension(shape: tuple[int, ...], travel: Any, gr
     step = 0.3 * 8.5 * CELL * math.hypot(*travel) / abs(travel[1])
     passed = torch.exp(-step * torch.arange(8, dtype=torch.float64)).flip(0)
     torch.testing.assert_close(beam, 3 * passed * (1 - math.exp(-step)) / step, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
+    """Wherever they enter a period: (1 - exp(-kappa L)) j / kappa."""
+    kind = {"sigma_s": (0.0,), "directional": None, "emission": torch.ones(1, dtype=torch.float64)}
+    scene = repeated(even(4, 5, 3), is_perspective=is_perspective, **kind)
+    up, middle = (tensor(*each) for each in ((0, 1, 0), (0.7, 0.5, 0.6)))
+    pose = look_at(middle + tensor(0.2, 0.9, 1.8), middle, up)
+    camera = Camera(pose, (16, 16), 0.3, is_perspective)
+    scene.views = [View("low", camera)]
+    direction = cast_rays(camera).direction.view(16, 16, 3)
+    depth = 0.3 * 0.5 * 5 * CELL / direction[..., 1].abs()
+    expected = (1 - torch.exp(-depth)) / (0.3 * 0.5)
+    torch.testing.assert_close(render(scene)[0], expected.expand(3, -1, -1), rtol=1e-10, atol=0)
 
 
 def test_a_period_is_the_middle_of_many():

@@ -55,6 +55,13 @@ def test_without_scattering_only_reduced_light_is_seen():
     assert not parts.single.any() and not parts.multiple.any() and bool((parts.reduced > 0).all())
 
 
+def test_what_scatters_nowhere_is_not_solved_for_cell_by_cell():
+    settings, memory = {"sigma_a": (2.0,), "transport_rounds": 1, **BOTH}, SolveMemory()
+    known = render(make_scene(half_empty(*SHAPE), sigma_s=(0.0,), **settings))
+    by_cell = make_scene(half_empty(*SHAPE), sigma_s=0 * half_empty(1, *SHAPE), **settings)
+    assert torch.equal(render(by_cell, memory=memory), known) and not memory.records
+
+
 def test_reduced_light_is_ambient_light_attenuated():
     """A directional light is not seen: no pixel looks straight into it."""
     density, lights = half_empty(*SHAPE), BOTH | {"directional": None}

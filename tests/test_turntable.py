@@ -9,6 +9,7 @@ from media import make_scene, random_values
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.renderer import render
+from ddrecon.scene import View
 from ddrecon.turntable import place_turntable, turn_camera, upright_axis
 
 CENTER = (0.1, -0.2, 0.3)
@@ -36,11 +37,15 @@ def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
 @pytest.mark.parametrize(
     ("up", "axis"), [((1.0, 0.1, 0), 0), ((0, 1.0, 0.2), 1), ((0.2, 0, -1.0), 2)]
 )
-def test_the_upright_axis_is_the_one_the_cameras_agree_on(
+def test_the_upright_axis_is_the_scenes_or_the_one_the_cameras_agree_on(
     up: tuple[float, float, float], axis: int
 ) -> None:
     origins = [(3.0, 0.4, 2.0), (-2.0, 0.3, 3.0), (-2.5, 3.0, -2.0)]
-    assert upright_axis([looking(origin, up) for origin in origins]) == axis
+    scene = make_scene(random_values(4, 5, 6))
+    scene.views = [View("view", looking(origin, up)) for origin in origins]
+    assert upright_axis(scene) == axis
+    for scene.up in range(3):
+        assert upright_axis(scene) == scene.up
 
 
 def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
@@ -48,7 +53,7 @@ def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
     views = place_turntable(scene, scene.views[0], 8)
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
     assert torch.allclose(views[0].camera.pose, scene.views[0].camera.pose, atol=1e-15)
-    center, axis = scene.volume.grid.center_xyz, upright_axis([view.camera for view in scene.views])
+    center, axis = scene.volume.grid.center_xyz, upright_axis(scene)
     again = turn_camera(views[7].camera, axis, math.pi / 4, center).pose
     assert torch.allclose(again, views[0].camera.pose, atol=1e-14)
 

@@ -41,13 +41,12 @@ ROUNDING = 1e-6
 @click.option(
     "--up",
     type=click.Choice(["y", "z"]),
-    default="y",
-    help="Which axis points up in FILE, a volume: y leaves the axes as they are; z is for programs "
-    "such as Blender and Unreal.",
+    help="Which axis points up in FILE, a volume, turned from the scene's volume.up; of VOLUMEs y "
+    "is up. z is for programs such as Blender and Unreal.",
 )
 @in_session
 def export(
-    session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool, up: str
+    session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool, up: str | None
 ) -> None:
     """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
     NeRF's transforms.json), or all fields of SCENE, or of VOLUMEs, in the format of FILE's suffix.
@@ -63,7 +62,7 @@ def export(
     for source in sources:
         sequence = f"optimize {source}/scene.yaml -o {source} --resume --export vdb"
         require_no_film(source, f"; `ddrecon {sequence}` writes the volumes of all")
-    from ddrecon.io.volumes.table import WRITTEN, raise_z, read_together, write_fields
+    from ddrecon.io.volumes.table import WRITTEN, read_together, turn_up, write_fields
 
     kind, known = output.suffix.lower(), (".xml", ".json", *WRITTEN)
     if kind not in known:
@@ -76,14 +75,15 @@ def export(
     is_of_scene = kind not in WRITTEN or any(map(_is_scene, sources))
     if is_of_scene and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
-    if kind not in WRITTEN and up == "z":
-        raise click.UsageError("--up z turns volumes only")
+    if kind not in WRITTEN and up:
+        raise click.UsageError(f"--up {up} turns volumes only")
     constants: Fields = {}
+    upright = "y"
     if not is_of_scene:
         fields, bounds = read_together(sources)
     else:
         scene_file = scene_file or session.read(sources[0])
-        scene = session.build(scene_file)
+        scene, upright = session.build(scene_file), scene_file.tree.volume.up
         if kind == ".xml":
             written = export_scene(scene, output, may_exist=overwrite)
         elif kind == ".json":
@@ -93,7 +93,7 @@ def export(
     if kind in WRITTEN:
         written = [output]
         require_free_files(written, may_exist=overwrite)
-        write_fields(output, *(raise_z(fields, bounds) if up == "z" else (fields, bounds)))
+        write_fields(output, *turn_up(fields, bounds, upright, up or upright))
     if constants:
         numbers = ", ".join(
             " ".join([name, *(f"{number:.6g}" for number in value.flatten().tolist())])

@@ -37,9 +37,11 @@ def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
     from ddrecon.cli.check import describe, lines, supports_of
-    from ddrecon.scene_file.frames import each_frame
+    from ddrecon.scene_file.frames import each_frame, require_frames
     from ddrecon.scene_file.load import find_expert_keys
 
+    if scene_file.tree.frames is not None:
+        require_frames(scene_file)
     expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
     first = next(scenes)

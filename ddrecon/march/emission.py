@@ -98,11 +98,11 @@ class Emission:
             if isinstance(beam, PointBeam) or beam.profile is None:
                 plain.append(beam)
                 continue
+            # Of all that is sent, this beam's light alone.
             lit = replace(self.scattering, field=self.scattering.field * beam.profile)
-            beams = (replace(beam, profile=None),)
-            one = replace(self, scattering=lit, beams=beams, extended=None)
-            dark = torch.zeros_like(self.diffuse[:1])
-            parts.append(replace(one, diffuse=dark, remaining=None, inflow=None))
+            beams, dark = (replace(beam, profile=None),), torch.zeros_like(self.diffuse[:1])
+            own = self.grid, self.extinction, lit, beams, dark, self.seen, self.peak
+            parts.append(Emission(*own, support=self.support, period=self.period))
         return [replace(self, beams=tuple(plain), extended=None), *parts] if parts else [self]
 
     @functools.cached_property

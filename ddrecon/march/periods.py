@@ -79,7 +79,8 @@ def march_periods(
         ends = torch.where(repeats > 0, (faces - own.origin) / direction, torch.inf)
         leave, axis = ends.min(1)
         end = torch.minimum(next_node(emission.grid, own, leave, sampler), far)
-        end = torch.where(leave < far, end, far)
+        # The node may be one that lies before the ray enters.
+        end = torch.where(leave < far, torch.maximum(end, near), far)
         is_there = end > near
         which, group = copy[is_there].unique(dim=0, return_inverse=True)
         if emission.from_eye is None or rays.eye is None:

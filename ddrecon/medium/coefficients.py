@@ -238,6 +238,9 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
     g = _mean_cosine(volume.phase)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
+    by_cell = sigma_s[0].numel() > 1 and not is_varied(sigma_s)
+    if by_cell and not is_any_nonzero(volume.sigma_s):
+        sigma_s = sigma_s[:, :1, :1, :1]  # nothing scatters, whatever the cell
     find = _find_coefficients
     if max(sigma_a[0].numel(), sigma_s[0].numel()) > 1:
         # Of what varies from cell to cell nothing is kept that is made on the way.
@@ -269,7 +272,7 @@ def _find_emission(volume: Volume, absorption: Coefficient) -> Tensor | None:
     given = volume.emission if volume.black_body is None else volume.black_body
     if given is None:
         return None
-    radiance = given if given.ndim == 4 else along_colors(given)
+    radiance = for_cells(given)
     if volume.black_body is not None:
         return absorption.value * (volume.index**2 * radiance)
     emission = radiance.expand(-1, *volume.grid.shape)
@@ -345,8 +348,13 @@ def _for_cells(numbers: Tensor) -> Tensor:
 
 def _broadcast(sigma: Tensor, g: Tensor) -> Tensor:
     """`sigma` as [C, z, y, x], with as many colors as `g` has."""
-    sigma = sigma if sigma.ndim == 4 else along_colors(sigma)
+    sigma = for_cells(sigma)
     return sigma if len(sigma) > 1 or g.shape[:1] != (3,) else sigma.expand(3, -1, -1, -1)
+
+
+def for_cells(values: Tensor) -> Tensor:
+    """`values` [C], or [C, z, y, x] as they are, as a tensor that broadcasts to cells."""
+    return values if values.ndim == 4 else along_colors(values)
 
 
 @remember

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from ddrecon.medium.coefficients import Volume, along_colors
+from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.medium.phase_blend import Blend
 
 NEARLY_NONE = 1e-6
@@ -19,14 +19,21 @@ def mix_media(media: Mapping[str, Volume]) -> Volume:
     """The volume of two `media` on the same grid, of density 1 (E8.10).
 
     It holds them as `media`. Its phase function is a blend of theirs, which are the same in all
-    cells and no mixtures. Raises ValueError for another number of media, or where grids differ.
+    cells and no mixtures. What glows, a support and an index are the mixture's own: `replace` it
+    with these. Raises ValueError for another number of media, where grids differ, and for media
+    that have any of these.
     """
     if len(media) != 2 or len({medium.grid for medium in media.values()}) != 1:
         raise ValueError("a mixture is of two media on the same grid")
+    for name, medium in media.items():
+        glows = medium.emission is not None or medium.black_body is not None
+        if glows or medium.support is not None or medium.index != 1:
+            what = "emission, black_body, support and index are for the mixture"
+            raise ValueError(f"media.{name}: {what}, not for a medium of it")
     first, second = media.values()
     grid = first.grid
-    absorbing = [_per_cell(medium.sigma_a, medium.density) for medium in (first, second)]
-    scattering = [_per_cell(medium.sigma_s, medium.density) for medium in (first, second)]
+    absorbing = [for_cells(medium.sigma_a) * medium.density for medium in (first, second)]
+    scattering = [for_cells(medium.sigma_s) * medium.density for medium in (first, second)]
     besides = NEARLY_NONE / math.hypot(*grid.extent)
     sigma_a, sigma_s = absorbing[0] + absorbing[1], scattering[0] + scattering[1]
     weight = (scattering[0] + besides) / (sigma_s + 2 * besides)
@@ -36,6 +43,8 @@ def mix_media(media: Mapping[str, Volume]) -> Volume:
     return Volume(grid, torch.ones_like(first.density), sigma_a, sigma_s, phase, media=media)
 
 
-def _per_cell(sigma: Tensor, density: Tensor) -> Tensor:
-    """A cross section [C] or [C, z, y, x] times `density`, [C, z, y, x]."""
-    return (sigma if sigma.ndim == 4 else along_colors(sigma)) * density
+def remix(volume: Volume, media: Mapping[str, Volume]) -> Volume:
+    """`volume` of other `media` on its grid; all else, as what glows, is its own."""
+    mixed = mix_media(media)
+    sigma_a, sigma_s = mixed.sigma_a, mixed.sigma_s
+    return replace(volume, sigma_a=sigma_a, sigma_s=sigma_s, phase=mixed.phase, media=media)

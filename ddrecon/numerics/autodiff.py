@@ -144,9 +144,9 @@ def recompute(function: Callable[..., T], *arguments: object) -> T:
 
     That computes it again, so `function` must not draw random numbers. It is what
     `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds of
-    every run.
+    every run. In forward mode, whose end may come before the backward pass, all is kept.
     """
-    if not torch.is_grad_enabled():
+    if not torch.is_grad_enabled() or is_forward():
         return function(*arguments)
     again = _Recomputation(lambda: function(*arguments))
     with saved_tensors_hooks(again.pack, again.unpack):
@@ -156,7 +156,8 @@ def recompute(function: Callable[..., T], *arguments: object) -> T:
 class _Recomputation:
     """Numbers in place of the tensors that `function` saves for its backward pass.
 
-    When the first is asked for, `function` runs again and saves the same tensors in the same order.
+    When the first is asked for, `function` runs again and saves the same tensors in the same order:
+    not in forward mode, as it did not before.
     """
 
     def __init__(self, function: Callable[[], Any]):
@@ -177,9 +178,13 @@ class _Recomputation:
 
     def _run(self) -> None:
         saved: list[Tensor] = []
-        with (
-            torch.enable_grad(),
-            saved_tensors_hooks(lambda tensor: saved.append(tensor.detach()), saved.__getitem__),
-        ):
-            self.function()
+        level, forward_ad._current_level = forward_ad._current_level, -1
+        try:
+            with (
+                torch.enable_grad(),
+                saved_tensors_hooks(lambda one: saved.append(one.detach()), saved.__getitem__),
+            ):
+                self.function()
+        finally:
+            forward_ad._current_level = level
         self.saved = dict(enumerate(saved))

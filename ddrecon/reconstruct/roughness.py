@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.losses import ROUNDING, compress, compressed_slope
+from ddrecon.losses import ROUNDING, compress, compressed_slope, rise_to_next
 
 AXES = (-3, -2, -1)
 
@@ -27,13 +27,12 @@ def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> 
     factors = [min(grid.extent) / spacing for spacing in grid.spacing]
     square, total = torch.full_like(field, ROUNDING**2), torch.zeros_like(field)
     for axis, factor in zip(AXES, factors, strict=True):
-        slope = seen.diff(dim=axis) * factor
-        square.narrow(axis, 0, slope.shape[axis]).add_(slope.square())
+        square.add_((rise_to_next(seen, axis, grid) * factor).square_())
     stiffness = 1 / (field.numel() * square.sqrt())
     # What holds neighbors together counts in both.
     for axis, factor in zip(AXES, factors, strict=True):
-        count = field.shape[axis] - 1
-        between = stiffness.narrow(axis, 0, count) * factor**2
-        total.narrow(axis, 0, count).add_(between)
-        total.narrow(axis, 1, count).add_(between)
+        between, count = stiffness * factor**2, field.shape[axis]
+        if count == 1 or axis % 3 not in grid.periodic:
+            between.narrow(axis, count - 1, 1).zero_()
+        total.add_(between).add_(between.roll(1, axis))
     return total if knee is None else total.mul_(compressed_slope(field, knee).square_())

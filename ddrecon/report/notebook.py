@@ -32,8 +32,8 @@ def html_of(shown: Scene | Volume) -> str:
     cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
     words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"
     up, (x, y, z) = 1, SIDEWAYS
-    if cameras:
-        pose, up = cameras[0].pose.detach(), upright_axis(cameras)
+    if isinstance(shown, Scene) and cameras:
+        pose, up = cameras[0].pose.detach(), upright_axis(shown)
         x, y, z = (pose[:, 3] - pose.new_tensor(volume.grid.center_xyz)).tolist()
     fields = {name: getattr(volume, name).detach() for name in FIELDS}
     fields = {name: value for name, value in fields.items() if value.ndim >= 3}

@@ -109,11 +109,11 @@ def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
         for of, values in (("result", named), ("truth", findings.given))
         for name, value in values.items()
     ]
-    cameras = [view.camera for view in scene.views]
-    towards = cameras[0].pose[:, 3] - cameras[0].pose.new_tensor(scene.volume.grid.center_xyz)
+    pose = scene.views[0].camera.pose
+    towards = pose[:, 3] - pose.new_tensor(scene.volume.grid.center_xyz)
     eye = towards.tolist()
     still = _stills(named)
-    viewer = volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
+    viewer = volume_viewer(fields, still, upright_axis(scene), (eye[0], eye[1], eye[2]))
     if "support" not in summary:
         return viewer
     left_out = 100 * (1 - summary["support"]["cells"])

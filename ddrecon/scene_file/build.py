@@ -139,6 +139,7 @@ def build_scene(
     render = tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume, diffusion.times))
+    has_up = ground is not None or tree.volume.up != "y"  # which stands where nothing is said
     scene = Scene(
         volume,
         lights,
@@ -149,6 +150,7 @@ def build_scene(
         path=scene_file.path,
         ground=ground,
         reason=reason,
+        up="xyz".index(tree.volume.up) if has_up else None,
     )
     try:
         require_supported(scene)

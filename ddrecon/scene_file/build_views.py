@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, cast_rays, image_places, look_at, project
+from ddrecon.cameras import Camera, cast_rays, edge_places, image_places, look_at, project
 from ddrecon.errors import FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
@@ -28,7 +28,7 @@ READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
 }
 """What reads the pictures of a view, by their keys."""
 CHECKED = 1000
-"""Pixels of an image at which its distortion is checked."""
+"""Within an image, distortion is checked at so many places; and at all of its edges."""
 COARSER = 8
 MOST_PIXELS = 2**18
 """Images are made about this small before they are looked at closely."""
@@ -144,8 +144,8 @@ def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
     """Raises SceneError where no light meets a pixel of `camera`: distortion folds over there."""
     if camera.lens is None or camera.distortion is None:
         return
-    places = image_places(camera)
-    places = places[:: max(1, len(places) // CHECKED)]
+    coarser = camera.resize(math.ceil(math.sqrt(camera.size[0] * camera.size[1] / CHECKED)))
+    places = torch.cat([image_places(coarser), edge_places(camera)])
     seen = ray_through(camera.lens, camera.distortion, places)
     error = (distort(camera.lens, camera.distortion, seen) - places).abs()
     if not bool((error <= 1e-4 * (1 + places.abs())).all()):

@@ -125,7 +125,7 @@ class _Medium:
             black_body = black_body_radiance(self.values("temperature")[0]).to(device, dtype)
         elif self.tree.glows and getattr(self.section, "emission", None) is not None:
             emission = self.values("emission").to(device, dtype)
-        elif self.tree.may_change(self.prefix + "emission"):
+        elif not self.prefix and self.tree.may_change("emission"):
             emission = sigma_a.new_zeros(3)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
         index = getattr(self.section, "index", 1.0)

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 import yaml
 
 from ddrecon.errors import FormatError, Problems, SceneError, suggestion
+from ddrecon.grid import Triple
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
@@ -98,8 +100,17 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
 
 def _scene_of(root: Node, path: Path) -> SceneFile:
-    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
+    finish = FINISH | {ViewSource: partial(views_of, up=_up_of(root))}
+    tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, finish))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
+
+
+def _up_of(root: Node) -> Triple:
+    """The unit vector along `volume.up`, of a scene that is not read yet."""
+    volume = root.entries().get("volume")
+    said = volume.value.get("up") if volume and isinstance(volume.value, dict) else None
+    up = said.value if said and said.value in ("x", "z") else "y"
+    return float(up == "x"), float(up == "y"), float(up == "z")
 
 
 def _text(path: Path) -> str:
@@ -213,7 +224,6 @@ def _violations(
 FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
     (Mapping, ParameterSettings): require_parameters,
     (tuple, ViewSection): name_listed,
-    ViewSource: views_of,
 }
 """What is made of all records of a list or mapping, or of one that stands for others."""
 

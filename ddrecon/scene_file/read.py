@@ -7,6 +7,7 @@ of them it is. Records are told apart by their `type`, others by their first key
 from __future__ import annotations
 
 import operator
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache, reduce
@@ -155,9 +156,18 @@ def _read_text(node: Node, kinds: Sequence[Any], rule: Rule) -> str | Path:
     if not text or not text.isprintable():
         raise node.refused(f"expected text that can be printed, found {describe_found(node)}")
     if Path in kinds:
-        return (rule.folder / text).absolute()
+        return path_in(rule.folder, text)
     _check_choice(node, choices or rule.limits.get("choices", ()), rule)
     return text
+
+
+def path_in(folder: Path, text: str) -> Path:
+    """The absolute path that `text` is in `folder`.
+
+    Backslashes are separators, as Windows writes them, unless a name that is there has them.
+    """
+    is_there = "\\" not in text or os.path.exists(folder / text)
+    return (folder / (text if is_there else text.replace("\\", "/"))).absolute()
 
 
 def _read_list(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:

@@ -431,9 +431,9 @@ def split_views(views: Sequence[ViewSection], test_every: int | None) -> list[Vi
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target`, the first towards +z of it and the next towards +x.
+    """Cameras around `target`, on a circle `height` above it about `up`, the volume's unless given.
 
-    The circle is horizontal, `height` above `target`.
+    Where y is up, the first is towards +z and the next towards +x; where z is, +x and +y.
     """
 
     count: int = bounded(minimum=1, maximum=10000)
@@ -441,8 +441,12 @@ class RingSection:
     fov: float = bounded(above=0, below=180)
     height: float = 0.0
     target: Triple = (0.0, 0.0, 0.0)
-    up: Triple = (0.0, 1.0, 0.0)
+    up: Triple | None = None
     resolution: Size | None = bounded(None, minimum=1, maximum=16384)
+
+    def violations(self) -> Iterator[Violation]:
+        if self.up is not None and not any(self.up):
+            yield "up", "must not be zero"
 
 
 @dataclass(frozen=True)
@@ -451,9 +455,9 @@ class ViewSource:
 
     Such files are written by NeRF, instant-ngp or nerfstudio; the model is a folder.
 
-    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn, or the
-    folder of COLMAP's pictures. Of every `test_every` views, where files say nothing of it, the
-    first is a test view.
+    `images` is a glob pattern whose matches, sorted by the numbers in their names, belong to the
+    ring's cameras in turn, or the folder of COLMAP's pictures. Of every `test_every` views, where
+    files say nothing of it, the first is a test view.
     """
 
     ALTERNATIVES: ClassVar = (("ring",), ("transforms",), ("colmap",))

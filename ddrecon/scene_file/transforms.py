@@ -48,6 +48,24 @@ OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PER
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 REMEDY = "undistort the pictures first (COLMAP: image_undistorter) and give the cameras they get"
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6")
+FOCAL = ("x_fov", "fl_x", "camera_angle_x", "y_fov", "fl_y", "camera_angle_y")
+"""What says the focal length. Of an axis, what comes first counts, as in instant-ngp."""
+UNKNOWN = (
+    *(f"ftheta_p{power}" for power in range(5)),
+    *("latlong", "equirectangular", "orthographic"),
+    *("sk_x", "sk_y", "skew", "b1", "b2", "s1", "s2", "s3", "s4"),
+)
+"""What says of a lens that it is not modeled, unless it is 0 or false."""
+UNNAMED = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
+"""Coefficients whose order is not known."""
+GROUPS = (
+    FOCAL,
+    (*COEFFICIENTS, "distortion_params", *UNKNOWN, *UNNAMED),
+    ("camera_model", "is_fisheye"),
+)
+"""What belongs together: of a group that a frame has any of, nothing of the file counts."""
+MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics")
+"""What is refused, as it is not read, of a frame that says no focal length besides."""
 NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """What lenses are called there."""
 Entries = Mapping[str, Node]
@@ -132,11 +150,11 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
     if not lists:
         return []
     named = [isinstance(frame.value, dict) and frame.value.get("file_path") for frame in frames]
-    paths = [Path(str(one.value)) if one else None for one in named]
+    paths = [Path(str(one.value).replace("\\", "/")) if one else None for one in named]
     listed = {name: set[Path]() for name in LISTS}
     for name, node in lists.items():
         for entry in node.children():
-            path = Path(read_as(entry, str, Path()))
+            path = Path(read_as(entry, str, Path()).replace("\\", "/"))
             if path not in paths:
                 raise entry.refused(f"no frame has the file_path {entry.value!r}")
             listed[name].add(path)
@@ -161,18 +179,31 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
         read_as(own[name], Path, folder) if name in own else None
         for name in ("file_path", "mask_path")
     )
-    camera = read_camera(frame, {**shared, **own}, folder)
+    if (matrices := own.keys() & set(MATRICES)) and not own.keys() & set(FOCAL):
+        raise own[min(matrices)].refused("is not read: write fl_x, fl_y, cx, cy, w and h instead")
+    camera = read_camera(frame, _override(shared, own), folder)
     if image is None and camera.resolution is None:
         raise frame.refused(
             "has neither file_path nor w and h, so that its number of pixels is unknown"
         )
-    if image is not None and image.suffix.lower() not in READERS:
-        image = image.with_name(f"{image.name}.png")
+    if image is not None and image.suffix.lower() not in READERS and not image.is_file():
+        # What looks like a suffix may be part of a name: images/frame_0.12.
+        with_suffix = Path(f"{image}.png")
+        if with_suffix.is_file() or not re.fullmatch(r"\.[A-Za-z]\w*", image.suffix):
+            image = with_suffix
     number = read_as(own["frame"], int, folder) if "frame" in own else 0
     # Of pictures, others call a time what lies between 0 and 1.
     is_film = image is not None and image.suffix.lower() in FILMS
     time = read_as(own["time"], float, folder) if is_film and "time" in own else 0.0
     return ViewSection(camera=camera, image=image, mask=mask, frame=number, time=time)
+
+
+def _override(shared: Entries, own: Entries) -> Entries:
+    """What holds for a frame: its `own` entries, and those `shared` ones that they leave alone."""
+    replaced = {name for group in GROUPS if own.keys() & set(group) for name in group}
+    if "camera_model" in own and "PINHOLE" in str(own["camera_model"].value).upper():
+        replaced |= set(GROUPS[1])
+    return {name: node for name, node in shared.items() if name not in replaced} | dict(own)
 
 
 def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
@@ -189,6 +220,7 @@ def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSecti
 
 NUMBERS: Mapping[str, Mapping[str, float]] = {
     **{f"camera_angle_{axis}": {"above": 0, "below": math.pi} for axis in "xy"},
+    **{f"{axis}_fov": {"above": 0, "below": 180} for axis in "xy"},
     **{f"fl_{axis}": {"above": 0} for axis in "xy"},
     **{side: {"minimum": 1, "maximum": 16384} for side in "wh"},
     **{f"c{axis}": {} for axis in "xy"},
@@ -206,21 +238,22 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
         for name, limits in NUMBERS.items()
         if name in entries
     }
-    if not {"fl_x", "camera_angle_x"} & set(given):
+    if not set(FOCAL) & set(given):
         raise frame.refused("has neither fl_x nor camera_angle_x")
-    tangents = [math.tan(given.get(f"camera_angle_{axis}", 0) / 2) for axis in "xy"]
     if not {"w", "h"} <= set(given):
         if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in given]:
             raise entries[needing[0]].refused(
                 "is in pixels, but w and h do not say how many there are"
             )
-        return {"fov": math.degrees(given["camera_angle_x"])}
+        if "x_fov" not in given and "camera_angle_x" not in given:
+            raise frame.refused("says how high its picture is, but not how wide: give w and h")
+        return {"fov": given.get("x_fov") or math.degrees(given["camera_angle_x"])}
     width, height = given["w"], given["h"]
     for name in ("w", "h"):
         if not given[name].is_integer():
             raise entries[name].refused(f"expected a whole number, found {given[name]:g}")
-    focal_x = given.get("fl_x") or width / 2 / tangents[0]
-    focal_y = given.get("fl_y") or (height / 2 / tangents[1] if tangents[1] else focal_x)
+    focal_x, focal_y = _focal(given, "x", width), _focal(given, "y", height)
+    focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
     return {
         "fov": 2 * math.degrees(math.atan(width / 2 / focal_x)),
         "resolution": (int(width), int(height)),
@@ -232,6 +265,15 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
     }
 
 
+def _focal(given: Mapping[str, float], axis: str, pixels: float) -> float:
+    """The focal length along `axis` of so many `pixels`; 0 where nothing says it."""
+    if f"{axis}_fov" in given:
+        return pixels / 2 / math.tan(math.radians(given[f"{axis}_fov"]) / 2)
+    if f"fl_{axis}" in given or f"camera_angle_{axis}" not in given:
+        return given.get(f"fl_{axis}", 0.0)
+    return pixels / 2 / math.tan(given[f"camera_angle_{axis}"] / 2)
+
+
 def _distortion(entries: Entries) -> LensSection | None:
     """The lens; None for a pinhole. Raises SceneError for a model that is not known."""
     model = ""
@@ -241,12 +283,28 @@ def _distortion(entries: Entries) -> LensSection | None:
             raise entries["camera_model"].refused(
                 f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
             )
-    is_fisheye = model in FISHEYE or ("is_fisheye" in entries and bool(entries["is_fisheye"].value))
+    for name in (*UNKNOWN, *UNNAMED):
+        if name in entries and any(
+            leaf.value for leaf in entries[name].walk() if not leaf.children()
+        ):
+            what = f"is of a lens that is not modeled; {REMEDY}"
+            raise entries[name].refused(
+                what if name in UNKNOWN else "is not read: write k1, k2, ..."
+            )
+    is_fisheye = model in FISHEYE or (
+        "is_fisheye" in entries and read_as(entries["is_fisheye"], bool | int, Path())
+    )
     section = FisheyeSection if is_fisheye else OpencvSection
     given = {name: entries[name] for name in COEFFICIENTS if name in entries}
     if "distortion_params" in entries:
-        # nerfstudio: k1, k2, k3, k4, p1, p2
-        given |= dict(zip(COEFFICIENTS, entries["distortion_params"].children(), strict=False))
+        # as in nerfstudio; OpenCV's own order is another
+        if len(listed := entries["distortion_params"].children()) not in (
+            6,
+            4 if is_fisheye else 6,
+        ):
+            what = f"expected k1, k2, k3, k4, p1, p2, found {len(listed)} numbers"
+            raise entries["distortion_params"].refused(what)
+        given |= dict(zip(COEFFICIENTS, listed, strict=False))
     lens = {name: read_as(node, float, Path()) for name, node in given.items()}
     for name in set(lens) - set(LENSES[section.type]):
         if (value := lens.pop(name)) != 0:

@@ -13,12 +13,14 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, Problems
+from ddrecon.grid import Triple
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
+from ddrecon.scene_file.read import path_in
 from ddrecon.scene_file.schema import (
     FRAME,
     PerspectiveSection,
@@ -40,12 +42,29 @@ MODELS: dict[str, tuple[str, ...]] = {
 """The camera models that are read, in the order of their numbers in binary files, with their
 parameters in order.
 """
+OTHERS = {
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
+"""The next models, whose cameras may be there but have no image, and how many parameters they have.
+"""
+Lens = tuple[str, tuple[int, int], Sequence[float]]
+"""A camera of a model: what it is called, its width and height, and its parameters."""
+DECIMAL = r"(?:(?<=_)-)?[0-9]+(?:\.[0-9]+)?"
+"""A number in a name, if it may have a sign and a fraction."""
 Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
-def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection, ...]:
-    """The views that `source` stands for, which `node` of a scene in `folder` says."""
+def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[ViewSection, ...]:
+    """The views that `source` stands for, which `node` of a scene in `folder` says.
+
+    `up` points up in the scene.
+    """
     entries = node.entries()
     every = source.test_every
     if "images" in entries:
@@ -54,18 +73,21 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
         files = source.transforms if isinstance(source.transforms, tuple) else (source.transforms,)
         return name_by_images(read_transforms(entries["transforms"], files, every))
     if source.colmap is not None:
-        pictures = (folder / (source.images or "")).absolute()
-        read = read_colmap(entries["colmap"], source.colmap, pictures)
+        read = read_colmap(entries["colmap"], source.colmap, path_in(folder, source.images or ""))
         return name_by_images(split_views(read, every))
     assert source.ring is not None
-    cameras = ring_cameras(source.ring)
+    cameras = ring_cameras(source.ring, up)
     images: list[Path] | list[None] = [None] * len(cameras)
     if source.images is not None:
         # Wildcards stand in the last two parts: those above may match without end.
-        is_endless = glob.has_magic(str(Path(source.images).parent.parent))
-        names = [] if is_endless else glob.glob(source.images, root_dir=folder)
-        paths = [(folder / name).absolute() for name in names]
-        images = sorted(path for path in paths if path.is_file())
+        patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
+        is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
+        names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
+        there = sorted(next(filter(None, names), []), key=in_order)
+        if there != sorted(there, key=lambda name: in_order(name, DECIMAL)):
+            what = "matches names with fractions or signs, whose order is not plain: count them"
+            raise entries["images"].refused(f"{source.images!r} {what} 0, 1, 2, ...")
+        images = [path for name in there if (path := (folder / name).absolute()).is_file()]
         if len(images) != len(cameras):
             what = f"{source.images!r} matches {len(images)} files, but the ring has"
             raise entries["images"].refused(f"{what} {len(cameras)} cameras")
@@ -74,6 +96,12 @@ def views_of(node: Node, source: ViewSource, folder: Path) -> tuple[ViewSection,
         for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]
     return tuple(split_views(views, every))
+
+
+def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]:
+    """A key that sorts names by each `number` in them, a regular expression: 2 before 10."""
+    words = re.split(f"({number})", name)
+    return [float(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
 def name_listed(
@@ -104,15 +132,25 @@ def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
 
-def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
-    """Camera i of n stands at target + (r sin(2 pi i/n), height, r cos(2 pi i/n))."""
-    (x, y, z), cameras = ring.target, []
+def ring_cameras(ring: RingSection, up: Triple) -> list[PerspectiveSection]:
+    """Camera i of n stands at target + height u + r (cos(2 pi i/n) a + sin(2 pi i/n) u x a).
+
+    u is the unit vector along the ring's own `up` or this one, and a the axis after the one
+    nearest to it, made perpendicular.
+    """
+    import numpy as np
+
+    upward = np.array(ring.up or up) / math.hypot(*(ring.up or up))
+    ahead = np.eye(3)[(np.abs(upward).argmax() + 1) % 3]
+    ahead = ahead - upward * (ahead @ upward)
+    ahead /= np.linalg.norm(ahead)
+    aside, cameras = np.cross(upward, ahead), []
     for index in range(ring.count):
         turn = 2 * math.pi * index / ring.count
-        right, forth = ring.radius * math.sin(turn), ring.radius * math.cos(turn)
-        origin = x + right, y + ring.height, z + forth
+        way = ring.radius * (math.cos(turn) * ahead + math.sin(turn) * aside)
+        x, y, z = (np.array(ring.target) + ring.height * upward + way).tolist()
         camera = PerspectiveSection(fov=ring.fov, resolution=ring.resolution)
-        cameras.append(replace(camera, origin=origin, target=ring.target, up=ring.up))
+        cameras.append(replace(camera, origin=(x, y, z), target=ring.target, up=ring.up or up))
     return cameras
 
 
@@ -131,21 +169,22 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
     with guard_reading(of_cameras):
         cameras = dict(READERS[suffix][0](of_cameras))
     with guard_reading(path):
-        posed = sorted(READERS[suffix][1](path))
+        posed = sorted(READERS[suffix][1](path), key=lambda image: in_order(image[0]))
     if not posed:
         raise FormatError(path, "has no images")
     views = []
     for name, number, pose in posed:
         if number not in cameras:
             raise FormatError(path, f"image {name!r}: there is no camera {number}")
-        picture = Path(name)
+        picture = PurePosixPath(name.replace("\\", "/"))
         if picture.is_absolute() or ".." in picture.parts:
             raise FormatError(path, f"image {name!r} leaves the folder of pictures; rename it")
-        frame = cameras[number] | {"transform_matrix": _matrix(path, name, pose)}
+        camera = _camera(of_cameras, number, *cameras[number])
+        frame = camera | {"transform_matrix": _matrix(path, name, pose)}
         with in_file(of_cameras):
             said = node_of(f"camera {number}", str(of_cameras), frame)
-            camera = read_camera(said, said.entries(), folder)
-        views.append(ViewSection(camera=camera, image=images / picture))
+            section = read_camera(said, said.entries(), folder)
+        views.append(ViewSection(camera=section, image=path_in(images, name)))
     return views
 
 
@@ -184,32 +223,33 @@ def _camera(
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """The lines of a text file that are no comments, with their numbers."""
-    with path.open(encoding="utf-8") as stream:
-        for number, line in enumerate(stream, 1):
+    with path.open(encoding="utf-8-sig") as stream:
+        for number, line in enumerate(map(str.strip, stream), 1):
             if not line.startswith("#"):
-                yield number, line.strip()
+                yield number, line
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for number, line in _lines(path):
         if not line:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            size, values = (int(width), int(height)), [float(word) for word in parameters]
+            lens = model, (int(width), int(height)), [float(word) for word in parameters]
             index = int(camera)
         except ValueError as error:
             raise FormatError(
                 path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
             ) from error
-        yield index, _camera(path, index, model, size, values)
+        yield index, lens
 
 
 def _text_images(path: Path) -> Iterator[Posed]:
-    """Every other line is an image; the others, which may be empty, are its points."""
-    lines = _lines(path)
-    for number, line in lines:
-        if not line:
+    """After the line of an image there may be one of its points, which may be empty."""
+    may_be_points = False
+    for number, line in _lines(path):
+        if not line or (may_be_points and _are_points(line)):
+            may_be_points = False
             continue
         try:
             _, *numbers = (words := line.split(maxsplit=9))[:8]
@@ -219,16 +259,28 @@ def _text_images(path: Path) -> Iterator[Posed]:
                 path, f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
         yield name, camera, pose
-        next(lines, None)
+        may_be_points = True
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _are_points(line: str) -> bool:
+    """Whether `line` begins with points of an image: X Y POINT3D_ID each."""
+    words = line.split(maxsplit=12)[:12]
+    try:
+        [float(word) for word in words], [int(word) for word in words[2::3]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
             number, model, width, height = _unpack(path, stream, "<iiQQ")
-            name = dict(enumerate(MODELS)).get(model, f"number {model}")
-            parameters = _unpack(path, stream, f"<{len(MODELS.get(name, ()))}d")
-            yield number, _camera(path, number, name, (width, height), parameters)
+            if not 0 <= model < len(lengths):
+                raise FormatError(path, f"camera {number}: lens model {model} is not known")
+            name = [*lengths][model]
+            yield number, (name, (width, height), _unpack(path, stream, f"<{lengths[name]}d"))
 
 
 def _binary_images(path: Path) -> Iterator[Posed]:

@@ -20,7 +20,7 @@ from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.mixture import remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import (
@@ -289,11 +289,12 @@ def _volume_value(volume: Volume, name: str) -> Tensor:
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if volume.media is not None:
-        return mix_media(
+        return remix(
+            volume,
             {
                 medium: _replace_volume(part, _within(f"media.{medium}.", values))
                 for medium, part in volume.media.items()
-            }
+            },
         )
     density, cells = values.get("density"), volume.grid.shape
     if isinstance(density, Tensor) and density.ndim == 0:

@@ -124,3 +124,27 @@ def test_z_points_up_where_y_did(succeed: Run, name: str, colors: tuple[int, ...
         was = values[z, y, x]
         now = [was[0], -was[2], was[1]] if name == "velocity" else was
         assert np.array_equal(turned.values[k, j, i], now)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "is_same"),
+    [("z", "z", True), ("y", "y", True), ("z", "y", False), ("x", "z", False)],
+)
+def test_a_scene_is_turned_from_its_own_way_up(
+    succeed: Run, before: str, after: str, is_same: bool
+) -> None:
+    """A column along its way up is one along the way up of the file, as high as before."""
+    column = np.zeros((5, 5, 5), np.float32)
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    upward = "zyx".index(before)
+    column[tuple(slice(2, 5) if axis == upward else 1 for axis in range(3))] = [1, 2, 3]
+    box[1, "xyz".index(before)] = 4
+    write_field(Path("column.npz"), "density", column, box)
+    said = f"volume={{density: {{file: column.npz}}, sigma_t: 1, albedo: 0.5, up: {before}}}"
+    succeed("export", "scene.yaml", "-o", "turned.npz", "-D", said, "--up", after)
+    turned = read_field(Path("turned.npz"), "density")
+    there = np.argwhere(turned.values > 0)
+    assert turned.bounds[:, "xyz".index(after)].tolist() == [-1, 4]
+    assert there[:, "zyx".index(after)].tolist() == [2, 3, 4]
+    assert turned.values[tuple(there.T)].tolist() == [1, 2, 3]
+    assert is_same == np.array_equal(turned.values, column)

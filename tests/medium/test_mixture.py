@@ -8,6 +8,7 @@ from media import box_grid, make_scene, random_values, tensor
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.levels import volume_at_level
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.reconstruct.levels import scene_at_level
@@ -85,6 +86,25 @@ def test_on_a_coarser_grid_each_medium_is_coarser():
     assert coarse.sigma_s.shape[1:] == coarse.grid.shape == alone.grid.shape
 
 
+@pytest.mark.parametrize("glow", ["emission", "black_body"])
+def test_what_a_mixture_has_itself_it_has_on_coarser_grids_and_with_other_values(glow: str):
+    """Of what glows and scatters there is as much; it glows, and scatters, where its support is."""
+    support, glows = (random_values(*SHAPE, seed=3) > 0.5).double(), {glow: tensor(0.2, 0.3, 0.5)}
+    whole = replace(mix_media({"smoke": SMOKE, "dust": DUST}), support=support, index=1.4, **glows)
+    scene, medium = scene_of(whole), scale_medium(whole)
+    same = with_values(scene, {"media.dust.density": DUST.density}).volume
+    for volume in (volume_at_level(whole, box_grid((2, 5, 3))), same):
+        found = scale_medium(volume)
+        assert found.index == 1.4 and found.emission is not None and medium.emission is not None
+        for one, other in (
+            (found.emission, medium.emission),
+            (found.scattering.value, medium.scattering.value),
+            (found.absorption.value, medium.absorption.value),
+        ):
+            means = (each.mean((1, 2, 3)).expand(3) for each in (one, other))
+            torch.testing.assert_close(*means, rtol=1e-12, atol=0)
+
+
 def test_where_both_are_empty_derivatives_are_finite():
     density = torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True)
     media = {"smoke": replace(SMOKE, density=density), "dust": replace(DUST, density=density)}
@@ -95,3 +115,6 @@ def test_where_both_are_empty_derivatives_are_finite():
 def test_a_mixture_is_of_two_on_one_grid():
     with pytest.raises(ValueError, match="two media on the same grid"):
         mix_media({"smoke": SMOKE})
+    for part in ({"emission": tensor(1)}, {"index": 1.4}):
+        with pytest.raises(ValueError, match="not for a medium of it"):
+            mix_media({"smoke": SMOKE, "dust": replace(DUST, **part)})

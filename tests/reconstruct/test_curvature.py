@@ -86,10 +86,13 @@ def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it
         assert target.loss_of(other) <= target.loss_of(image) + parabola + 1e-12
 
 
-def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above() -> None:
+@pytest.mark.parametrize("periodic", [(), (0, 2)])
+def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(
+    periodic: tuple[int, ...],
+) -> None:
     """In each cell by itself."""
     field = random_values(4, 3, 5)
-    grid = make_scene(field).volume.grid
+    grid = replace(make_scene(field).volume.grid, periodic=periodic)
     stiffness = stiffness_diagonal(field, grid).flatten()
     field.requires_grad_()
     variation = total_variation(field, grid)
@@ -100,6 +103,15 @@ def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above() ->
             step[cell] = size
             parabola = variation + size * slope.flatten()[cell] + size**2 * stiffness[cell] / 2
             assert total_variation(field + step.view_as(field), grid) <= parabola + 1e-12
+
+
+def test_smoothing_does_not_depend_on_where_a_period_begins() -> None:
+    field, shift = random_values(4, 3, 5), (1, 2)
+    grid = replace(make_scene(field).volume.grid, periodic=(0, 2))
+    moved = field.roll(shift, (0, 2))
+    torch.testing.assert_close(total_variation(moved, grid), total_variation(field, grid))
+    stiff = stiffness_diagonal(field, grid, 0.1)
+    torch.testing.assert_close(stiffness_diagonal(moved, grid, 0.1), stiff.roll(shift, (0, 2)))
 
 
 @pytest.mark.parametrize("density", [0.0, 0.05, 2.0])

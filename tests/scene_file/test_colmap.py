@@ -15,7 +15,7 @@ from ddrecon.errors import FormatError, SceneError
 from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.view_sources import MODELS
+from ddrecon.scene_file.view_sources import MODELS, OTHERS
 from ddrecon.settings import LENSES
 
 Read = Callable[..., SceneFile]
@@ -101,6 +101,70 @@ def test_one_in_so_many_is_a_test_view(read: Read, tmp_path: Path) -> None:
     write_text(tmp_path / "sparse/0", "PINHOLE")
     views = read(scene_text(test_every=2)).tree.views
     assert [view.split for view in views] == ["test", "train"]
+
+
+IMAGE = "1 0.2 0.9 -0.3 0.1 0.1 -0.2 3.0 7"
+POINTS = "1.5 2.5 -1 3.5 4.5 12"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["a.png", "b 2.png", "b 10.png"],
+        ["b 10.png", "", "a.png", "b 2.png"],
+        ["b 2.png", POINTS, "b 10.png", "a.png"],
+        ["", "", "a.png", "", "  ", "# c", "b 10.png", POINTS, "", "b 2.png"],
+    ],
+)
+def test_lines_of_points_may_be_missing(read: Read, tmp_path: Path, lines: list[str]) -> None:
+    """No image is taken for points; pictures are in order of their numbers."""
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    text = [f"{IMAGE} {line}" if line.endswith("png") else line for line in lines]
+    (tmp_path / "sparse/0/images.txt").write_text("\n".join(text))
+    assert [view.name for view in read(scene_text()).tree.views] == ["a", "b_2", "b_10"]
+
+
+@pytest.mark.parametrize("lines", [[POINTS, POINTS], ["", POINTS], [IMAGE]])
+def test_a_line_that_is_neither_is_refused(read: Read, tmp_path: Path, lines: list[str]) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    text = "\n".join([f"{IMAGE} a.png", *lines])
+    (tmp_path / "sparse/0/images.txt").write_text(text)
+    with pytest.raises(FormatError, match=f"line {1 + len(lines)}: expected IMAGE_ID"):
+        read(scene_text())
+
+
+def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
+    """With a byte order mark, other ends of lines, and backslashes; but not out of the folder."""
+    folder = tmp_path / "sparse/0"
+    write_text(folder, "PINHOLE", "left\\c.png")
+    for path in folder.iterdir():
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-8-sig"))
+    views = read(changed(views={"colmap": "sparse\\0", "images": "pictures"})).tree.views
+    assert [view.image for view in views] == [
+        tmp_path / "pictures" / name for name in ("a.png", "left/c.png")
+    ]
+    write_text(folder, "PINHOLE", "left\\..\\..\\c.png")
+    with pytest.raises(FormatError, match="leaves the folder of pictures"):
+        read(scene_text())
+
+
+@pytest.mark.parametrize("store", [write_text, write_binary])
+@pytest.mark.parametrize("model", OTHERS)
+def test_cameras_that_no_image_has_may_be_of_any_model(
+    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+) -> None:
+    folder, numbers = tmp_path / "sparse/0", [0.5] * OTHERS[model]
+    store(folder, "PINHOLE")
+    before = read(scene_text()).tree
+    if store is write_text:
+        with (folder / "cameras.txt").open("a") as stream:
+            stream.write(f"8 {model} 8 6 {' '.join(map(str, numbers))}\n")
+    else:
+        count, cameras = struct.pack("<Q", 2), (folder / "cameras.bin").read_bytes()[8:]
+        kind = [*MODELS, *OTHERS].index(model)
+        strange = struct.pack(f"<iiQQ{len(numbers)}d", 8, kind, 8, 6, *numbers)
+        (folder / "cameras.bin").write_bytes(count + strange + cameras)
+    assert read(scene_text()).tree == before
 
 
 @pytest.mark.parametrize(

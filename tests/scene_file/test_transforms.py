@@ -18,7 +18,7 @@ from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
-from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
+from ddrecon.scene_file.schema import FisheyeSection, OpencvSection, PerspectiveSection, ViewSection
 from ddrecon.scene_file.transforms import export_transforms
 
 Read = Callable[..., SceneFile]
@@ -86,15 +86,100 @@ def test_a_frame_takes_precedence_over_its_file(read: Read, tmp_path: Path) -> N
     assert second.mask == tmp_path / "masks/b.png"
 
 
-def test_angles_and_focal_lengths_say_the_same(read: Read, tmp_path: Path) -> None:
-    angles = {"camera_angle_x": 2 * math.atan(8 / 2 / 20), "w": 8, "h": 6}
-    angles["camera_angle_y"] = 2 * math.atan(6 / 2 / 19)
-    (one,) = views(read(transforms(tmp_path / "a.json", frame(), **angles)))
-    lengths = NERFSTUDIO | {"cx": 4, "cy": 3}
-    (other,) = views(read(transforms(tmp_path / "a.json", frame(), **lengths)))
-    assert camera_of(one).fov == pytest.approx(camera_of(other).fov, rel=1e-14)
-    assert camera_of(one).pixel_aspect == pytest.approx(20 / 19, rel=1e-14)
-    assert camera_of(one).principal_point == camera_of(other).principal_point == (0.5, 0.5)
+def angle(focal: float, pixels: int) -> float:
+    return 2 * math.atan(pixels / 2 / focal)
+
+
+@pytest.mark.parametrize(
+    ("shared", "own", "focal"),
+    [
+        ({}, {"fl_x": 20, "fl_y": 19}, (20, 19)),
+        ({"fl_x": 20, "fl_y": 19}, {}, (20, 19)),
+        ({"camera_angle_x": angle(20, 8), "camera_angle_y": angle(19, 6)}, {}, (20, 19)),
+        ({"x_fov": math.degrees(angle(20, 8)), "fl_y": 19}, {}, (20, 19)),
+        ({"fl_x": 20}, {}, (20, 20)),
+        ({"fl_y": 19}, {}, (19, 19)),
+        ({"y_fov": math.degrees(angle(19, 6))}, {}, (19, 19)),
+        # a frame's own, whatever it is said by, and then nothing of the file's
+        ({"fl_x": 20, "fl_y": 19}, {"fl_x": 40}, (40, 40)),
+        ({"fl_x": 20, "fl_y": 19}, {"camera_angle_x": angle(40, 8)}, (40, 40)),
+        ({"fl_x": 20, "fl_y": 19}, {"x_fov": math.degrees(angle(40, 8))}, (40, 40)),
+        ({"x_fov": 30, "y_fov": 40}, {"fl_x": 40, "fl_y": 38}, (40, 38)),
+        ({"camera_angle_x": 0.5, "camera_angle_y": 0.3}, {"fl_y": 40}, (40, 40)),
+        ({"fl_x": 20}, {"w": 16, "h": 8}, (20, 20)),
+        ({"camera_angle_x": 0.5}, {"w": 16, "h": 8}, (8 / math.tan(0.25), 8 / math.tan(0.25))),
+    ],
+)
+def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
+    read: Read, tmp_path: Path, shared: Any, own: Any, focal: tuple[float, float]
+) -> None:
+    text = transforms(tmp_path / "a.json", frame(**own), **({"w": 8, "h": 6} | shared))
+    (view,) = views(read(text))
+    (width, _), (focal_x, focal_y) = camera_of(view).resolution or (0, 0), focal
+    assert camera_of(view).fov == pytest.approx(math.degrees(angle(focal_x, width)), rel=1e-14)
+    assert camera_of(view).pixel_aspect == pytest.approx(focal_x / focal_y, rel=1e-14)
+    assert camera_of(view).principal_point == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("shared", "own", "expected"),
+    [
+        ({"k1": -0.1, "k2": 0.02}, {"k1": 0.05}, OpencvSection(k1=0.05)),
+        ({"distortion_params": [-0.1, 0.02, 0, 0, 0, 0]}, {"k1": 0.05}, OpencvSection(k1=0.05)),
+        ({"k1": -0.1}, {"distortion_params": [0.05, 0, 0, 0, 0, 0]}, OpencvSection(k1=0.05)),
+        ({"k1": 0.05}, {"camera_model": "OPENCV"}, OpencvSection(k1=0.05)),
+        ({"k1": 0.05}, {"camera_model": "PINHOLE"}, None),
+        ({"k1": 0.05}, {"is_fisheye": True}, FisheyeSection(k1=0.05)),
+        ({"k1": 0.05, "is_fisheye": True}, {"camera_model": "OPENCV"}, OpencvSection(k1=0.05)),
+        ({"ftheta_p1": 0.01, "latlong": True}, {"k1": 0.05}, OpencvSection(k1=0.05)),
+        ({"k1": 0.05, "latlong": False, "sk_x": 0.0, "dist": [0, 0]}, {}, OpencvSection(k1=0.05)),
+    ],
+)
+def test_a_lens_is_a_frames_own_before_that_of_its_file(
+    read: Read, tmp_path: Path, shared: Any, own: Any, expected: FisheyeSection | None
+) -> None:
+    (view,) = views(read(transforms(tmp_path / "a.json", frame(**own), **(SIZES | shared))))
+    assert camera_of(view).distortion == expected
+
+
+def test_a_frames_own_principal_point_and_size(read: Read, tmp_path: Path) -> None:
+    (view,) = views(read(transforms(tmp_path / "a.json", frame(cx=2, h=12), **SIZES)))
+    assert camera_of(view).resolution == (8, 12)
+    assert camera_of(view).principal_point == (2 / 8, 2.9 / 12)
+
+
+@pytest.mark.parametrize(
+    ("name", "there", "image"),
+    [
+        ("images\\r_0.png", ["images/r_0.png"], "images/r_0.png"),
+        (".\\images\\r_0", [], "images/r_0.png"),
+        ("a\\b.png", ["a\\b.png"], "a\\b.png"),
+        ("images/r_0.12", [], "images/r_0.12.png"),
+        ("images/r_0.left", ["images/r_0.left.png"], "images/r_0.left.png"),
+        ("IMG_1.HEIC", ["IMG_1.HEIC"], "IMG_1.HEIC"),
+        ("IMG_1.DNG", [], "IMG_1.DNG"),
+        ("r_0", ["r_0"], "r_0"),
+    ],
+)
+def test_which_picture_a_name_means(
+    read: Read, tmp_path: Path, name: str, there: list[str], image: str
+) -> None:
+    (tmp_path / "images").mkdir()
+    for file in there:
+        (tmp_path / file).touch()
+    lists = {"train_filenames": [name.replace("\\", "/")]} if "\\" in name else {}
+    text = transforms(tmp_path / "a.json", frame(name), **NERFSTUDIO, **lists)
+    (view,) = views(read(text))
+    assert view.image == tmp_path / image
+
+
+def test_a_file_of_windows_is_read(read: Read, tmp_path: Path) -> None:
+    """With a byte order mark, as its editors write text."""
+    text = transforms(tmp_path / "a.json", frame(), **NERFSTUDIO)
+    before = read(text)
+    for path in (tmp_path / "a.json", tmp_path / "scene.yaml"):
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-8-sig"))
+    assert read_scene(tmp_path / "scene.yaml").tree == before.tree
 
 
 @pytest.mark.parametrize(
@@ -148,6 +233,19 @@ WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
     ([frame()], FISHEYE, "distortion_params.4: p1 = 0.001 is not modeled"),
     ([frame()], {"camera_model": "EQUIRECTANGULAR"}, "camera_model: EQUIRECTANGULAR is a lens"),
+    ([frame()], {"ftheta_p0": 0.0, "ftheta_p1": 0.01}, "ftheta_p1: is of a lens that is not"),
+    ([frame(latlong=True)], {}, "frames.0.latlong: is of a lens that is not modeled; undistort"),
+    ([frame()], {"equirectangular": True}, "equirectangular: is of a lens that is not modeled"),
+    ([frame()], {"sk_x": 0.1}, "sk_x: is of a lens that is not modeled"),
+    ([frame(K=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])], {}, "frames.0.K: is not read: write fl_x, fl_y"),
+    (
+        [frame()],
+        {"distortion_params": [0.1, 0, 0, 0]},
+        "distortion_params: expected k1, k2, k3, k4",
+    ),
+    ([frame(dist_coeffs=[[0.1, 0]])], {}, "frames.0.dist_coeffs: is not read: write k1, k2"),
+    ([frame()], {"is_fisheye": "false"}, "is_fisheye: expected true or false"),
+    ([frame()], {"x_fov": 180}, "x_fov: must be below 180"),
     ([frame()], {"fl_x": 0}, "fl_x: must be above 0"),
     ([frame()], {"w": 8.5}, "w: expected a whole number, found 8.5"),
     ([frame()], {"w": None}, "w: expected a number, found nothing"),
@@ -168,6 +266,11 @@ TOO_LITTLE: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"w": 8, "h": 6}, "frames.0: has neither fl_x nor camera_angle_x"),
     ([frame()], {"fl_x": 20}, "fl_x: is in pixels, but w and h do not say how many there are"),
     ([frame()], {"camera_angle_x": 0.5, "cx": 3}, "cx: is in pixels"),
+    (
+        [frame()],
+        {"camera_angle_y": 0.5},
+        "frames.0: says how high its picture is, but not how wide: give w and h",
+    ),
     ([frame(None)], {"camera_angle_x": 0.5}, "frames.0: has neither file_path nor w and h"),
 ]
 
@@ -261,8 +364,12 @@ def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> 
     assert (pinhole.direction - rays[0]).abs().max() > 1e-4
 
 
-def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path) -> None:
-    numbers = NERFSTUDIO | {"k1": -12.0}
+LEFT = {"w": 40, "h": 1000, "fl_x": 20.0, "fl_y": 2e3, "cx": 0.0, "cy": 500.0, "k1": -0.3}
+"""Its axis is at the left edge, where it does not fold over."""
+
+
+@pytest.mark.parametrize("numbers", [NERFSTUDIO | {"k1": -12.0}, LEFT])
+def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path, numbers: Any) -> None:
     scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
     with pytest.raises(SceneError, match="folds over within the image") as caught:
         build_scene(scene_file)

@@ -6,6 +6,10 @@ its residual falls below `tolerance` times that of its right side, for every col
 write it, enter it here.
 """
 
-from ddrecon.diffusion.solvers.multigrid import conjugate_gradient, jacobi, multigrid
+from ddrecon.diffusion.solvers import multigrid
 
-SOLVERS = {"multigrid": multigrid, "conjugate_gradient": conjugate_gradient, "jacobi": jacobi}
+SOLVERS = {
+    "multigrid": multigrid.multigrid,
+    "conjugate_gradient": multigrid.conjugate_gradient,
+    "jacobi": multigrid.jacobi,
+}

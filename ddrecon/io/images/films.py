@@ -1,8 +1,14 @@
-"""Frames of films, through ffmpeg (extra `film`)."""
+"""Frames of films, by the times at which they are shown, through ffmpeg (extra `film`)."""
 
 from __future__ import annotations
 
+import logging
+import math
 import re
+import subprocess
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,34 +22,84 @@ FILMS = {".mp4": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska"}
 """What ffmpeg takes a suffix for: by itself it would go by content, and follow playlists."""
 OTHER_CURVES = re.compile("arib-std-b67|smpte2084|smpte428|linear|log100|log316")
 """As ffmpeg calls them: HLG, PQ, that of cinemas, none and logarithms."""
+STREAM = ["-map", "0:V:0"]
+"""The first video that is no cover."""
+AHEAD = 0.5
+"""Seconds before a frame from which on a film is decoded.
+
+ffmpeg seeks by when frames are decoded, which is earlier than when they are shown.
+"""
 
 
 def read_frame(path: Path, number: int = 0, time: float = 0.0) -> np.ndarray:
-    """The frame `number`, counted from that at `time` [s], of the film at `path`: uint8 [h, w, 3].
+    """The frame `number`, counted from the one nearest to `time` [s], of the film at `path`.
 
-    Raises FormatError where there is none, or the film is damaged.
+    It is uint8 [h, w, 3]. Raises FormatError where there is none, or the film is damaged.
     """
+    times = frame_times(path)
+    number += nearest_frame(times, time)
+    if not 0 <= number < len(times):
+        length = f"{len(times)} frames in {times[-1]:g} seconds"
+        raise FormatError(path, f"has no frame {number}, counted from 0: it has {length}")
+    # Between halfway from the frame before and halfway to the next, this one alone is shown.
+    near = [-1.0, *times, math.inf][number : number + 3]
+    low, high = ((a + b) / 2 for a, b in pairwise(near))
+    for start in (max(0.0, low - AHEAD), 0.0):  # where seeking misses it, from the start
+        if (frame := _decode(path, start, low, high)) is not None:
+            return frame
+    raise FormatError(path, f"frame {number} is damaged")
+
+
+def nearest_frame(times: Sequence[float], time: float) -> int:
+    """Which of the frames shown at `times` [s] that is which is nearest to `time`."""
+    return min(range(len(times)), key=lambda index: abs(times[index] - time))
+
+
+def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | None:
+    """The frame shown between `low` and `high` [s], where decoding from `start` on comes by it."""
     # here, as scene files know suffixes without NumPy
     import numpy as np
 
     from ddrecon.io.files.arrays import check_size
 
     read = load_for_file("imageio_ffmpeg", path).read_frames
-    asked = ["-f", FILMS[path.suffix.lower()]]
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it tells of turned films
+    options = ["-f", FILMS[path.suffix.lower()], "-xerror", "-ss", f"{start:.6f}"]
+    end = f":end={high - start:.6f}" if high < math.inf else ""
+    chosen = [*STREAM, "-vf", f"trim=start={low - start:.6f}{end},setpts=0", "-frames:v", "1"]
     try:
-        about = next(read(path, input_params=asked))
-        (width, height), rate = about["size"], about["fps"]
+        frames = read(path, input_params=options, output_params=chosen)
+        about = next(frames)
+        width, height = about["size"]
         if curve := OTHER_CURVES.search(about["pix_fmt"]):
             what = f"is encoded by {curve[0]}, not by a curve near sRGB's"
             raise FormatError(path, f"{what}; convert it to SDR (BT.709) first")
-        number += round(time * rate)
         check_size(4 * width * height, path, f"a film of {width} x {height} pixels")
-        # Half a frame early: the times of frames are rounded.
-        asked += ["-xerror", "-ss", f"{max(0.0, (number - 0.5) / rate):.6f}"]
-        _, *found = read(path, input_params=asked, output_params=["-frames:v", "1"])
-    except (OSError, RuntimeError, ZeroDivisionError) as error:
-        raise FormatError(path, "is damaged, or no film") from error
-    if not found or number < 0:
-        length = f"{about['duration']:g} seconds of {rate:g} frames"
-        raise FormatError(path, f"has no frame {number}, counted from 0: it has {length}")
-    return np.frombuffer(found[0], np.uint8).reshape(height, width, 3)
+        decoded = list(frames)
+    except (OSError, RuntimeError):
+        return None
+    return np.frombuffer(decoded[0], np.uint8).reshape(height, width, 3) if decoded else None
+
+
+def frame_times(path: Path) -> tuple[float, ...]:
+    """When each frame of the film at `path` is shown, in seconds after the film's start.
+
+    Raises FormatError where the film is damaged.
+    """
+    about = path.stat()
+    return _frame_times(path, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=256)
+def _frame_times(path: Path, *_: int) -> tuple[float, ...]:
+    """By the packets of the film, none of which is decoded."""
+    program = load_for_file("imageio_ffmpeg", path).get_ffmpeg_exe()
+    film = [program, "-nostdin", "-f", FILMS[path.suffix.lower()], "-i", str(path), *STREAM]
+    done = subprocess.run([*film, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
+    listed = done.stdout.decode(errors="replace")
+    base = re.search(r"^#tb 0: (\d+)/(\d+)$", listed, re.MULTILINE)
+    # Packets before 0 are cut off; hidden ones have the time of the next that is shown.
+    ticks = {int(word) for word in re.findall(r"^0, *-?\d+, *(\d+),", listed, re.MULTILINE)}
+    if done.returncode or base is None or not ticks:
+        raise FormatError(path, "is damaged, or no film")
+    return tuple(tick * int(base[1]) / int(base[2]) for tick in sorted(ticks))

@@ -149,14 +149,23 @@ def _place(field: Field) -> str:
     return f"{cells} cells (x, y, z) in {box}"
 
 
-def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
-    """`fields` and their box turned so that z points up where y did: (x, y, z) is (x, -z, y)."""
-    (x, y, z), (far_x, far_y, far_z) = bounds.tolist()
-    box = np.array([[x, -far_z, y], [far_x, -z, far_y]])
-    turned = {name: values.swapaxes(0, 1)[:, ::-1] for name, values in fields.items()}
-    along = {
-        name: turned[name][..., [0, 2, 1]] * np.array([1, -1, 1])
-        for name in VECTORS
-        if name in turned
+def turn_up(
+    fields: Fields, bounds: np.ndarray, before: str, after: str
+) -> tuple[Fields, np.ndarray]:
+    """`fields` and their box turned so that the axis `after` points up where `before` did.
+
+    From y to z (x, y, z) is (x, -z, y).
+    """
+    if before == after:
+        return fields, bounds
+    old, new = ("xyz".index(name) for name in (before, after))
+    turned = {
+        name: np.flip(values.swapaxes(2 - old, 2 - new), 2 - old) for name, values in fields.items()
     }
-    return turned | along, box
+    box, (low, high) = bounds.copy(), bounds
+    box[:, new], box[:, old] = bounds[:, old], (-high[new], -low[new])
+    for name in turned.keys() & set(VECTORS):
+        along = turned[name].copy()
+        along[..., new], along[..., old] = turned[name][..., old], -turned[name][..., new]
+        turned[name] = along
+    return turned, box
