@@ -182,7 +182,7 @@ def measure(
     if verb == "solve":
         command = [sys.executable, "-c", SOLVE, str(path)]
     else:
-        command = [*program, verb, str(path), "-o", str(folder / "out"), "--overwrite", "-q"]
+        command = [*program, verb, str(path), "-o", str(folder / verb), "--overwrite", "-q"]
     return peak(command), int(json.loads(found.stdout)["memory_bytes"])
 
 

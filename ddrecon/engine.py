@@ -12,6 +12,8 @@ import logging
 import os
 from collections.abc import Collection, Mapping
 from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryFile
 
 from ddrecon.errors import MissingExtraError, UsageError
 from ddrecon.extras import advice
@@ -22,6 +24,8 @@ CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
 PARTS = "view rays", "light", "diffusion", "transport rounds"
 """The parts of the renderer, which every engine has."""
+CACHE = "WARP_CACHE_PATH"
+"""The environment variable that names the folder where Warp keeps kernels."""
 LOG = "ddrecon.engine"
 """The logger that is told when kernels are compiled, which happens once, or warp is missing."""
 
@@ -100,7 +104,43 @@ def _resolve(name: str, asked: str) -> str:
     if name == "warp" and not is_installed:
         raise MissingExtraError(f"{asked} {advice('warp')}")
     if is_installed:
-        return "warp"
+        return _keep_kernels(name, asked)
     missing = 'engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast'
     logging.getLogger(LOG).info(missing)
     return "torch"
+
+
+def _keep_kernels(name: str, asked: str) -> str:
+    """`warp`, once there is a folder for its kernels; `torch` where there is none, with `auto`.
+
+    Where the usual one cannot be written, as in containers, `auto` takes a temporary one. Raises
+    UsageError for `warp` there.
+    """
+    usual = os.environ.get(CACHE) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    if os.name != "posix" or _is_writable(Path(usual)):
+        return "warp"
+    advice = f"set {CACHE} to a folder that can be written"
+    lost = f"kernels cannot be kept in {usual}"
+    if name == "warp":
+        raise UsageError(f"{asked}: {lost}; {advice}")
+    folder = Path(os.environ.get("TMPDIR") or "/tmp", f"ddrecon-{os.getuid()}")
+    # What others put there would be run as kernels.
+    if _is_writable(folder) and folder.lstat().st_uid == os.getuid():
+        os.environ[CACHE] = str(folder)
+        name, instead = "warp", f", but in {folder}"
+    else:
+        name, instead = "torch", ""
+    logging.getLogger(LOG).info(f"engine {name}: {lost}{instead}; {advice}")
+    return name
+
+
+def _is_writable(folder: Path) -> bool:
+    """Whether files can be written to `folder`, which is made."""
+    try:
+        place = folder.expanduser()
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.mkdir(0o700, exist_ok=True)
+        with TemporaryFile(dir=place):
+            return True
+    except (OSError, RuntimeError):  # the latter where nobody knows a home
+        return False

@@ -27,6 +27,11 @@ def one_line(text: str) -> str:
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
+def is_utf8(name: object) -> bool:
+    """Whether `name` is text, which the name of a file need not be: Python keeps its bytes so."""
+    return not any("\ud800" <= character <= "\udfff" for character in str(name))
+
+
 class DdreconError(Exception):
     """Base of every error a user can cause; `exit_code` is what the command line returns."""
 

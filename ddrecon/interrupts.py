@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -54,9 +55,12 @@ def on_interrupt(handler: Callable[[int, FrameType | None], None]) -> Iterator[N
 def defer_interrupt() -> Iterator[list[int]]:
     """A list that fills when the process is asked to stop, so that no iteration is torn.
 
-    Asked twice, it stops at once.
+    Asked twice, it stops at once. Another thread than the main one is never asked.
     """
     asked: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
 
     def note(number: int, frame: FrameType | None) -> None:
         if asked:

@@ -1,10 +1,11 @@
-"""How much memory a scene takes, before any of it is taken, and how much there is."""
+"""How much memory a scene takes, before any of it is taken; what memory and cores there are."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +18,11 @@ from ddrecon.kernels import spare
 from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
 
+GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""Where Linux has its control groups, and says in which this process is."""
+UNIFIED = "memory.max", "memory.current", "inactive_file"
+DIVIDED = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+"""The files of a group's limit and usage, and what can be given back of that, by both versions."""
 SMALL = 2**24
 """Bytes of arrays that are small beside what else the process holds."""
 MATTER = 4
@@ -195,41 +201,48 @@ def _available() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def _group_limits(
-    root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
-) -> Iterator[int]:
-    """Bytes left to each control group of this process, by either version of Linux's."""
+def usable_cores(root: Path = GROUPS, own: Path = OWN_GROUPS) -> int:
+    """How many cores this process may use, by its affinity and the quotas of its control groups."""
+    is_limited = hasattr(os, "sched_getaffinity")
+    cores = [len(os.sched_getaffinity(0)) if is_limited else os.cpu_count() or 1]
+    for is_unified, group in _groups("cpu", root, own):
+        names = ("cpu.max",) if is_unified else ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+        with suppress(OSError, ValueError):  # the latter of "max"
+            quota, period = (int(n) for name in names for n in (group / name).read_text().split())
+            if quota > 0:
+                cores.append(math.ceil(quota / period))
+    return min(cores)
+
+
+def _group_limits(root: Path = GROUPS, own: Path = OWN_GROUPS) -> Iterator[int]:
+    """Bytes left to each control group of this process."""
+    for is_unified, group in _groups("memory", root, own):
+        limit, usage, cached = UNIFIED if is_unified else DIVIDED
+        with suppress(OSError, ValueError):
+            allowed, used = (group / limit).read_text().strip(), int((group / usage).read_text())
+            lines = (group / "memory.stat").read_text().splitlines()
+            if allowed != "max":
+                given_back = dict(line.split() for line in lines).get(cached, 0)
+                yield int(allowed) - used + int(given_back)
+
+
+def _groups(kind: str, root: Path, own: Path) -> Iterator[tuple[bool, Path]]:
+    """The folders of the control groups of this `kind` that hold this process, inner ones first.
+
+    And whether each is of Linux's second version, where groups of all kinds are one.
+    """
     try:
         lines = own.read_text().splitlines()
     except OSError:
         return
     for line in lines:
         _, kinds, path = line.split(":", 2)
-        if not kinds:
-            yield from _left(root, path, "memory.max", "memory.current", "inactive_file")
-        elif "memory" in kinds.split(","):
-            yield from _left(
-                root / "memory",
-                path,
-                "memory.limit_in_bytes",
-                "memory.usage_in_bytes",
-                "total_inactive_file",
-            )
-
-
-def _left(root: Path, path: str, limit: str, usage: str, cached: str) -> Iterator[int]:
-    """Bytes left to the group at `path` and to each that it is in, by these of its files."""
-    for folder in (root / path.lstrip("/"), *(root / path.lstrip("/")).parents):
-        try:
-            allowed, used = (folder / limit).read_text().strip(), int((folder / usage).read_text())
-            lines = (folder / "memory.stat").read_text().splitlines()
-            if allowed != "max":
-                given_back = dict(line.split() for line in lines).get(cached, 0)
-                yield int(allowed) - used + int(given_back)
-        except (OSError, ValueError):
-            pass
-        if folder == root:
-            return
+        if not kinds or kind in kinds.split(","):
+            top = root / kind if kinds else root
+            for folder in (top / path.lstrip("/"), *(top / path.lstrip("/")).parents):
+                yield not kinds, folder
+                if folder == top:
+                    break
 
 
 def is_shortage(error: BaseException) -> bool:

@@ -1,7 +1,9 @@
 """The engine is chosen by name, by the environment, or by what is installed."""
 
+import os
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 
@@ -87,3 +89,40 @@ def test_to_choose_imports_no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "warp", raising=False)
     ddrecon.use_engine("auto")
     assert "warp" not in sys.modules
+
+
+@pytest.fixture(params=["/proc/nohome", None])
+def homeless(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A home that cannot be written, or none at all."""
+    for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "")  # so that it is put back
+        monkeypatch.delenv(name)
+    if request.param:
+        monkeypatch.setenv("HOME", request.param)
+    else:
+        monkeypatch.delenv("HOME", raising=False)
+        monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
+
+
+def test_kernels_of_the_homeless_are_kept_among_temporary_files(
+    homeless: None,
+    installed: None,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Where others cannot write them; in torch where there is no such place, and not in `~`."""
+    caplog.set_level("INFO", engine.LOG)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"engine warp: kernels cannot .* set WARP_CACHE_PATH to"):
+        ddrecon.use_engine("warp")
+    places = {"/proc": "torch", str(tmp_path): "warp"}
+    for place, expected in places.items():
+        monkeypatch.setenv("TMPDIR", place)
+        ddrecon.use_engine("auto")
+        assert current_engine() == expected
+        assert caplog.messages[-1].startswith(f"engine {expected}: kernels cannot be kept in ")
+    (kept,) = tmp_path.iterdir()
+    assert os.environ["WARP_CACHE_PATH"] == str(kept) and kept.stat().st_mode & 0o777 == 0o700
+    ddrecon.use_engine("warp")
+    assert len(caplog.messages) == 2

@@ -24,6 +24,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.extras import load_extra
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.progress import Progress
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
@@ -152,7 +153,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")
         axis.grid(which="major", alpha=0.3)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
-    figure.savefig(path, dpi=110)
+    with replace_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
     plt.close(figure)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from contextlib import suppress
 from typing import Any
 
 from ddrecon.interrupts import INTERRUPTED, end_at_once, on_interrupt
@@ -18,5 +19,12 @@ def main(*arguments: Any, **settings: Any) -> None:
         if end.code == INTERRUPTED:
             os._exit(INTERRUPTED)  # threads that compile kernels are not waited for
         raise
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        # Of a stream, not of a file: what is left in it cannot be written at the end either.
+        with suppress(OSError):
+            os.write(2, f"cannot write: {error.strerror}\n".encode())
+        os._exit(3)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done

@@ -17,7 +17,7 @@ from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
@@ -40,15 +40,19 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
 
     Where it has no support it is as by `support: auto`, if pictures tell.
     """
-    found = list[Support | None]()
+    found = list[Support]()
     for scene in frames:
         train, settings = select_views(scene, is_test=False), scene.optimize
         density = settings.parameters.get("density") if settings is not None else None
         if settings is not None and density is not None and train.views:
             auto = replace(density, support=density.support or AUTO)
             with nullcontext() if density.support else suppress(SceneError):
-                found.append(find_support(train, replace(settings, parameters={"density": auto})))
-    return [support for support in found if support is not None]
+                support = find_support(train, replace(settings, parameters={"density": auto}))
+                if support is not None:
+                    # Without its pictures: those of a whole film take more memory than there is.
+                    views = [View(view.name, view.camera) for view in support.views]
+                    found.append(replace(support, views=views))
+    return found
 
 
 def describe(

@@ -39,14 +39,14 @@ COMMON = (
     click.option(
         "--threads",
         type=click.IntRange(min=1),
-        help="Processor threads; OMP_NUM_THREADS or all cores unless given.",
+        help="Processor threads; OMP_NUM_THREADS or all cores it may use unless given.",
     ),
     click.option("--seed", type=click.IntRange(-(2**31), 2**32 - 1), default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),
     click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
     DEBUG,
 )
-FEWER = {"watch": (DEBUG,), "info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG)}
+FEWER = {"info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG)}
 """The common options of commands that compute nothing."""
 ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 """Waiting threads spin for a moment, then sleep; said before torch is loaded.

@@ -10,7 +10,7 @@ import click
 
 from ddrecon import __version__
 from ddrecon.cli.file_commands import export, info
-from ddrecon.cli.scene_commands import balance, check, optimize, render, uncertainty, watch
+from ddrecon.cli.scene_commands import balance, check, optimize, render, uncertainty
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
@@ -21,7 +21,6 @@ GONE = {
     "--mp4": "say `ffmpeg -i DIR/ring_%03d.png ring.mp4` after it",
     "--tensorboard": "loss.csv has the same numbers",
     "--uncertainty": "say `ddrecon uncertainty RUN -o DIR` after it",
-    "--watch": "say `ddrecon watch RUN` beside it",
 }
 """Options that there were, and what to do instead."""
 
@@ -79,7 +78,7 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-OF_SCENES = check, render, balance, optimize, uncertainty, watch
+OF_SCENES = check, render, balance, optimize, uncertainty
 ALL = (*OF_SCENES, gradcheck, reference, bench, export, info)
 for command in ALL:
     main.add_command(command)

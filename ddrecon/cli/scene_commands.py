@@ -1,4 +1,4 @@
-"""Commands of scenes and runs: check, render, optimize, uncertainty, watch.
+"""Commands of scenes and runs: check, render, optimize, uncertainty.
 
 torch is imported inside the commands, after their scene is read: help, and what is wrong with a
 scene file, are shown at once.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.scene import Scene, View
     from ddrecon.scene_file.load import SceneFile
 
 
@@ -107,24 +107,32 @@ def render(
     output: Path,
     lights: tuple[str, ...],
     part: str | None,
+    overwrite: bool,
     **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    choice = _Choice(is_relit=bool(lights), **options)
+    choice = _Choice(is_relit=bool(lights), overwrite=overwrite, **options)
     if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
         typed = " ".join(f"--light {light}" for light in lights)
         session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
-    if not (scene / "frames").is_dir():
+    from ddrecon.io.files.folders import FILM, RENDER, claim_folder, kind_of_folder
+    from ddrecon.ranks import is_first
+
+    if kind_of_folder(scene) != FILM:
         if part is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
         session.show(*_render(session, scene, output, choice))
         return
     from ddrecon.film.folder import finished_frames
 
-    frames = finished_frames(scene, part, session.build)
-    found = {run.name: _render(session, run, output / run.name, choice) for run in frames}
+    frames = finished_frames(scene, part)
+    claim = claim_folder(output, RENDER, overwrite=overwrite)
+    with claim if is_first() else nullcontext() as folder:
+        if folder is not None and part is None:
+            folder.clear()
+        found = {run.name: _render(session, run, output / run.name, choice) for run in frames}
     session.show(
         {name: report for name, (report, _) in found.items()},
         [*chain.from_iterable(lines for _, lines in found.values())],
@@ -149,18 +157,24 @@ def _render(
     session: Session, scene: Path, output: Path, choice: _Choice
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
-    kinds = sorted({"npz", choice.exported or "npz"}) if choice.has_fluence else []
     scene_file = session.read(scene)
-    from ddrecon.io.files.atomic import write_json
-    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.io.files.folders import RENDER, claim_folder
     from ddrecon.ranks import is_first
-    from ddrecon.run.render_folder import (
-        remove_targets,
-        render_lines,
-        render_to_folder,
-        require_variation,
-        write_ring,
-    )
+    from ddrecon.scene_file.load import referenced_files
+
+    claim = claim_folder(output, RENDER, overwrite=choice.overwrite)
+    with claim if is_first() else nullcontext() as folder:
+        loaded, views = _choose_views(session, scene_file, choice)
+        if folder is not None:
+            folder.clear([scene_file.path, *referenced_files(scene_file)])
+        return _render_views(session, loaded, views, output, choice)
+
+
+def _choose_views(
+    session: Session, scene_file: SceneFile, choice: _Choice
+) -> tuple[Scene, list[View]]:
+    """The scene that is rendered, and its views that are."""
+    from ddrecon.run.render_folder import remove_targets, require_variation
 
     loaded = session.build(scene_file)
     if choice.has_fluence and not _are_rounds_said(session, scene_file):
@@ -173,16 +187,26 @@ def _render(
         views = list(loaded.views)
     if choice.parameter is not None:
         require_variation(loaded, choice.parameter)
-    with claim_folder(output, may_exist=choice.overwrite) if is_first() else nullcontext():
-        progress, parameter = session.progress, choice.parameter
-        report = render_to_folder(
-            loaded, views, output, choice.components, progress, parameter, kinds
-        )
-        if not is_first():
-            return {}, []
-        if choice.count is not None:
-            report["ring"] = write_ring(views, output)
-        write_json(output / "render.json", report)
+    return loaded, views
+
+
+def _render_views(
+    session: Session, loaded: Scene, views: list[View], output: Path, choice: _Choice
+) -> tuple[dict[str, Any], list[str]]:
+    from ddrecon.io.files.atomic import write_json
+    from ddrecon.ranks import is_first
+    from ddrecon.run.render_folder import render_lines, render_to_folder, write_ring
+
+    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
+    progress, parameter = session.progress, choice.parameter
+    report = render_to_folder(
+        loaded, views, output, choice.components, progress, parameter, [*kinds]
+    )
+    if not is_first():
+        return {}, []
+    if choice.count is not None:
+        report["ring"] = write_ring(views, output)
+    write_json(output / "render.json", report)
     return report, render_lines(report, output)
 
 
@@ -258,30 +282,34 @@ def optimize(
 
     if scene_file.tree.frames is not None:
         from ddrecon.film.drive import drive_film, share_out
-        from ddrecon.film.folder import Film, open_film
+        from ddrecon.film.folder import Film, choose_frames, open_film
         from ddrecon.film.report import film_lines
 
         film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
-        chosen, film.environment = film.choose(part), session.environment()
-        if is_first():
-            open_film(film, may_exist=overwrite, resume=resume, shared=shared)
-        from_first(None)  # others find the folder as it is to be
-        own = share_out(chosen)
-        with alone():
-            record = drive_film(film, own, exported)
+        own = share_out(choose_frames(film.frames.numbers, part))
+        film.environment = session.environment()
+        if not is_first():
+            from_first(None)  # others find the folder as it is to be
+            overwrite, resume, shared = False, True, None
+        with open_film(film, part, own, overwrite=overwrite, resume=resume, shared=shared):
+            if is_first():
+                from_first(None)
+            with alone():
+                record = drive_film(film, own, exported)
         session.show(record, film_lines(record, output))
         return
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
+    from ddrecon.io.files.folders import RUN, claim_folder
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
-    built, environment = session.build(scene_file), session.environment()
     if not is_first():
-        follow_run(built, scene_file, resume=resume)
+        follow_run(session.build(scene_file), scene_file, resume=resume)
         return
-    choice = {"may_exist": overwrite, "resume": resume}
-    with open_run(built, scene_file, output, environment, **choice) as (run, folder):
+    with claim_folder(output, RUN, overwrite=overwrite, resume=resume) as claimed:
+        built, environment = session.build(scene_file), session.environment()
+        run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
         summary = drive_run(run, folder, preview_every, session.is_quiet)
     session.show(summary, summary_lines(summary, output))
 
@@ -344,22 +372,17 @@ def uncertainty(
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
     they do not.
     """
-    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.io.files.folders import UNCERTAINTY, claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
-    from ddrecon.run.checkpoint import require_checkpoint
     from ddrecon.run.result import require_no_film
-    from ddrecon.run.run_folder import CHECKPOINTS, load_run
+    from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
     if tolerance is not None:
         warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
-    if output.resolve() == run.resolve():
-        raise click.UsageError("-o names the run itself; name another folder")
     require_no_film(run)
-    if resume:
-        require_checkpoint(output / CHECKPOINTS)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):
         raise UsageError(
@@ -372,30 +395,6 @@ def uncertainty(
     if not is_first():
         follow_uncertainty(taken, request)
         return
-    with claim_folder(output, may_exist=overwrite or resume):
-        record = drive_uncertainty(taken, output, request, resume=resume, is_quiet=session.is_quiet)
+    with claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
+        record = drive_uncertainty(taken, folder, request, resume=resume, is_quiet=session.is_quiet)
     session.show(record, uncertainty_lines(record, output))
-
-
-@click.command()
-@click.argument("run", type=click.Path(path_type=Path))
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    show_default="8765, or a free one if that is taken",
-    help="Where to serve it; 0 is a free one.",
-)
-@in_session
-def watch(session: Session, run: Path, port: int | None) -> None:
-    """Serve the page of RUN, the folder of a run or a film, on this machine alone, as it goes on.
-
-    Ctrl-C ends it.
-    """
-    from ddrecon.film.report import film_page
-    from ddrecon.run.live import HOST, LiveRun, serve_page
-
-    is_film = any((run / name).is_dir() for name in ("frames", "calibration"))
-    page = partial(film_page, run) if is_film else LiveRun(run).page
-    with serve_page(page, port) as server:
-        click.echo(f"http://{HOST}:{server.server_port}/  (Ctrl-C ends)")
-        server.serve_forever()

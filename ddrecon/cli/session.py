@@ -64,6 +64,7 @@ class Session:
         import torch
 
         from ddrecon.kernels.spare import keep_freed_memory
+        from ddrecon.memory import usable_cores
 
         has_gpu = torch.cuda.is_available()
         if self.device == "cuda" and not has_gpu:
@@ -87,7 +88,7 @@ class Session:
                 )
             torch.cuda.set_device(own)
             self.place = torch.device("cuda", own)
-        cores = max(1, (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+        cores = max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
         usual = torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else cores
         self.threads = self.threads or usual
         torch.set_num_threads(self.threads)

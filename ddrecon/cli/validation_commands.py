@@ -81,15 +81,18 @@ def reference(
     is_only_traced: bool,
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
-    loaded = session.load(scene)
+    scene_file = session.read(scene)
+    loaded = session.build(scene_file)
     from ddrecon.io.files.atomic import write_json
-    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.io.files.folders import REFERENCE, claim_folder
     from ddrecon.reference.compare import compare_to_folder, reference_lines
     from ddrecon.reference.trace import open_tracer
+    from ddrecon.scene_file.load import referenced_files
 
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     tracer = open_tracer(loaded, views, threads=session.threads)
-    with claim_folder(output, may_exist=overwrite):
+    with claim_folder(output, REFERENCE, overwrite=overwrite) as folder:
+        folder.clear([scene, *referenced_files(scene_file)])
         shown = None if is_only_traced else loaded
         settings = output, samples, session.seed, session.progress
         report = compare_to_folder(tracer, shown, views, *settings)
@@ -132,9 +135,12 @@ def bench(
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     scene_file = None if scene is None else session.read(scene)
-    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.io.files.folders import BENCH, claim_folder
 
-    with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
+    claim = nullcontext() if output is None else claim_folder(output, BENCH, overwrite=overwrite)
+    with claim as folder:
+        if folder is not None:
+            folder.clear()
         if not is_hard:
             _bench_speed(session, scene_file, is_quick, output)
             return

@@ -20,7 +20,7 @@ from ddrecon.errors import DataWarning, DdreconError, FormatError, SceneError, S
 from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
 from ddrecon.film.report import write_film_report
 from ddrecon.film.shared import SHARED, read_shared, write_shared
-from ddrecon.io.files.folders import claim_folder
+from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
@@ -35,7 +35,13 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.drive import advance, drive_run, open_run
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, volume_file, write_volume
+from ddrecon.run.run_folder import (
+    CHECKPOINTS,
+    SCENE,
+    Checkpoints,
+    volume_file,
+    write_volume,
+)
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
@@ -62,10 +68,11 @@ def optimize_sequence(
         film = Film(read_scene(path, overrides), Path(place), build)
         if film.scene_file.tree.frames is None:
             raise SceneError(f"{path}: frames: missing section; say which, {{first: 0, last: 99}}")
-        open_film(film, may_exist=False, resume=True, shared=None)
-        for number in drive_frames(film, film.frames.numbers):
-            scene = build(read_scene(film.of(number) / RESULT))
-            yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
+        numbers = film.frames.numbers
+        with open_film(film, None, numbers, overwrite=False, resume=True):
+            for number in drive_frames(film, numbers):
+                scene = build(read_scene(film.of(number) / RESULT))
+                yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
 
 
 def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict[str, Any]:
@@ -83,13 +90,18 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
     finally:
         record = _report(film)
     if exported is not None:
-        (film.path / SEQUENCE).mkdir(exist_ok=True)
-        for number in film.done():
-            files = sorted((film.of(number) / "volumes").glob("*.npz"))
-            fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
-            path = film.path / SEQUENCE / f"film_{number:04d}.{exported}"
-            write_fields(path, fields, np.array(film.grid.bounds_xyz))
+        with film.claim():
+            _export(film, exported)
     return record
+
+
+def _export(film: Film, kind: str) -> None:
+    (film.path / SEQUENCE).mkdir(exist_ok=True)
+    for number in film.done():
+        files = sorted((film.of(number) / "volumes").glob("*.npz"))
+        fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
+        path = film.path / SEQUENCE / f"film_{number:04d}.{kind}"
+        write_fields(path, fields, np.array(film.grid.bounds_xyz))
 
 
 def share_out(numbers: Sequence[int]) -> Sequence[int]:
@@ -99,7 +111,7 @@ def share_out(numbers: Sequence[int]) -> Sequence[int]:
 
 
 def _report(film: Film) -> dict[str, Any]:
-    with film.lock:  # the last of several parts to come knows of all that are done
+    with film.claim():  # the last of several parts to come knows of all that are done
         return write_film_report(film)
 
 
@@ -109,7 +121,7 @@ def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
     A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
     again, its error is raised when all others are done.
     """
-    with film.lock:
+    with film.claim():
         calibrate(film)
     failed = dict[int, DdreconError]()
     for is_second in (False, True):
@@ -151,28 +163,27 @@ def calibrate(film: Film) -> None:
         for number, file in zip(numbers, files, strict=True)
     }
     folder = film.path / "calibration"
-    with claim_folder(folder, may_exist=True):
-        checkpoints = folder / CHECKPOINTS
-        checkpoints.mkdir(exist_ok=True)
-        if newest_checkpoint(checkpoints) is not None:
-            state, loaded = load_checkpoint(checkpoints, described)
-            together.restore(state)
-            continue_from(loaded)
+    checkpoints = folder / CHECKPOINTS
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    if newest_checkpoint(checkpoints) is not None:
+        state, loaded = load_checkpoint(checkpoints, described)
+        together.restore(state)
+        continue_from(loaded)
 
-        def make_iteration() -> str:
-            return f"PSNR {mean(row.psnr for row in together.step()):.1f} dB"
+    def make_iteration() -> str:
+        return f"PSNR {mean(row.psnr for row in together.step()):.1f} dB"
 
-        title = f"calibrate by {len(numbers)} frames"
-        saved = Checkpoints(folder, described)
-        advance(together, make_iteration, saved, film.is_quiet, title)
-        for number, run in zip(numbers, together.runs, strict=True):
-            grid = run.problem.scene.volume.grid
-            for p in run.parameters:
-                if p.is_field:
-                    write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
-        write_shared(path, together, numbers)
-        for file in checkpoints.iterdir():
-            file.unlink()
+    title = f"calibrate by {len(numbers)} frames"
+    saved = Checkpoints(folder, described)
+    advance(together, make_iteration, saved, film.is_quiet, title)
+    for number, run in zip(numbers, together.runs, strict=True):
+        grid = run.problem.scene.volume.grid
+        for p in run.parameters:
+            if p.is_field:
+                write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
+    write_shared(path, together, numbers)
+    for file in checkpoints.iterdir():
+        file.unlink()
     film.shared = read_shared(path)
 
 
@@ -180,13 +191,13 @@ def _drive_frame(film: Film, number: int, is_second: bool) -> None:
     """Finishes the frame `number`, from where it was, or anew where it `is_second` time."""
     folder = film.of(number)
     if number not in film.done():
-        resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
-        known = folder / "scene.yaml"
-        scene_file = read_scene(known) if resume else film.scene_of(number, is_second)
-        parts = film.build(scene_file), scene_file, folder, film.environment
-        with open_run(*parts, may_exist=True, resume=resume) as (run, run_folder):
+        with claim_folder(folder, RUN, overwrite=True) as claimed:
+            resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
+            scene_file = read_scene(folder / SCENE) if resume else film.scene_of(number, is_second)
+            parts = film.build(scene_file), scene_file, claimed, film.environment
+            run, run_folder = open_run(*parts, resume=resume)
             drive_run(run, run_folder, film.preview_every, film.is_quiet, f"frame {number}")
-        (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
+            (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(folder, VELOCITY).is_file():
         film.write_velocity(number)
 

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
 from torch import Tensor
+from tqdm import tqdm
 
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.film.shared import SHARED, fix, read_shared
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import refusals, write_json
+from ddrecon.io.files.atomic import note_written, write_json
+from ddrecon.io.files.folders import FILM, RUN, Folder, claim_folder, hold
 from ddrecon.io.volumes.table import read_field
 from ddrecon.numerics.flow import carry, find_flow
-from ddrecon.run.checkpoint import differences
-from ddrecon.run.run_folder import field_key, remove_files, remove_run, volume_file, write_volume
+from ddrecon.run.checkpoint import require_same
+from ddrecon.run.run_folder import SCENE, SUMMARY, field_key, volume_file, write_scene, write_volume
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_volume import build_media
 from ddrecon.scene_file.frames import at_frame, require_frames
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_described, read_scene
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    read_described,
+    read_scene,
+    referenced_files,
+)
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
@@ -38,15 +47,10 @@ FARTHEST = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
+PART = "part"
+"""What the locks of parts are called, `part.0000-0011.lock`."""
 SEQUENCE = "sequence"
 """The folder of exported volumes, `film_0000.vdb` and so on."""
-FILM_FILES = (
-    *("scene.yaml", "film.json", "report.html", "movie.png"),
-    *(SHARED, f"{SHARED}.lock", "shared.lights.*", f"{SEQUENCE}/film_[0-9]*.*"),
-    *("calibration/checkpoints/*.pt", "calibration/[0-9]*/volumes/*.npz"),
-    *("frames/[0-9]*/start/volumes/*.npz", f"frames/[0-9]*/volumes/{VELOCITY}.npz"),
-)
-"""What files of a film are called, but for those of its frames' runs."""
 
 
 @dataclass
@@ -65,16 +69,6 @@ class Film:
     is_quiet: bool = True
     shared: dict[str, Any] = field(default_factory=dict)
 
-    def choose(self, part: str | None) -> list[int]:
-        """The frames that `part` names, `A:B`, both among them; None is all. Raises UsageError."""
-        ends = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
-        first, last = (ends[1] or 0, ends[2] or self.frames.last) if ends else (1, 0)
-        chosen = [number for number in self.frames.numbers if int(first) <= number <= int(last)]
-        if not chosen:
-            whole = f"{self.frames.first}:{self.frames.last}"
-            raise UsageError(f"--frames {part}: names no frame; expected a part of {whole}")
-        return chosen
-
     @property
     def frames(self) -> FramesSection:
         """Which frames there are."""
@@ -87,18 +81,24 @@ class Film:
         media = build_media(self.scene_file, torch.float32, torch.device("cpu"))
         return next(iter(media.values())).grid
 
-    @cached_property
-    def lock(self) -> FileLock:
-        """Held by the one of several parts that calibrates, or reports."""
-        return FileLock(self.path / f"{SHARED}.lock", fallback_to_soft=False)
+    def claim(
+        self, *, overwrite: bool = False, resume: bool = True
+    ) -> AbstractContextManager[Folder]:
+        """Its folder for the one of several parts that begins, calibrates or reports."""
+        tell = self._tell if resume else None
+        return claim_folder(self.path, FILM, overwrite=overwrite, resume=resume, tell=tell)
+
+    def _tell(self, line: str) -> None:
+        if not self.is_quiet:
+            tqdm.write(line, file=sys.stderr)
 
     def of(self, number: int) -> Path:
         """The folder of the run of the frame `number`."""
         return self.path / "frames" / f"{number:04d}"
 
     def done(self) -> list[int]:
-        """The frames that are finished: the report of each is written last."""
-        return [n for n in self.frames.numbers if (self.of(n) / "report.html").is_file()]
+        """The frames that are finished."""
+        return [n for n in self.frames.numbers if (self.of(n) / SUMMARY).is_file()]
 
     def calibrated(self, number: int) -> Path:
         """The folder of the volumes that the frame `number` had in the calibration."""
@@ -180,8 +180,9 @@ class Film:
             return
         motion = self._flow(before[-1], number) * self._cell
         for each in (number, before[-1]):
-            if not volume_file(self.of(each), VELOCITY).is_file():
-                write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
+            with claim_folder(self.of(each), RUN, resume=True, tell=self._tell):
+                if not volume_file(self.of(each), VELOCITY).is_file():
+                    write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
 
     def _velocity(self, number: int) -> Tensor | None:
         """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
@@ -194,58 +195,98 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
-def finished_frames(
-    path: Path, part: str | None, build: Callable[[SceneFile], Scene]
-) -> list[Path]:
+def choose_frames(numbers: Sequence[int], part: str | None) -> list[int]:
+    """Those of the frames `numbers` that `part` names, `A:B`, both among them; None is all.
+
+    Raises UsageError where there are none.
+    """
+    ends = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
+    first, last = (ends[1] or 0, ends[2] or numbers[-1]) if ends else (1, 0)
+    chosen = [number for number in numbers if int(first) <= number <= int(last)]
+    if not chosen:
+        whole = f"{numbers[0]}:{numbers[-1]}"
+        raise UsageError(f"--frames {part}: names no frame; expected a part of {whole}")
+    return chosen
+
+
+def finished_frames(path: Path, part: str | None) -> list[Path]:
     """The runs of those frames of the film in the folder `path` that are done, of a `part` of it.
 
     Raises UsageError where there are none.
     """
-    film = Film(read_scene(path / "scene.yaml"), path, build)
-    done = film.done()
-    found = [film.of(number) for number in film.choose(part) if number in done]
-    if not found:
-        raise UsageError(f"{path}: no such frame is done")
-    return found
+    finished = (file.parent for file in path.glob(f"frames/*/{SUMMARY}"))
+    runs = {int(run.name): run for run in finished if run.name.isdecimal()}
+    if not runs:
+        raise UsageError(f"{path}: no frame is done")
+    return [runs[number] for number in choose_frames(sorted(runs), part)]
 
 
-def open_film(film: Film, *, may_exist: bool, resume: bool, shared: Path | None) -> None:
-    """Prepares the folder of `film`, whose calibration may be `shared` from a file.
+@contextmanager
+def open_film(
+    film: Film,
+    part: str | None,
+    numbers: Sequence[int],
+    *,
+    overwrite: bool,
+    resume: bool,
+    shared: Path | None = None,
+) -> Iterator[None]:
+    """Prepares the folder of `film`, of whose frames a `part` is asked for.
 
-    What an earlier one has left there is removed, unless this one is to `resume` it. Raises
-    UsageError for a folder that is not empty, unless it may be, or that holds another film;
-    SceneError where pictures are missing, or nothing is optimized.
+    Its calibration may be `shared` from a file. Until the block ends no other process does any of
+    the frames `numbers`. What an earlier film has left there, of that part, is removed, unless this
+    one is to `resume` it. Raises UsageError for a folder that holds something else, or another
+    film; SceneError where pictures are missing, or nothing is optimized.
     """
     scene_file, path = film.scene_file, film.path
     if not any(kind_of(name).is_cellwise for name in film.optimized):
         what = "optimize.parameters: none changes from frame to frame; name one, such as density"
         raise SceneError(f"{scene_file.path}: {what}")
     require_frames(scene_file)
-    known = path / "scene.yaml"
+    known = path / SCENE
     given = None if shared is None else read_shared(shared)
-    with refusals(path):
-        path.mkdir(parents=True, exist_ok=True)
-    if resume and known.is_file():
-        there, now = describe(read_scene(known)), describe(scene_file)
-        for scene in (there, now):
-            scene.pop("frames", None)  # a film may grow
-            scene.get("optimize", {}).pop("iterations", None)
-        if changes := differences(there, now):
-            what = f"{path}: holds another film; use another output folder"
-            raise UsageError([f"{what}: {change}" for change in changes])
-    elif not resume:
-        if any(path.iterdir()) and not may_exist:
-            raise UsageError(
-                f"{path}: the folder is not empty; choose another, or say --overwrite or --resume"
-            )
-        for frame in path.glob("frames/[0-9]*"):
-            remove_run(frame, scene_file)
-        remove_files(path, FILM_FILES, [scene_file.path, *([shared] if shared else [])])
-    if given is not None:
-        if (path / SHARED).is_file() and read_shared(path / SHARED)["values"] != given["values"]:
-            raise UsageError(f"{path / SHARED}: holds another calibration; leave --shared out")
-        write_json(path / SHARED, given)
-    dump_scene(describe(scene_file), known)
+    with ExitStack() as stack:
+        with film.claim(overwrite=overwrite, resume=resume) as folder:
+            chosen = choose_frames(film.frames.numbers, part)
+            _require_free(path, numbers if resume else chosen)
+            if numbers:
+                lock = path / f"{PART}.{numbers[0]:04d}-{numbers[-1]:04d}.lock"
+                stack.enter_context(hold(lock))
+            is_same = (resume or part is not None) and known.is_file()
+            if is_same:
+                _require_same_film(path, describe(read_scene(known)), describe(scene_file))
+            write_scene(scene_file, path)
+            if not resume:
+                frames = [f"frames/{number:04d}/" for number in chosen]
+                frames += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
+                kept = [known, scene_file.path, *referenced_files(scene_file)]
+                kept += [] if shared is None else [shared]
+                folder.clear(kept, frames if is_same else [""])
+            if given is not None:
+                taken = path / SHARED
+                if taken.is_file() and read_shared(taken)["values"] != given["values"]:
+                    raise UsageError(f"{taken}: holds another calibration; leave --shared out")
+                write_json(taken, given)
+            for number in film.frames.numbers:
+                note_written(film.of(number), "/")
+        yield
+
+
+def _require_same_film(path: Path, there: dict[str, Any], now: dict[str, Any]) -> None:
+    for scene in (there, now):
+        scene.pop("frames", None)  # a film may grow
+        scene.get("optimize", {}).pop("iterations", None)
+    what = f"{path}: holds another film; use another output folder"
+    require_same(there, now, what)
+
+
+def _require_free(path: Path, numbers: Sequence[int]) -> None:
+    """Raises UsageError where another process does one of the frames `numbers` of the film."""
+    for lock in path.glob(f"{PART}.*.lock"):
+        ends = re.fullmatch(r"([0-9]+)-([0-9]+)", lock.name.split(".")[1])
+        if ends and any(int(ends[1]) <= number <= int(ends[2]) for number in numbers):
+            with hold(lock):
+                pass
 
 
 def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:

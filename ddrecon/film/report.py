@@ -18,10 +18,8 @@ from ddrecon.io.images.table import read_image, webp_of, write_animation
 from ddrecon.pictures import srgb
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
-    ALIVE,
     captioned,
     embed,
-    page_text,
     paragraph,
     scrub,
     section,
@@ -31,8 +29,9 @@ from ddrecon.report.page import (
 )
 from ddrecon.report.pictures import pixels, shrink
 from ddrecon.run.report import registered_text
+from ddrecon.run.run_folder import REPORT, SUMMARY
 
-RECORD, REPORT, MOVIE = "film.json", "report.html", "movie.png"
+RECORD, MOVIE = "film.json", "movie.png"
 KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
 """What of a run's summary is kept of each frame."""
 SHOWN = 48
@@ -45,7 +44,7 @@ def write_film_report(film: Film) -> dict[str, Any]:
     """What `film.json` says of the frames that are done; writes it, a page and a movie."""
     rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
     for number in film.done():
-        summaries[number] = json.loads((film.of(number) / "summary.json").read_text())
+        summaries[number] = json.loads((film.of(number) / SUMMARY).read_text())
         row = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
         registered = summaries[number].get("registered", {})
         row |= {f"registered_{key}": value for key, value in registered.items()}
@@ -59,23 +58,15 @@ def write_film_report(film: Film) -> dict[str, Any]:
         if found.get("values"):
             sections += [section("Calibration", *_calibration(film.shared))]
         title = f"ddrecon: {film.path.absolute().name}"
-        write_page(film.path / REPORT, title, _lead(record), sections, is_alive=True)
+        goes_on = len(rows) < record["asked"]
+        path, lead = film.path / REPORT, _lead(record)
+        write_page(path, title, lead, sections, is_alive=True, goes_on=goes_on)
     return record
 
 
 def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
     """The `record` of a film in `folder`, as lines."""
     return [_lead(record), f"volumes and all else written to {folder}"]
-
-
-def film_page(folder: Path) -> str:
-    """The page of the film in `folder`, alive as long as frames are missing."""
-    if not (folder / REPORT).is_file():
-        return page_text(f"ddrecon: {folder.name}", "just begun", [], is_alive=True, state=ALIVE)
-    record = json.loads((folder / RECORD).read_text())
-    text = (folder / REPORT).read_text(encoding="utf-8")
-    is_done = len(record["frames"]) == record["asked"]
-    return text if is_done else text.replace("<body", f"<body {ALIVE}", 1)
 
 
 def _lead(record: Mapping[str, Any]) -> str:

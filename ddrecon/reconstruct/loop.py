@@ -93,7 +93,7 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
-        _compile_ahead(lambda: deepcopy(self)._iterate(start))
+        _compile_ahead(lambda: self.copy_for_rehearsal()._iterate(start))
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -109,6 +109,16 @@ class Reconstruction:
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
             raise
+
+    def copy_for_rehearsal(self) -> Reconstruction:
+        """A copy that shares its pictures alone: they are large, and no kernel makes anything of
+        them.
+        """
+        level = self.level
+        views = *self.problem.scene.views, *level.train.views, *level.test.views
+        pictures = [picture for view in views for picture in (view.image, view.mask)]
+        targets = *level.targets.values(), *level.test_targets.values()
+        return deepcopy(self, {id(shared): shared for shared in (*pictures, *targets)})
 
     def _iterate(self, start: float) -> Row:
         """One iteration, begun at `start` [s]."""

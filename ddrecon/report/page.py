@@ -15,14 +15,14 @@ from typing import Any
 from ddrecon.io.files.atomic import replace_file
 
 ASSETS = resources.files("ddrecon.report") / "assets"
-SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "film.js", "page.js", "live.js")
+SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "film.js", "page.js")
 """What makes a page alive, in the order in which one needs the other."""
-ALIVE = "data-live"
-"""The attribute of the body of a page that asks for itself again and again."""
+REFRESH = '<meta http-equiv="refresh" content="30">'
+"""What has a browser load a page again and again."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\
-<title>{title}</title><style>{style}</style></head>
+{refresh}<title>{title}</title><style>{style}</style></head>
 <body{state}>
 <h1>{title}</h1>
 <p id="lead">{lead}</p>
@@ -32,21 +32,36 @@ PAGE = """<!doctype html>
 
 
 def write_page(
-    path: Path, title: str, lead: str, sections: Sequence[str], *, is_alive: bool = False
+    path: Path,
+    title: str,
+    lead: str,
+    sections: Sequence[str],
+    *,
+    is_alive: bool = False,
+    goes_on: bool = False,
 ) -> None:
-    """Writes the page of `sections` under `title`, and `lead`, a sentence, to `path`."""
-    text = page_text(title, lead, sections, is_alive=is_alive)
+    """Writes the page of `sections` under `title`, and `lead`, a sentence, to `path`.
+
+    While the job `goes_on` that it is about, browsers load it again and again.
+    """
+    text = page_text(title, lead, sections, is_alive=is_alive, refresh=REFRESH if goes_on else "")
     with replace_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="replace")
 
 
 def page_text(
-    title: str, lead: str, sections: Sequence[str], *, is_alive: bool = False, state: str = ""
+    title: str,
+    lead: str,
+    sections: Sequence[str],
+    *,
+    is_alive: bool = False,
+    state: str = "",
+    refresh: str = "",
 ) -> str:
     """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures.
 
-    `state` are attributes of its body. With `data-live`, scripts ask for the page again and again,
-    and take up what is new; with `class="small"`, it is laid out for a frame within another page.
+    `state` are attributes of its body: with `class="small"`, it is laid out for a frame within
+    another page. `refresh` is nothing, or `REFRESH`.
     """
     style, *scripts = (
         (ASSETS / name).read_text(encoding="utf-8")
@@ -54,6 +69,7 @@ def page_text(
     )
     return PAGE.format(
         state=f" {state}" if state else "",
+        refresh=refresh,
         title=escape(title),
         style=style,
         lead=escape(lead),

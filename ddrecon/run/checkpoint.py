@@ -29,6 +29,8 @@ LAST, PREVIOUS = "last.pt", "previous.pt"
 ANEW = "start anew with --overwrite"
 UNUSABLE = f"not a usable checkpoint; {ANEW}"
 """What is wrong with a damaged checkpoint, and what to do."""
+MOST = 5
+"""Differences that are named."""
 LONGEST = 80
 """Values of more characters are cut short where they are shown."""
 ABSENT = object()
@@ -51,13 +53,6 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return next((folder / name for name in (LAST, PREVIOUS) if (folder / name).is_file()), None)
 
 
-def require_checkpoint(folder: Path) -> None:
-    """Raises UsageError where there is no checkpoint in `folder`."""
-    if newest_checkpoint(folder) is None:
-        what = "there is no checkpoint to resume from; run without --resume"
-        raise UsageError(f"{folder / LAST}: {what}")
-
-
 def load_checkpoint(
     folder: Path, scene: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, Any], Path]:
@@ -67,7 +62,8 @@ def load_checkpoint(
     neither can be used, UsageError if there is none or it is not of `scene` (None: of any).
     """
     last, previous = folder / LAST, folder / PREVIOUS
-    require_checkpoint(folder)
+    if newest_checkpoint(folder) is None:
+        raise UsageError(f"{last}: there is no checkpoint to resume from; run without --resume")
     try:
         return _load(last, scene), last
     except FormatError as error:
@@ -115,13 +111,9 @@ def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
         raise FormatError(
             path, f"a checkpoint of format {written}; this version reads {FORMAT}; {ANEW}"
         )
-    if scene is not None and (changes := differences(content["scene"], scene)):
-        raise UsageError(
-            [
-                f"{path}: belongs to another scene: {change}; use another output folder"
-                for change in changes
-            ]
-        )
+    if scene is not None:
+        what = f"{path}: belongs to another scene; use another output folder"
+        require_same(content["scene"], scene, what)
     return dict(content["state"])
 
 
@@ -138,18 +130,22 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def differences(old: Any, new: Any) -> list[str]:
-    """The differences between two trees of mappings, lists and plain values, a text for each.
+def require_same(old: Any, new: Any, what: str) -> None:
+    """Raises UsageError, of `what` is wrong, unless two trees of plain values are the same.
 
-    A text reads `key.path is A there, B now`.
+    Its lines read `what: key.path is A there, B now`.
     """
     one, other = _leaves(old, ""), _leaves(new, "")
     pairs = {path: (one.get(path, ABSENT), other.get(path, ABSENT)) for path in one | other}
-    return [
-        f"{path[1:]} is {_shorten(there)} there, {_shorten(now)} now"
+    changes = [
+        f"{what}: {path[1:]} is {_shorten(there)} there, {_shorten(now)} now"
         for path, (there, now) in pairs.items()
         if there != now
     ]
+    if len(changes) > MOST:
+        changes[MOST:] = [f"{what}: {len(changes) - MOST} more differ"]
+    if changes:
+        raise UsageError(changes)
 
 
 def _leaves(tree: Any, path: str) -> dict[str, Any]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
-from ddrecon.io.files.folders import claim_folder
+from ddrecon.io.files.folders import Folder
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
@@ -22,47 +21,43 @@ from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.run.report import registered_text
-from ddrecon.run.run_folder import CHECKPOINTS, Checkpoints, RunFolder, remove_run
+from ddrecon.run.run_folder import CHECKPOINTS, SCENE, Checkpoints, RunFolder, write_scene
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, describe, dump_scene
+from ddrecon.scene_file.load import SceneFile, referenced_files
 from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
 """What the progress bar of a run is called that is no frame of a film."""
 
 
-@contextmanager
 def open_run(
     scene: Scene,
     scene_file: SceneFile,
-    path: Path,
+    claimed: Folder,
     environment: dict[str, Any],
     *,
-    may_exist: bool,
     resume: bool,
-) -> Iterator[tuple[Reconstruction, RunFolder]]:
-    """A run of `scene` and its folder `path`, this process's alone until the block ends.
+) -> tuple[Reconstruction, RunFolder]:
+    """A run of `scene`, and what writes its folder, which is `claimed`.
 
     The resolved scene and the `environment` are written there; what an earlier run has left there
-    is removed, unless this one is to `resume` it. Raises UsageError for a folder that another
-    process writes to or that is not empty, unless it may be or the run goes on from the checkpoint
-    in it; SceneError for a scene that cannot be reconstructed.
+    is removed, unless this one is to `resume` it. Raises UsageError where there is no checkpoint to
+    resume from, SceneError for a scene that cannot be reconstructed.
     """
-    run = _begin(scene, scene_file)
+    run, path = _begin(scene, scene_file), claimed.path
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
-    with claim_folder(path, may_exist=may_exist or resume):
-        if loaded is None:
-            remove_run(path, scene_file)
-        of_run = {"seed": run.seed, "engines": engine_of_scene(scene)}
-        folder = RunFolder(path, scene_file, result_of, environment | of_run)
-        if loaded is None:
-            folder.start(run)
-        else:
-            folder.resume(run, loaded)
-        dump_scene(describe(scene_file), path / "scene.yaml")
-        write_json(path / "environment.json", folder.environment)
-        yield run, folder
+    write_scene(scene_file, path)
+    if loaded is None:
+        claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])
+    of_run = {"seed": run.seed, "engines": engine_of_scene(scene)}
+    folder = RunFolder(path, scene_file, result_of, environment | of_run)
+    if loaded is None:
+        folder.start(run)
+    else:
+        folder.resume(run, loaded)
+    write_json(path / "environment.json", folder.environment)
+    return run, folder
 
 
 def _begin(scene: Scene, scene_file: SceneFile) -> Reconstruction:
@@ -127,7 +122,15 @@ def drive_run(
     advance(run, make_iteration, folder, is_quiet, title)
     # What is left the first rank does by itself.
     leave_ranks()
-    return folder.finish(run)
+
+    def show(views: Sequence[Any], what: str) -> Iterable[Any]:
+        return tqdm(views, desc=what, leave=False, **bar_settings(is_quiet))
+
+    try:
+        return folder.finish(run, show)
+    except KeyboardInterrupt:
+        made = f"after {run.iteration} iterations"
+        raise KeyboardInterrupt(f"{made}; write its results with --resume") from None
 
 
 def advance(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.pictures.scales import COMPARED, LINEAR
+from ddrecon.progress import Progress
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes
 from ddrecon.reconstruct.setup import choose_loss, targets_of
@@ -37,30 +38,32 @@ class Findings:
     quality: Mapping[str, Mapping[str, Any]]
 
 
-def find_results(run: Reconstruction, registers: bool = False) -> Findings:
-    """What `run` has found so far, rendered; it `registers` views held out where that is said."""
+def find_results(run: Reconstruction, progress: Progress | None = None) -> Findings:
+    """What `run` has found so far, rendered; views held out are registered with a `progress`."""
     scene = run.current_scene()
     shown = [view for view in scene.views if view.image is not None]
     targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
-    images, quality = {}, {}
+    images, quality = dict[str, Tensor](), dict[str, dict[str, Any]]()
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
         for view in shown:
             target, sizes = targets[view.name], response_sizes(run.parameters)
-            fitted, registered = dict[str, Tensor](), dict[str, Any]()
+            fitted = dict[str, Tensor]()
             picture = view_picture(light_field, scene, view)
             if view.is_test:
                 picture, fitted = fit_held_out(picture, view, target, sizes)
-                if registers:
-                    registered["registered"] = register(light_field, scene, view, target, sizes)
             images[view.name] = picture
             quality[view.name] = {
                 "split": "test" if view.is_test else "train",
                 "psnr": float(target.psnr_of(picture)),
                 "ssim": float(target.ssim_of(picture)),
                 **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
-                **registered,
             }
+        held_out = [view for view in shown if view.is_test]
+        for view in progress(held_out, "register") if progress and held_out else ():
+            target = targets[view.name]
+            registered = register(light_field, scene, view, target, response_sizes(run.parameters))
+            quality[view.name]["registered"] = registered
     return Findings(scene, _given_fields(run.problem.scene), images, quality)
 
 

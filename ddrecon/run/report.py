@@ -45,6 +45,8 @@ SHOWN = 24
 """Views whose pictures are on the page; all are in the folder."""
 PIXELS = 1_200_000
 """So many pixels all pictures of views have together, at most."""
+GOES_ON = {"kind": "running", "text": "goes on"}
+"""How a run has `ended` that has not."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
 
@@ -72,7 +74,8 @@ def write_run_report(
         section("Versions", versions(known)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
-    write_page(path, title, _lead(scene, summary), sections, is_alive=True)
+    goes_on = summary["ended"]["kind"] == GOES_ON["kind"]
+    write_page(path, title, _lead(scene, summary), sections, is_alive=True, goes_on=goes_on)
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:

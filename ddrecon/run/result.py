@@ -23,7 +23,10 @@ RESULT = "result.yaml"
 
 def require_no_film(folder: Path, more: str = "") -> None:
     """Raises UsageError where `folder` is that of a film, not of a run; it says `more` to do."""
-    if frames := sorted(folder.glob(f"frames/*/{RESULT}")):
+    from ddrecon.io.files.folders import FILM, kind_of_folder
+
+    frames = sorted(folder.glob(f"frames/*/{RESULT}"))
+    if frames and kind_of_folder(folder) == FILM:
         what = f"is the folder of a film; name that of a frame, such as {frames[0].parent}"
         raise UsageError(f"{folder}: {what}{more}")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import mean
 from time import monotonic
@@ -13,11 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import SceneError, UsageError
+from ddrecon.errors import FormatError, UsageError, is_utf8
 from ddrecon.grid import Grid
-from ddrecon.io.files.atomic import flush, refusals, remove_temporaries, write_json
+from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
+from ddrecon.progress import Progress
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.reconstruct.together import Together
@@ -32,13 +33,19 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import write_run_report
+from ddrecon.run.report import GOES_ON, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
-from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
+from ddrecon.scene_file.load import (
+    SceneFile,
+    describe,
+    dump_scene,
+    read_scene,
+    referenced_files,
+    scene_text,
+)
 from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
-    FIELDS,
     PHASE,
     RESPONSE,
     is_of_volume,
@@ -47,12 +54,16 @@ from ddrecon.variables.kinds import (
 )
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
-CHECKPOINTS = "checkpoints"
-"""Where a run folder keeps its checkpoints."""
+CHECKPOINTS, SCENE = "checkpoints", "scene.yaml"
+"""Where a run folder keeps its checkpoints, and its resolved scene."""
 CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
+PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
+"""Its report is written about this often, and takes at most this part of its time."""
+REPORT, SUMMARY = "report.html", "summary.json"
+"""Its page, and what is written last of all: a run that has it is finished."""
 
 
 def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
@@ -71,7 +82,7 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
 def require_run(folder: Path) -> Path:
     """The folder of checkpoints of the run in `folder`; raises UsageError where there is no run."""
     checkpoints = folder / CHECKPOINTS
-    if not (folder / "scene.yaml").is_file() or newest_checkpoint(checkpoints) is None:
+    if not (folder / SCENE).is_file() or newest_checkpoint(checkpoints) is None:
         raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
     return checkpoints
 
@@ -119,9 +130,8 @@ class RunFolder(Checkpoints):
         with refusals(path):
             for name in ("volumes", "previews", CHECKPOINTS):
                 (path / name).mkdir(exist_ok=True)
-                remove_temporaries(path / name)
-            remove_temporaries(path)
         self.log = LossLog(path / "loss.csv")
+        self.next_page = monotonic() + PAGE_SECONDS
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run."""
@@ -142,14 +152,31 @@ class RunFolder(Checkpoints):
         flush(self.log.path)
         super().save(run)
 
+    def save_in_time(self, run: Reconstruction | Together) -> None:
+        """As of all checkpoints; and has the report say how far the run is, unless that is new."""
+        super().save_in_time(run)
+        # Where ranks share cells, all of them would have to render.
+        if isinstance(run, Reconstruction) and run.iteration and not cells_are_shared():
+            start = monotonic()
+            if start >= self.next_page:
+                found = find_results(run)
+                summary = _summary(run) | {"ended": GOES_ON}
+                self._report(found, summary | {"views": found.quality, "diagnoses": []})
+                seconds = monotonic() - start
+                self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
+
+    def _report(self, found: Findings, summary: Mapping[str, Any]) -> None:
+        rows = self.log.rows(summary["iterations"])
+        write_run_report(self.path / REPORT, found, rows, summary, self.environment)
+
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         self._pictures(find_results(run), f".{run.iteration:06d}")
 
-    def finish(self, run: Reconstruction) -> dict[str, Any]:
+    def finish(self, run: Reconstruction, progress: Progress) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        found = find_results(run, registers=True)
+        found = find_results(run, progress)
         scene = found.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
@@ -163,8 +190,8 @@ class RunFolder(Checkpoints):
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
-        write_json(self.path / "summary.json", summary)
-        write_run_report(self.path / "report.html", found, rows, summary, self.environment)
+        self._report(found, summary)
+        write_json(self.path / SUMMARY, summary)
         return summary
 
     def _store(self, scene: Scene, name: str) -> Any:
@@ -207,6 +234,23 @@ class RunFolder(Checkpoints):
             if view.image is not None:
                 shown = comparison(view.image, found.images[view.name])
                 write_preview(folder / f"{view.name}{mark}.png", shown)
+
+
+def write_scene(scene_file: SceneFile, folder: Path) -> None:
+    """Writes the resolved scene to `folder`; UsageError where the scene file itself would go.
+
+    One that was written there, and not changed since, may be read and go. Raises FormatError for
+    files that no scene file can name.
+    """
+    path = folder / SCENE
+    for file in referenced_files(scene_file):
+        if not is_utf8(file):
+            raise FormatError(file, "cannot be named in scene.yaml: it is not UTF-8; rename it")
+    if path.resolve() == scene_file.path.resolve():
+        text = path.read_text(encoding="utf-8")
+        if text != scene_text(describe(read_scene(path))):
+            raise UsageError(f"{path}: was changed and would be replaced; name a copy elsewhere")
+    dump_scene(describe(scene_file), path)
 
 
 def field_key(name: str) -> str:
@@ -253,57 +297,3 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     if problem.support is not None:
         summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
     return summary
-
-
-CHECKPOINT_FILES = ("checkpoints/last.pt", "checkpoints/previous.pt")
-SAMPLE_FILES = (
-    *("uncertainty.json", "report.html", *CHECKPOINT_FILES),
-    *(f"volumes/*_{kind}.*" for kind in ("std", "mean", "explained")),
-    "samples/[0-9][0-9][0-9][0-9]/*",
-)
-"""What files of `ddrecon uncertainty` are called."""
-RUN_FILES = (
-    *("scene.yaml", "result.yaml", "environment.json", "parameters.json", "summary.json"),
-    *("loss.csv", "report.html", *CHECKPOINT_FILES),
-    *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
-    *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
-)
-"""What files of `ddrecon optimize` are called, but for those named after media and views."""
-
-
-def remove_samples(folder: Path) -> None:
-    """Removes what `ddrecon uncertainty` has written to `folder`; raises FormatError."""
-    remove_files(folder, SAMPLE_FILES, ())
-
-
-def remove_run(folder: Path, scene_file: SceneFile) -> None:
-    """Removes what `ddrecon optimize` has written to `folder`, but for what `scene_file` reads.
-
-    Raises FormatError where the system refuses.
-    """
-    kept = {path.resolve() for path in (scene_file.path, *referenced_files(scene_file))}
-    remove_files(folder, [*RUN_FILES, *_names_by_scene(folder)], kept)
-
-
-def _names_by_scene(folder: Path) -> Iterator[str]:
-    """Files named after the media and the views of the scene that the run in `folder` had."""
-    try:
-        tree = read_scene(folder / "scene.yaml").tree
-    except SceneError:
-        return
-    for medium in ("", *(f"{name}." for name in getattr(tree.volume, "media", ()))):
-        yield from (f"volumes/{medium}{name.removeprefix(PHASE)}.npz" for name in FIELDS)
-    yield from (f"previews/{view.name}.png" for view in tree.views)
-
-
-def remove_files(folder: Path, names: Iterable[str], kept: Iterable[Path]) -> None:
-    """Removes the files of these `names` in `folder`, and the folders within that this empties."""
-    with refusals(folder):
-        found = {path for name in names for path in folder.glob(name) if path.is_file()}
-        for path in found:
-            if path.resolve() not in kept:
-                path.unlink()
-    within = {parent for path in found for parent in path.parents if folder in parent.parents}
-    for parent in sorted(within, reverse=True):
-        with suppress(OSError):  # it holds something else
-            parent.rmdir()

@@ -289,7 +289,13 @@ def describe(scene_file: SceneFile) -> dict[str, Any]:
 
 def dump_scene(described: dict[str, Any], path: Path) -> None:
     """Writes what `describe` returns to `path` as YAML that `read_scene` reads as the same tree."""
-    text = yaml.dump(
+    with replace_file(path) as temporary:
+        temporary.write_text(scene_text(described), encoding="utf-8")
+
+
+def scene_text(described: dict[str, Any]) -> str:
+    """What `dump_scene` writes."""
+    text: str = yaml.dump(
         described,
         Dumper=_Dumper,
         sort_keys=False,
@@ -297,8 +303,7 @@ def dump_scene(described: dict[str, Any], path: Path) -> None:
         width=10**6,
         default_flow_style=None,
     )
-    with replace_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    return text
 
 
 def _plain(value: Any) -> Any:

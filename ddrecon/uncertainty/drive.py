@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -12,12 +11,13 @@ from tqdm import tqdm
 
 from ddrecon.errors import RanksError
 from ddrecon.interrupts import defer_interrupt
+from ddrecon.io.files.folders import Folder
 from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoint
-from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS, remove_samples
+from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS
 from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 from ddrecon.uncertainty.folder import write_found
@@ -40,13 +40,14 @@ class Request:
 
 
 def drive_uncertainty(
-    run: Reconstruction, path: Path, request: Request, *, resume: bool, is_quiet: bool
+    run: Reconstruction, claimed: Folder, request: Request, *, resume: bool, is_quiet: bool
 ) -> dict[str, Any]:
-    """What `uncertainty.json` says of `run`, its folder being `path`.
+    """What `uncertainty.json` says of `run`, its folder being the one that is `claimed`.
 
     An interrupt takes effect after an iteration of an experiment; `resume` goes on from there.
     """
     views = rank_views(run.level.train) if request.has_next_view else []
+    path = claimed.path
     described, checkpoints = _describe(run, request), path / CHECKPOINTS
     state, began = None, perf_counter()
     if resume:
@@ -54,7 +55,7 @@ def drive_uncertainty(
         continue_from(loaded)
         began -= state["seconds"]
     else:
-        remove_samples(path)
+        claimed.clear()
     for folder in (path / "volumes", checkpoints):
         folder.mkdir(exist_ok=True)
     found = _begin(run, from_first(state), request)

@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from ddrecon.io.files.atomic import write_json
+from ddrecon.io.files.folders import UNCERTAINTY, kind_of_folder
 from ddrecon.io.images.table import png_of
 from ddrecon.report.curve import draw_bars
 from ddrecon.report.page import items, paragraph, picture, section, table, write_page
@@ -19,7 +20,6 @@ from ddrecon.uncertainty.deviations import SHORT, Deviations, Field
 from ddrecon.variables.kinds import kind_of
 
 RECORD = "uncertainty.json"
-"""What tells a folder of this kind."""
 ASSUMED = (
     "Deviations are those of experiments: what was found was photographed, by more transport rounds"
     " than the run had, with the errors that its pictures had, and reconstructed by the same"
@@ -82,9 +82,8 @@ def _write(field: Field, stem: Path, name: str, value: Tensor) -> None:
 
 def volumes_in(folder: Path) -> list[Path]:
     """The volumes of the `folder` that `drive_uncertainty` wrote, in order; else none."""
-    if not (folder / RECORD).is_file():
-        return []
-    return sorted((folder / "volumes").glob("*.npz"))
+    is_sure = kind_of_folder(folder) == UNCERTAINTY
+    return sorted((folder / "volumes").glob("*.npz")) if is_sure else []
 
 
 def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:

@@ -1,13 +1,19 @@
 """`ddrecon check` says what a scene is and what physics it needs, and writes nothing."""
 
+import gc
 import json
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from click.testing import Result
 from small_scene import contents
+
+from ddrecon import Scene, load_scene
+from ddrecon.cli.check import supports_of
 
 Run = Callable[..., Result]
 
@@ -97,3 +103,19 @@ def test_every_command_tells_the_same_doubts(succeed: Run) -> None:
         ["uncertainty", "run", "-o", "sure", "--calibrate", "0"],
     ):
         assert succeed(*command).stderr.splitlines().count(told) == 1
+
+
+def test_no_pictures_of_a_film_are_kept(folder: Path) -> None:
+    """But what they show."""
+    pictures = list[weakref.ref[torch.Tensor]]()
+
+    def frames() -> Iterator[Scene]:
+        for _ in range(3):
+            scene = load_scene(folder / "scene.yaml")
+            pictures.extend(weakref.ref(v.image) for v in scene.views if v.image is not None)
+            yield scene
+
+    supports = supports_of(frames())
+    gc.collect()
+    assert len(supports) == 3 and all(support.shown[0].any() for support in supports)
+    assert pictures and not any(picture() is not None for picture in pictures)

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import chdir
 from itertools import chain, product
@@ -16,12 +17,14 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner, Result
+from small_scene import contents
 
 import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.film.drive import share_out, spread_out
-from ddrecon.film.folder import KEPT
+from ddrecon.film.folder import KEPT, Film
+from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.field import prune
 from ddrecon.io.volumes.table import field_names, read_field, write_field
 from ddrecon.reconstruct.divergence import NotFiniteError
@@ -138,7 +141,7 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
     # Each is a run as any other, and some are rendered together.
     succeed("render", "out", "-o", "seen", "--frames", "1:2", "--view", "side")
     succeed("render", "out/frames/0002", "-o", "one", "--view", "side")
-    assert sorted(path.name for path in Path("seen").iterdir()) == ["0001", "0002"]
+    assert {path.name for path in Path("seen").iterdir()} == {"0001", "0002", MANIFEST}
     np.testing.assert_array_equal(np.load("seen/0002/side.npy"), np.load("one/side.npy"))
     load_run(Path("out/frames/0002"), lambda dtype: load_scene("out/frames/0002/scene.yaml"))
     # Its calibration goes to another film.
@@ -398,7 +401,68 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     succeed(*advice.split(), "-q", "--frames", "0:0")
     assert Path("out/sequence/film_0000.vdb").is_file()
     beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
-    assert beyond.exit_code == 2 and "no such frame is done" in beyond.stderr
+    assert beyond.exit_code == 2 and "--frames 2:3: names no frame; expected" in beyond.stderr
+
+
+def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refuse) -> None:
+    """And nothing is touched while another process has that part, or where it is another film."""
+    few = *FEW, "-D", "frames.calibrate=0"
+    succeed(*optimize("-o", "out", "--frames", "0:1", "--export", "npz", *few))
+    before = contents(film / "out")
+    written = {f"{place}/{n}".removeprefix("./") for place in (".", *PLACES) for n in named(place)}
+    assert {name for name, data in before.items() if data is not None} <= written
+    for frame in ("0000", "0001"):
+        Path("out/frames", frame, "mine.txt").write_text("mine")
+    succeed(*optimize("-o", "out", "--frames", "1:1", "--overwrite", "--export", "npz", *few))
+    after = contents(film / "out")
+    first = [name for name in before if name.startswith("frames/0000")]
+    assert {name: before[name] for name in first} == {name: after[name] for name in first}
+    assert after.keys() == before.keys() | {f"{place}/mine.txt" for place in PLACES}
+    assert after["frames/0001/loss.csv"] != before["frames/0001/loss.csv"]
+    redo = optimize("-o", "out", "--frames", "1:1", "--overwrite", *few)
+    (line,) = refuse(2, *redo, "-D", "volume.albedo=0.5")
+    assert line.startswith("out: holds another film; use another output folder: volume.albedo")
+    for lock, what in (("part.0001-0003.lock", "out"), (f"frames/0001/{LOCK}", "out/frames/0001")):
+        with hold(Path("out", lock)):
+            for how in (redo, optimize("-o", "out", "--overwrite", *few)):
+                (line,) = refuse(2, *how)
+                assert line.startswith(f"{what}: process ") and "is writing there" in line
+    (line,) = refuse(2, "optimize", "scene.yaml", "-o", "out", "--overwrite")
+    assert line.startswith("out: is the folder of another kind of job, film")
+
+
+PLACES = "frames/0000", "frames/0001"
+
+
+def named(place: str) -> list[str]:
+    """The files that the manifest in a `place` of the film `out` names, and itself."""
+    return [MANIFEST, *(name for name in names_in(Path("out", place)) if name[-1] != "/")]
+
+
+def test_a_folder_that_is_no_films_is_left_alone(film: Path, run: Run, refuse: Refuse) -> None:
+    Path("foreign").mkdir()
+    Path("foreign/report.html").write_text("mine")
+    for how in ("--resume", "--overwrite"):
+        (line,) = refuse(2, *optimize("-o", "foreign", how, *FEW))
+        assert line.startswith("foreign: holds report.html, which ddrecon did not write")
+    with pytest.raises(ddrecon.UsageError, match="which ddrecon did not write"):
+        next(ddrecon.optimize_sequence("film.yaml", "foreign"))
+
+
+def test_a_part_that_waits_says_so(
+    film: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("ddrecon.io.files.folders.PATIENCE", 0.0)
+    part, told = Film(read_scene("film.yaml"), film / "out", build_scene, is_quiet=False), ""
+    Path("out").mkdir()
+    waiting = threading.Thread(target=lambda: part.claim().__enter__())
+    with part.claim():
+        waiting.start()
+        while not told:
+            waiting.join(0.01)
+            told = capsys.readouterr().err
+    waiting.join()
+    assert told.startswith(f"{film}/out: process ") and "waiting for it" in told
 
 
 def test_frames_are_spread_over_all() -> None:

@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+import threading
 
 import pytest
+
+from ddrecon.interrupts import defer_interrupt
 
 PRESS = """
 import importlib.abc, os, signal, sys
@@ -37,3 +40,17 @@ def test_an_interrupt_is_one_line(folder: object, moment: str) -> None:
     command = [sys.executable, "-c", PRESS + MOMENTS[moment]]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_other_threads_are_not_interrupted() -> None:
+    """As of whoever iterates over `optimize_sequence` in one: there are no signals there."""
+    asked = list[list[int]]()
+
+    def work() -> None:
+        with defer_interrupt() as numbers:
+            asked.append(numbers)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    worker.join()
+    assert asked == [[]]

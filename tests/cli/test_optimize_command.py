@@ -16,6 +16,7 @@ from small_scene import contents
 from ddrecon.reconstruct import tuning
 
 Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
 DensityOf = Callable[[str], np.ndarray]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
 COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr"]
@@ -31,7 +32,8 @@ def read_json(path: str) -> Any:
     return json.loads(Path(path).read_text())
 
 
-FILES = """scene.yaml result.yaml environment.json loss.csv parameters.json summary.json report.html
+FILES = """ddrecon.manifest scene.yaml result.yaml environment.json loss.csv parameters.json
+summary.json report.html
 volumes volumes/density.npz checkpoints checkpoints/last.pt checkpoints/previous.pt previews
 previews/density.slices.png previews/front.png previews/side.png"""
 
@@ -107,8 +109,8 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
-    names = "notes.txt", "volumes/mine.npz", "previews/mine.png"
-    for path in (Path("out", name) for name in (*names, "lights.1.radiance.npy")):
+    names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "lights.1.radiance.npy"
+    for path in (Path("out", name) for name in names):
         path.write_text(path.name)
     succeed(*OPTIMIZE, "out", "--overwrite")
     succeed(*OPTIMIZE, "fresh")
@@ -137,9 +139,20 @@ def test_overwriting_keeps_what_the_new_run_reads(
     succeed(*again, "--resume")
 
 
+def test_a_scene_file_of_the_users_own_stays(succeed: Run, refuse: Refuse) -> None:
+    """Even where it was a run's once."""
+    succeed(*OPTIMIZE, "out", "--iterations", "1")
+    with Path("out/scene.yaml").open("a") as stream:
+        stream.write("# why 4 iterations are enough\n")
+    for how in ("--overwrite", "--resume"):
+        (line,) = refuse(2, "optimize", "out/scene.yaml", "-q", "-o", "out", how)
+        assert line.startswith("out/scene.yaml: was changed and would be replaced")
+
+
 def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
     assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
+    assert "register: " in loud.stderr
     assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
 
 

@@ -26,7 +26,7 @@ def test_theirs_ours_and_the_difference(succeed: Run) -> None:
     report = json.loads(Path("out/reference.json").read_text())
     assert json.loads(result.stdout) == report
     files = {file for files in report["files"].values() for file in files}
-    assert files | {"reference.json"} == set(contents(Path("out")))
+    assert files | {"ddrecon.manifest", "reference.json"} == set(contents(Path("out")))
     assert report["settings"]["samples_per_pixel"] == 8 and report["settings"]["passes"] >= 4
     assert report["environment"]["mitsuba"] and report["environment"]["ddrecon"]
     for name, view in report["views"].items():
@@ -54,7 +54,7 @@ def test_views_are_targets(succeed: Run) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     succeed(*REFERENCE, "--views")
     names = [name.split(".") for name in contents(Path("out"))]
-    assert {name[0] for name in names} == {"front", "side", "reference"}
+    assert {name[0] for name in names} == {"ddrecon", "front", "side", "reference"}
     assert {len(name) for name in names} == {2}
     targets = ["-D", "views.0.image=out/front.npy", "-D", "views.1.image=out/side.png"]
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1", *targets)

@@ -11,6 +11,7 @@ from click.testing import Result
 from small_scene import SCENE
 
 from ddrecon.errors import SceneError
+from ddrecon.io.files.folders import FILM, MANIFEST
 from ddrecon.io.volumes.table import write_field
 
 Refuse = Callable[..., list[str]]
@@ -24,8 +25,9 @@ CHANGES = {
 }
 """What every command refuses, in place of its scene."""
 TABLE = """
-render scene.yaml -o full => 2 full: the folder is not empty; choose another, or say --overwrite
-optimize scene.yaml -o full => 2 full: the folder is not empty; choose another, or say --overwrite
+render scene.yaml -o full => 2 full: holds notes.txt, which ddrecon did not write; choose another
+optimize scene.yaml -o full --overwrite => 2 full: holds notes.txt, which ddrecon did not write;
+optimize scene.yaml -o . --overwrite => 2 .: holds bad.npz, which ddrecon did not write
 render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
@@ -36,7 +38,7 @@ render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
 optimize scene.yaml -o out --iterations 0 => 2 --iterations 0: optimize.iterations: must
 optimize scene.yaml -o out --iterations some => 2 --iterations some: optimize.iterations:
-optimize scene.yaml -o out --watch --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
+optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize done -o out => 2 done: a finished run leaves nothing to optimize; name its scene, done/sc
 optimize done/result.yaml -o out --iterations 9 => 2 done/result.yaml: a finished run leaves noth
@@ -44,7 +46,7 @@ optimize film -o out => 2 film: is the folder of a film; name that of a frame, s
 optimize scene.yaml -o out -D views.0.split=test => 2 scene.yaml: views: none has split: train and
 optimize scene.yaml -o out -D 'optimize.parameters={views.side.camera: {}}' => 2 scene.yaml: op
 optimize scene.yaml -o out --resume => 2 out/checkpoints/last.pt: there is no checkpoint to resume
-optimize scene.yaml -o full --resume => 2 full/checkpoints/last.pt: there is no checkpoint to resume
+optimize scene.yaml -o full --resume => 2 full: holds notes.txt, which ddrecon did not write
 check full => 2 full: holds no result.yaml, as `ddrecon optimize` writes it at its end; name a
 check begun => 2 begun: holds no result.yaml, as `ddrecon optimize` writes it at its end; finish
 check film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003
@@ -71,10 +73,9 @@ info film => 2 film: is the folder of a film; name that of a frame, such as film
 info front.txt => 3 front.txt: unknown image format '.txt'
 info bad.npz => 3 bad.npz: is damaged: File is not a zip file
 info gone.vol => 3 gone.vol: cannot be read
-watch . => 2 .: holds no run, as `ddrecon optimize -o` makes it
 uncertainty gone -o sure => 2 gone: holds no run
 uncertainty film -o sure => 2 film: is the folder of a film; name that of a frame, such as film/fr
-uncertainty full -o ./full => 2 Error: -o names the run itself
+uncertainty full -o ./full => 2 full: holds no run
 """
 
 
@@ -93,6 +94,7 @@ def test_what_cannot_be_done_is_refused(
     texts = dict.fromkeys(["full/notes.txt", "file", "front.txt", "bad.npz"], "mine")
     runs = "done/scene.yaml", "done/result.yaml", "film/frames/0003/result.yaml", "begun/scene.yaml"
     texts |= dict.fromkeys(runs, SCENE) | {"begun/loss.csv": ""}
+    texts |= {f"film/{MANIFEST}": f"ddrecon {FILM}\n"}
     for name, text in texts.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(text)
@@ -121,7 +123,7 @@ def test_a_run_cannot_go_on_as_another(refuse: Refuse, succeed: Callable[..., ob
     again = "optimize", "scene.yaml", "-o", "out", "--iterations", "2"
     succeed(*again)
     (line,) = refuse(2, *again, "--resume", "-D", "volume.g=0.1")
-    assert "belongs to another scene: volume.g is 0.3 there, 0.1 now" in line
+    assert "belongs to another scene; use another output folder: volume.g is 0.3 there" in line
     (line,) = refuse(2, *again[:-1], "1", "--resume")
     assert "2 iterations are made already" in line
     path = Path("out/checkpoints/last.pt")

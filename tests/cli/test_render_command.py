@@ -38,6 +38,7 @@ def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run)
     pytest.importorskip("OpenImageIO")
     succeed(*RENDER)
     assert set(contents(Path("out"))) == {
+        "ddrecon.manifest",
         "render.json",
         *(f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png")),
     }
@@ -73,7 +74,7 @@ def test_the_report(succeed: Run) -> None:
         if solve["kind"] == "forward"
     ] == [True, True]  # diffusion's own, and that of the round
     named = {file for files in report["files"].values() for file in files}
-    assert named | {"render.json"} == set(contents(Path("out")))
+    assert named | {"ddrecon.manifest", "render.json"} == set(contents(Path("out")))
     target = np.load("front.npy").astype(float)
     expected = 10 * np.log10(target.max() ** 2 / np.square(pixels("front") - target).mean())
     assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)

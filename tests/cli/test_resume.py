@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+from ddrecon.errors import UsageError
+from ddrecon.io.files.folders import LOCK, hold
 from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.report.page import REFRESH
+from ddrecon.run import drive, quality
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
@@ -66,6 +70,50 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     succeed(*OPTIMIZE, "parts", "--resume")
     assert iterations("parts") == [1, 2, 3, 4]
     assert np.array_equal(density_of("parts"), density_of("whole"))
+
+
+def test_a_run_interrupted_after_its_end_is_told_how_to_finish(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, quality, "register", 1)
+        result = run(*OPTIMIZE, "out")
+    told = "interrupted after 4 iterations; write its results with --resume\n"
+    assert (result.exit_code, result.stderr) == (130, told)
+    succeed(*OPTIMIZE, "out", "--resume")
+    assert Path("out/report.html").is_file()
+
+
+def test_the_report_is_there_while_a_run_goes_on(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Browsers load it again and again until then."""
+    monkeypatch.setattr("ddrecon.run.run_folder.PAGE_SECONDS", 0.0)
+    succeed(*OPTIMIZE, "whole")
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, Parameter, "step", 3)
+        assert run(*OPTIMIZE, "out").exit_code == 130
+    begun = Path("out/report.html").read_text()
+    assert "It goes on." in begun and REFRESH in begun
+    assert all(f'<section id="{name}">' in begun for name in ("volume", "loss", "views"))
+    succeed(*OPTIMIZE, "out", "--resume")
+    done = Path("out/report.html").read_text()
+    assert "It goes on." not in done and REFRESH not in done
+
+
+def test_what_is_resumed_is_read_once_no_other_process_can_write(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    succeed(*OPTIMIZE, "out")
+    load = drive.load_checkpoint
+
+    def load_locked(*arguments: Any) -> Any:
+        with pytest.raises(UsageError, match="is writing there"), hold(Path("out", LOCK)):
+            pass
+        return load(*arguments)
+
+    monkeypatch.setattr(drive, "load_checkpoint", load_locked)
+    succeed(*OPTIMIZE, "out", "--resume")
 
 
 def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:

@@ -4,6 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+import torch
+
+from ddrecon.cli.session import Session
+
 SCENE = "{volume: {bounds: 3, resolution: [1, 1], densty: 1}, views: [{camera: {}}]}"
 TABLE = """
 check missing.yaml
@@ -38,3 +43,20 @@ def test_errors_of_a_scene_file_need_no_torch(folder: Path) -> None:
     assert done.stderr == ""
     assert [line[1:] for line in done.stdout.splitlines()] == [" True"] * len(COMMANDS)
     assert [line[0] for line in done.stdout.splitlines()] == ["2"] * (len(COMMANDS) - 2) + ["3"] * 2
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version"])
+def test_results_that_cannot_be_written_are_one_line(argument: str) -> None:
+    command = [sys.executable, "-m", "ddrecon", argument]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    line = "cannot write: No space left on device\n"
+    assert (done.returncode, done.stderr) == (3, line)
+
+
+def test_threads_are_no_more_than_cores_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})
+    session = Session()
+    session.start()
+    assert session.threads == torch.get_num_threads() == 1

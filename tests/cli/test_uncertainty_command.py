@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
+from small_scene import contents
 from test_resume import press_ctrl_c_in
 
-from ddrecon.errors import DataWarning
+from ddrecon.io.files.folders import MANIFEST, names_in
 from ddrecon.io.volumes.table import field_names, read_field
-from ddrecon.run.live import LiveRun
-from ddrecon.run.run_folder import remove_samples
 from ddrecon.uncertainty.experiments import Uncertainty
 
 Run = Callable[..., Result]
@@ -62,8 +61,27 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
         "density_mean",
         "density_explained",
     }
-    remove_samples(Path("sure"))
-    assert not any(Path("sure").iterdir())
+
+
+def test_no_run_is_harmed(finished: Path, succeed: Run, refuse: Refuse) -> None:
+    """Nor is a folder made where there is nothing to go on with; what was written has its names."""
+    assert files_of("run") == set(names_in(finished))
+    (finished / "frames").mkdir()  # which makes no film of it
+    refuse(2, "uncertainty", "run", "-o", "sure", "--resume", *KNOWN)
+    for command in ("uncertainty run", "render scene.yaml"):
+        (line,) = refuse(2, *command.split(), "-o", "run", "--overwrite", "-q")
+        assert line.startswith("run: is the folder of another kind of job, run")
+    light = "--light", "{type: ambient, radiance: 1}"
+    succeed("render", "run", "-o", "seen", "--ring", "2", "--fluence", "--components", *light)
+    succeed("uncertainty", "run", "-o", "sure", "--calibrate", "0", "--keep-samples", *KNOWN)
+    for kind in ("seen", "sure"):
+        assert files_of(kind) == set(names_in(Path(kind))) - {"checkpoints/previous.pt"}
+    (line,) = refuse(2, "optimize", "scene.yaml", "-o", "sure", "--overwrite")
+    assert line.startswith("sure: is the folder of another kind of job, uncertainty")
+
+
+def files_of(folder: str) -> set[str]:
+    return {name for name, data in contents(Path(folder)).items() if data} - {MANIFEST}
 
 
 def test_what_is_not_there_is_not_gone_on_with(finished: Path, refuse: Refuse) -> None:
@@ -110,8 +128,7 @@ def test_one_that_stops_goes_on_to_the_same_bits(
 def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
     finished: Path, succeed: Run
 ) -> None:
-    """To samples and to those who watch, whether the last is damaged or gone."""
-    (finished / "report.html").unlink()
+    """Whether the last is damaged or gone."""
     last = finished / "checkpoints/last.pt"
     last.with_name("previous.pt").write_bytes(last.read_bytes())
     for lose in (lambda: last.write_bytes(last.read_bytes()[:1000]), last.unlink):
@@ -120,5 +137,3 @@ def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
             "uncertainty", "run", "-o", "sure", "--overwrite", "--calibrate", "0", *KNOWN
         ).stderr
         assert "last.pt: " in told and "going on from run/checkpoints/previous.pt" in told
-        with pytest.warns(DataWarning, match="going on from"):
-            assert '<section id="volume">' in LiveRun(finished).page()

@@ -82,7 +82,7 @@ def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g
     run_folder = RunFolder(folder / "out", scene_file, {}, {})
     run_folder.start(run)
     run_folder.log.add(row)
-    run_folder.finish(run)
+    run_folder.finish(run, lambda views, _: views)
     return run.current_scene()
 
 

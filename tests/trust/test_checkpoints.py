@@ -11,11 +11,18 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon.errors import DataWarning
+from ddrecon.errors import DataWarning, UsageError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
-from ddrecon.run.checkpoint import LAST, PREVIOUS, differences, load_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import (
+    LAST,
+    MOST,
+    PREVIOUS,
+    load_checkpoint,
+    require_same,
+    save_checkpoint,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -143,15 +150,23 @@ def test_what_has_changed_is_named(run: Run, folder: Path) -> None:
     for change, difference in CHANGES.items():
         options = [change, "float64"] if change.startswith("-") else ["-D", change]
         result = run(*RESUME, *options)
-        line = f"out/checkpoints/last.pt: belongs to another scene: {difference}; use another"
-        assert (result.exit_code, result.stderr) == (2, f"{line} output folder\n")
+        line = "out/checkpoints/last.pt: belongs to another scene; use another output folder"
+        assert (result.exit_code, result.stderr) == (2, f"{line}: {difference}\n")
     np.save("side.npy", 2 * np.load("side.npy"))
     result = run(*RESUME)
     assert result.exit_code == 2 and f"the content of {folder / 'side.npy'} is" in result.stderr
 
 
 def test_an_empty_section_is_a_difference() -> None:
-    assert differences({"a": {}}, {"a": {}, "g": {}}) == ["g is absent there, {} now"]
+    with pytest.raises(UsageError, match=r"^other: g is absent there, {} now$"):
+        require_same({"a": {}}, {"a": {}, "g": {}}, "other")
+
+
+def test_few_of_many_differences_are_named() -> None:
+    with pytest.raises(UsageError) as error:
+        require_same(dict.fromkeys("abcdefghijkl", 0), dict.fromkeys("abcdefghijkl", 1), "other")
+    assert len(error.value.problems) == MOST + 1
+    assert error.value.problems[-1] == f"other: {12 - MOST} more differ"
 
 
 def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:

@@ -12,7 +12,7 @@ from click.testing import Result
 from ddrecon import memory
 from ddrecon.cli.check import memory_estimate
 from ddrecon.io.volumes.table import write_field
-from ddrecon.memory import Needs, is_shortage, memory_of
+from ddrecon.memory import Needs, is_shortage, memory_of, usable_cores
 from ddrecon.run import render_folder
 from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
@@ -127,6 +127,24 @@ def test_limits_of_control_groups(tmp_path: Path) -> None:
     own.write_text("3:cpu,memory:/c\n1:cpu:/\n")
     assert list(memory._group_limits(tmp_path / "v1", own)) == [825]
     assert list(memory._group_limits(tmp_path / "none", own)) == []
+
+
+def test_cores_are_those_that_may_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By affinity, and by the smallest quota of a group or of one that it is in."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)))
+    own = tmp_path / "own"
+    own.write_text("0::/a/b\n3:cpu,cpuacct:/c\n")
+    files = {"v2/a/b/cpu.max": "max 100000", "v1/cpu/c/cpu.cfs_quota_us": "-1"}
+    files["v1/cpu/c/cpu.cfs_period_us"] = "100000"
+    assert usable_cores(tmp_path / "none", own) == 8
+    for cores, quota in ((8, files), (3, {"v2/a/cpu.max": "250000 100000"})):
+        for name, text in quota.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text + "\n")
+        assert usable_cores(tmp_path / "v2", own) == cores
+    assert usable_cores(tmp_path / "v1", own) == 8
+    (tmp_path / "v1/cpu/c/cpu.cfs_quota_us").write_text("100000")
+    assert usable_cores(tmp_path / "v1", own) == 1
 
 
 def test_a_shortage_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

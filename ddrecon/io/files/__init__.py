@@ -1,1 +1,1 @@
-"""Files and folders of any kind: safe reading, atomic writing, locks."""
+"""Files and folders of any kind: safe reading, atomic writing, locks, manifests."""

@@ -1,4 +1,7 @@
-"""Writing files so that a reader, or an interrupted run, never sees half of one."""
+"""Writing files so that a reader, or an interrupted run, never sees half of one.
+
+Whatever is written so inside a folder that this process has claimed is noted in its manifest.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,27 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import FormatError, is_utf8
 
 _TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
+claimed: dict[Path, Callable[[Path, str], None]] = {}
+"""What notes files, by the absolute paths of the folders that this process has claimed."""
+
+
+def note_written(path: Path, mark: str = "") -> None:
+    """Has the claimed folder nearest above `path`, if any, note that it is written.
+
+    A `mark` of "/" says that it is a folder with a manifest of its own.
+    """
+    absolute = Path(os.path.abspath(path))
+    for folder in filter(claimed.__contains__, absolute.parents):
+        claimed[folder](absolute, mark)
+        break
 
 
 @contextmanager
@@ -22,10 +38,13 @@ def replace_file(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`, with its suffix, for a block to write to.
 
     It becomes `path` when the block ends well, and vanishes when not. Raises FormatError where the
-    system refuses to write.
+    system refuses to write, or where other programs and scene files could not name it.
     """
     temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
+    if not is_utf8(path):
+        raise FormatError(path, "cannot be written: its name is not UTF-8; choose another")
     with refusals(path):
+        note_written(path)
         try:
             yield temporary
             os.replace(temporary, path)
@@ -48,7 +67,8 @@ def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
                     os.link(path, kept)
                 except OSError:  # of a system without links
                     shutil.copyfile(path, kept)
-    flush(path.parent)
+    with suppress(FormatError):  # Windows and some network drives flush no folders
+        flush(path.parent)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -59,15 +79,21 @@ def write_json(path: Path, content: Any) -> None:
 
 def remove_temporaries(folder: Path) -> None:
     """Removes what processes that were killed while writing have left in `folder`."""
-    for path in folder.iterdir():
-        if _TEMPORARY.fullmatch(path.name):
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if is_temporary(path):
             path.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """Whether `path` is named as what `replace_file` gives a block to write to."""
+    return _TEMPORARY.fullmatch(path.name) is not None
 
 
 def flush(path: Path) -> None:
     """Puts the file or folder at `path` on its disk; raises FormatError where the system cannot."""
     with refusals(path):
-        handle = os.open(path, os.O_RDONLY)
+        # Windows puts only what it may write on its disk.
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
         try:
             os.fsync(handle)
         finally:

@@ -1,5 +1,6 @@
-"""Output folders and files: nothing is overwritten unasked, and one process at a time writes.
+"""Output folders and files: nothing of others is touched, and one process at a time writes.
 
+A folder has a manifest: which kind of job writes there, and the name of each file that it wrote.
 The operating system locks a file that names its holder, and lets go when its process ends, however
 it ends, so what a killed process left behind is only a name.
 """
@@ -7,56 +8,222 @@ it ends, so what a killed process left behind is only a name.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import DataWarning, UsageError
+from ddrecon.io.files.atomic import (
+    claimed,
+    is_temporary,
+    note_written,
+    refusals,
+    remove_temporaries,
+    replace_file,
+)
 
-LOCK = "ddrecon.lock"
-"""The name of the lock file."""
+LOCK, MANIFEST = "ddrecon.lock", "ddrecon.manifest"
+"""The names of the lock file, and of the file that names the others."""
+RUN, FILM, UNCERTAINTY, RENDER, REFERENCE, BENCH = KINDS = (
+    *("run", "film", "uncertainty", "render", "reference", "bench"),
+)
+"""The kinds of jobs that write folders."""
+TEXT: dict[str, Any] = {"encoding": "utf-8", "errors": "surrogateescape"}
+PATIENCE = 1.0
+"""Who waits for a lock says so after so many seconds."""
+
+
+class Folder:
+    """A folder that a job of a `kind` writes to, this process alone; `names` are its files.
+
+    The name of a folder within, which has a manifest of its own, ends in a slash.
+    """
+
+    def __init__(self, path: Path, kind: str):
+        self.path, self.kind, self.names = path, kind, dict.fromkeys(names_in(path))
+
+    def note(self, file: Path, mark: str) -> None:
+        """Adds `file` to the manifest before it is written; another's file is moved aside."""
+        name = file.relative_to(os.path.abspath(self.path)).as_posix() + mark
+        if name in self.names or file.name == MANIFEST:
+            return
+        if file.is_file():
+            aside = next(
+                place
+                for count in range(1, 10**6)
+                if not (place := file.with_name(f"{file.stem}.{count}{file.suffix}")).exists()
+            )
+            file.rename(aside)
+            warnings.warn(f"{file}: was not written by ddrecon; now {aside.name}", DataWarning, 2)
+        self.names[name] = None
+        with (self.path / MANIFEST).open("a", **TEXT) as stream:
+            stream.write(f"{name}\n")
+
+    def clear(self, kept: Iterable[Path] = (), parts: Sequence[str] = ("",)) -> None:
+        """Removes the files that the manifest names, but for those `kept`, and emptied folders.
+
+        `parts` are beginnings of names. Raises UsageError, before anything is removed, where
+        another process writes to a folder within; FormatError where the system refuses.
+        """
+        stay = {path.resolve() for path in kept}
+        chosen = [self.path / name for name in self.names if name.startswith(tuple(parts))]
+        within = [path for path in chosen if path.is_dir() and (path / MANIFEST).is_file()]
+        for path in within:
+            with hold(path / LOCK):
+                pass
+        for path in within:
+            with claim_folder(path, kind_of_folder(path) or "", overwrite=True) as folder:
+                folder.clear(stay)
+        with refusals(self.path):
+            for path in chosen:
+                if path.is_file() and path.resolve() not in stay:
+                    path.unlink()
+            for place in self.places():
+                with suppress(OSError):  # it holds something else
+                    place.rmdir()
+        left = (n for n in self.names if (self.path / re.sub("/$", f"/{MANIFEST}", n)).is_file())
+        self.names = dict.fromkeys(left)
+        self.write()
+
+    def places(self) -> list[Path]:
+        """The folders within that hold files of the manifest, inner ones first."""
+        paths = {up for name in self.names for up in (Path(name), *Path(name).parents)}
+        return sorted(self.path / path for path in paths if (self.path / path).is_dir())[:0:-1]
+
+    def require(self, may_exist: bool) -> None:
+        """Raises UsageError where others' files are, or its own unless these `may_exist`."""
+        kind, content = kind_of_folder(self.path), self.content()
+        if kind is None and content:
+            strange = f"holds {content[0]}, which ddrecon did not write"
+            raise UsageError(f"{self.path}: {strange}; choose another folder")
+        if kind not in (None, self.kind):
+            raise UsageError(
+                f"{self.path}: is the folder of another kind of job, {kind}; choose another folder"
+            )
+        if self.names and not may_exist:
+            also = " or --resume" if self.kind in (RUN, FILM, UNCERTAINTY) else ""
+            raise UsageError(
+                f"{self.path}: the folder is not empty; choose another, or say --overwrite{also}"
+            )
+
+    def content(self) -> list[str]:
+        """The names of all that is in the folder, but for what this class itself writes there."""
+        entries = [entry.name for entry in sorted(self.path.iterdir()) if not is_temporary(entry)]
+        return [name for name in entries if name not in (LOCK, MANIFEST)]
+
+    def write(self) -> None:
+        """Writes the manifest."""
+        with replace_file(self.path / MANIFEST) as temporary:
+            lines = f"ddrecon {self.kind}", *self.names
+            temporary.write_text("".join(f"{line}\n" for line in lines), **TEXT)
 
 
 @contextmanager
-def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
-    """Makes the folder `path`, and keeps other processes out of it until the block ends.
+def claim_folder(
+    path: Path,
+    kind: str,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    tell: Callable[[str], None] | None = None,
+) -> Iterator[Folder]:
+    """Makes the folder `path` of this `kind`, and keeps other processes out until the block ends.
 
-    Raises UsageError where it is a file or cannot be locked, where another process writes there, or
-    where it holds something and `may_exist` is False.
+    What is there stays; a job that is to `overwrite` it clears it once it can begin. A folder in
+    which nothing was written is gone afterwards. Raises UsageError where `path` is a file or cannot
+    be locked, where it is of another kind or holds files of others, where it holds its own and
+    neither is said, and where another process writes there, which `tell`, if any, is told of: then
+    that is waited for.
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: is a file; name a folder for the output")
+    lacking = [place for place in (path, *path.parents) if not place.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{path}: cannot be made: {error.strerror or error}") from error
-    lock = path / LOCK
+    key = Path(os.path.abspath(path))
     try:
-        # No soft locks: what they leave behind would have to be judged stale or not.
-        own = FileLock(lock, fallback_to_soft=False).acquire(timeout=0)
-    except Timeout:
-        holder = ""
-        with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
-            holder = lock.read_text()
-        process = f"process {holder}" if holder.isdigit() else "another process"
-        raise UsageError(
-            f"{path}: {process} is writing there; wait for it, or choose another folder"
-        ) from None
+        with hold(path / LOCK, tell):
+            folder = Folder(path, kind)
+            folder.require(overwrite or resume)
+            for place in (path, *folder.places()):
+                remove_temporaries(place)
+            with refusals(path):
+                note_written(path, "/")
+            claimed[key] = folder.note
+            try:
+                folder.write()
+                yield folder
+            finally:
+                del claimed[key]
+                if not folder.content():
+                    (path / MANIFEST).unlink(missing_ok=True)
+    finally:
+        for place in lacking:
+            with suppress(OSError):  # something is there
+                place.rmdir()
+
+
+@contextmanager
+def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Keeps other processes from the file `lock` until the block ends.
+
+    Raises UsageError where it cannot be locked, and where another process holds it; with `tell`
+    that is told and waited for.
+    """
+    # No soft locks: what they leave behind would have to be judged stale or not.
+    own = FileLock(lock, fallback_to_soft=False)
+    try:
+        try:
+            own.acquire(timeout=0 if tell is None else PATIENCE)
+        except Timeout:
+            holder = ""
+            with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
+                holder = lock.read_text()
+            process = f"process {holder}" if holder.isdigit() else "another process"
+            busy = f"{lock.parent}: {process} is writing there"
+            if tell is None:
+                advice = "wait for it, or choose another folder"
+                raise UsageError(f"{busy}; {advice}") from None
+            tell(f"{busy}; waiting for it")
+            own.acquire()
     except OSError as error:
         raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
-    with own:
-        lock.write_text(str(os.getpid()))
-        try:
-            if not may_exist and any(entry != lock for entry in path.iterdir()):
-                raise UsageError(
-                    f"{path}: the folder is not empty; choose another, or say --overwrite"
-                )
-            yield
-        finally:
-            # Before the lock goes: whoever waits for a file without a name has to begin again.
-            lock.unlink(missing_ok=True)
+    try:
+        with suppress(OSError):  # a full disk
+            lock.write_text(str(os.getpid()))
+        yield
+    finally:
+        # Before the lock goes: whoever waits for a file without a name has to begin again.
+        lock.unlink(missing_ok=True)
+        own.release()
+
+
+def kind_of_folder(path: Path) -> str | None:
+    """The kind of job that wrote the folder `path`; None without a manifest that says it."""
+    kind = _lines(path)[0].removeprefix("ddrecon ")
+    return kind if kind in KINDS else None
+
+
+def names_in(path: Path) -> list[str]:
+    """The names in the manifest of the folder `path`; none that leads out of it."""
+    if kind_of_folder(path) is None:
+        return []
+    return [n for n in _lines(path)[1:-1] if not (n.startswith("/") or ".." in Path(n).parts)]
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of the manifest of the folder `path`, and what follows the last, torn perhaps."""
+    try:
+        return (path / MANIFEST).read_text(**TEXT).split("\n")
+    except OSError:
+        return [""]
 
 
 def require_free_files(paths: Sequence[Path], *, may_exist: bool) -> None:

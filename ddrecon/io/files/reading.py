@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ddrecon.errors import DdreconError, FormatError
+from ddrecon.errors import DdreconError, FormatError, is_utf8
 
 
 @contextmanager
@@ -30,6 +30,8 @@ def guard_reading(path: Path) -> Iterator[None]:
     except MemoryError as error:
         raise FormatError(path, "cannot be read: not enough memory") from error
     except Exception as error:  # decoders of damaged files raise whatever they like
+        if not is_utf8(path):
+            raise FormatError(path, "cannot be read: its name is not UTF-8; rename it") from error
         raise FormatError(path, f"is damaged: {error or type(error).__name__}") from error
 
 

@@ -59,3 +59,20 @@ def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
     path = tmp_path / "absent" / "a.txt"
     with pytest.raises(FormatError, match="cannot be written"), replace_file(path) as temporary:
         temporary.write_text("x")
+
+
+def test_folders_that_cannot_be_flushed_hold_checkpoints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Windows and some network drives have them."""
+    opened = os.open
+
+    def refuse(path: Path, *rest: int, **others: int) -> int:
+        if os.path.isdir(path):
+            raise PermissionError
+        return opened(path, *rest, **others)
+
+    monkeypatch.setattr(os, "open", refuse)
+    with replace_file_durably(tmp_path / "a", kept_as=tmp_path / "b") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "a").read_text() == "new"

@@ -18,7 +18,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import claim_folder
 folder = Path(sys.argv[1])
 """
-HOLD = SCRIPT + "with claim_folder(folder, may_exist=True): exec(sys.argv[2])"
+HOLD = SCRIPT + "with claim_folder(folder, 'run', overwrite=True): exec(sys.argv[2])"
 
 
 def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path: Path) -> None:
@@ -27,7 +27,10 @@ def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path
         assert first.stdout is not None and first.stdout.readline() == b"in\n"
         line = f"{tmp_path}: process {first.pid} is writing there; wait for it, or choose another"
         for _ in range(2):
-            with pytest.raises(UsageError, match=line), claim_folder(tmp_path, may_exist=True):
+            with (
+                pytest.raises(UsageError, match=line),
+                claim_folder(tmp_path, "run", overwrite=True),
+            ):
                 pass
         first.communicate(b"\n")
     assert list(tmp_path.iterdir()) == []
@@ -41,7 +44,7 @@ def test_what_nobody_holds_blocks_nobody(tmp_path: Path) -> None:
     for content in (None, "", "hello"):
         if content is not None:
             (tmp_path / LOCK).write_text(content)
-        with claim_folder(tmp_path, may_exist=False):
+        with claim_folder(tmp_path, "run"):
             assert (tmp_path / LOCK).read_text() == str(os.getpid())
         assert list(tmp_path.iterdir()) == []
 
@@ -52,7 +55,7 @@ def test_of_several_processes_that_ask_at_once_one_goes_in(tmp_path: Path) -> No
 inside, entered = folder / "inside", 0
 while entered < 100:
     try:
-        with claim_folder(folder, may_exist=True):
+        with claim_folder(folder, 'run', overwrite=True):
             os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
             inside.unlink()
             entered += 1
@@ -68,7 +71,7 @@ while entered < 100:
 def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / LOCK).mkdir()
     with pytest.raises(UsageError, match=f"{LOCK}: cannot be locked: Is a directory"):
-        claim_folder(tmp_path, may_exist=True).__enter__()
+        claim_folder(tmp_path, "run", overwrite=True).__enter__()
     (tmp_path / LOCK).rmdir()
 
     def refuse(*_: object) -> None:
@@ -76,7 +79,7 @@ def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr("fcntl.flock", refuse)
     with pytest.raises(UsageError, match="cannot be locked: Function not implemented"):
-        claim_folder(tmp_path, may_exist=True).__enter__()
+        claim_folder(tmp_path, "run", overwrite=True).__enter__()
 
 
 def test_files_are_written_into_folders_and_over_nothing_unasked(tmp_path: Path) -> None:
