@@ -18,7 +18,6 @@ from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.progress import Progress
-from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.reconstruct.together import Together
@@ -155,8 +154,7 @@ class RunFolder(Checkpoints):
     def save_in_time(self, run: Reconstruction | Together) -> None:
         """As of all checkpoints; and has the report say how far the run is, unless that is new."""
         super().save_in_time(run)
-        # Where ranks share cells, all of them would have to render.
-        if isinstance(run, Reconstruction) and run.iteration and not cells_are_shared():
+        if isinstance(run, Reconstruction) and run.iteration:
             start = monotonic()
             if start >= self.next_page:
                 found = find_results(run)

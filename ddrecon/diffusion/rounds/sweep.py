@@ -1,10 +1,7 @@
 """One sweep: radiance along every direction of a quadrature, of which only moments are kept (E2.8).
 
 Directions are gone through one at a time, and computed again one at a time in the backward pass:
-memory does not grow with their number. Through slabs of the grid light goes from one to the next
-("Cells shared among processes" in docs/theory.md): while one rank follows a direction, the next
-follows that before, and half of the directions come from either end, so that all ranks have
-something to do nearly from the beginning.
+memory does not grow with their number.
 """
 
 from __future__ import annotations
