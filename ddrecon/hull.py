@@ -16,7 +16,7 @@ from torch.nn.functional import adaptive_max_pool2d, avg_pool2d, max_pool2d, nor
 from ddrecon.cameras import Camera, cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid, array_order
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures.noise import estimate_noise, least_noise
 from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 
@@ -24,8 +24,12 @@ DARKEST = 0.1
 """So much of each picture, at least, is background. Chosen on the capture, as what follows."""
 DEVIATIONS = 4.0
 """Black is less than so many deviations of noise above it."""
+TAIL = 0.98
+"""This part of black is within two deviations."""
+TOGETHER = 0.4
+"""Smoke is where this part of neighbors show something; what noise shows stands alone."""
 MOST_PIXELS = 256
-"""For a box, pictures of more pixels along a side are made smaller."""
+"""Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""
 BOX_CELLS, SHRINKS = 48, 0.97
 """A box is cut to the cells that are left of so many along each side, again and again until no side
 shrinks below this part of itself."""
@@ -39,20 +43,13 @@ def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    with `auto`, where the brightest color is above black, or differs from the view's background
-    by more than noise, or is not known. Raises HullError where that is most of its edges.
+    with `auto`, where it is brighter than its black, or differs from its background, by more than
+    noise, or is not known. Raises HullError where that is most of its edges.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
         return view.mask > 0
-    image, behind = view.image, view.background
-    if support == AUTO and behind is not None:
-        # A background that is a picture errs as well.
-        noise = estimate_noise(image, view.step).deviation(behind) * math.sqrt(2)
-        differs = ((image - behind).abs() / noise).amax(0)
-        shown = differs > _darkest(differs) + DEVIATIONS
-    else:
-        shown = image.amax(0) > (brightest_black(image, view.step) if support == AUTO else 0.0)
+    shown = _tell_from_noise(view) if support == AUTO else view.image.amax(0) > 0
     shown = shown if view.mask is None else shown | (view.mask == 0)
     edges = torch.cat([shown[[0, -1]].flatten(), shown[:, [0, -1]].flatten()])
     if support == AUTO and float(edges.float().mean()) > 0.5:
@@ -64,19 +61,53 @@ def find_shown(view: View, support: str) -> Tensor:
     return shown
 
 
-def brightest_black(image: Tensor, step: float) -> float:
-    """The radiance up to which a picture `image` [3, h, w] may be black, by its own noise.
+def _tell_from_noise(view: View) -> Tensor:
+    """Where the picture of `view` shows more than noise: bool [h, w].
 
-    Its black is what the darkest part of its pixels, `DARKEST`, does not exceed; what is brighter
-    than that by `DEVIATIONS` of the noise there (E9.2) shows something.
+    A first guess of its noise (E9.2), which bright smoke may mislead, tells what is surely smoke;
+    what lies away from that is black, and says how far black goes. Noise that is not normal, such
+    as compression leaves, goes beyond; but its pixels stand alone.
     """
-    black = _darkest(image.amax(0))
-    return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
+    image, behind = view.image, view.background
+    assert image is not None
+    guess, least = (find(image, view.step) for find in (estimate_noise, least_noise))
+    if behind is None:
+        values = image.amax(0)
+        black = _darkest(values)
+        unit, smallest = guess.deviation(black), least.deviation(black)
+    else:
+        # A background that is a picture errs as well.
+        noise = guess.deviation(behind) * math.sqrt(2)
+        values = ((image - behind).abs() / noise).amax(0)
+        black, unit = _darkest(values), torch.ones(())
+        smallest = (least.deviation(behind) * math.sqrt(2) / noise).median()
+    reach = math.ceil(max(values.shape) / MOST_PIXELS)
+    floor = black + DEVIATIONS * unit
+    dark = values[~_widen(_together(values > floor, reach), 4 * reach, is_cut=True)]
+    if len(dark) >= DARKEST * values.numel():
+        middle, high = (_at_part(dark, part) for part in (0.5, TAIL))
+        floor = torch.maximum(
+            middle + (high - middle) * DEVIATIONS / 2, black + DEVIATIONS * smallest
+        )
+    shown = values > floor
+    return shown & _widen(_together(shown, reach), reach, is_cut=True)
+
+
+def _together(shown: Tensor, reach: int) -> Tensor:
+    """Where enough pixels of `shown` [h, w] within `reach` rows and columns are true."""
+    side, pixels = 2 * reach + 1, shown.float()[None]
+    rows = avg_pool2d(pixels, (side, 1), 1, (reach, 0))
+    return avg_pool2d(rows, (1, side), 1, (0, reach))[0] > TOGETHER
 
 
 def _darkest(values: Tensor) -> Tensor:
     """What the part `DARKEST` of `values` does not exceed."""
-    return values.flatten().kthvalue(max(1, round(DARKEST * values.numel()))).values
+    return _at_part(values.flatten(), DARKEST)
+
+
+def _at_part(values: Tensor, part: float) -> Tensor:
+    """What this `part` of `values` [n] does not exceed."""
+    return values.kthvalue(max(1, round(part * len(values)))).values
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
@@ -106,14 +137,18 @@ def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[T
     return wide[row, column].view(grid.shape), is_seen.view(grid.shape)
 
 
-def _widen(shown: Tensor, reach: int) -> Tensor:
+def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
     """Where any pixel of `shown` [h, w] within `reach` rows and columns is true.
 
-    Also so far beyond its edges, [h + 2 reach, w + 2 reach]: there it goes on as it ends.
+    Also so far beyond its edges, [h + 2 reach, w + 2 reach], where it goes on as it ends; unless it
+    `is_cut` there.
     """
-    pixels = pad(shown.float()[None, None], [2 * reach] * 4, "replicate")
-    side = 2 * reach + 1
-    return max_pool2d(max_pool2d(pixels, (side, 1), 1), (1, side), 1)[0, 0] > 0
+    pixels, side = shown.float()[None, None], 2 * reach + 1
+    beside = reach if is_cut else 0
+    if not is_cut:
+        pixels = pad(pixels, [2 * reach] * 4, "replicate")
+    rows = max_pool2d(pixels, (side, 1), 1, (beside, 0))
+    return max_pool2d(rows, (1, side), 1, (0, beside))[0, 0] > 0
 
 
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
