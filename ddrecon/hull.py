@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import permutations, product
 
 import torch
 from torch import Tensor
@@ -33,6 +34,15 @@ MOST_PIXELS = 256
 BOX_CELLS, SHRINKS = 48, 0.97
 """A box is cut to the cells that are left of so many along each side, again and again until no side
 shrinks below this part of itself."""
+
+
+FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
+"""A box is far too large if less than the first part of it may hold smoke, far too small if it has
+less than the second of what may, and cuts off what reaches beyond it by the third of a side. It
+fits what it has more than the last of."""
+
+
+OUTSIDE = "no overlap"
 
 
 class HullError(SceneError):
@@ -208,3 +218,75 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     if bool((box == cube).any()):
         raise HullError("the views leave it open; more from other sides may close it")
     return box
+
+
+def bounds_text(box: Tensor) -> str:
+    """The corners `box` [2, 3] as a scene file has them."""
+    low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in box.tolist())
+    return f"bounds: {{min: [{low}], max: [{high}]}}"
+
+
+def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | None:
+    """What is wrong with a scene's `box` where pictures show smoke in the box `shown`, [2, 3] each.
+
+    It says how they differ, which axes or unit of the cameras would explain it, and what to write.
+    `upright` are the axes (0, 1, 2: x, y, z) that point up by the cameras and by the scene.
+    """
+    held, filled = _share(shown, box)
+    lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
+    end, axis = divmod(int(lacks.argmax()), 3)
+    if held == 0:
+        what = f"{OUTSIDE}, the pictures show smoke elsewhere"
+    elif filled < FILLED:
+        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
+    elif held < HELD:
+        what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+    elif float(lacks[end, axis]) > CUT:
+        beyond = f"{('below', 'above')[end]} {float(box[end, axis]):.3g} along {'xyz'[axis]}"
+        what = f"cut off, the pictures show smoke {beyond}"
+    else:
+        return None
+    # Where up does not tell of a turn, the longest side may.
+    longest = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
+    reason = _explain(shown, box, *(upright if upright[0] != upright[1] else longest))
+    up = f" and up: {'xyz'[upright[0]]}" if upright[0] != upright[1] else ""
+    return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
+
+
+def _share(part: Tensor, box: Tensor) -> tuple[float, float]:
+    """What shares of the boxes `part` and `box` lie in both."""
+    sides = (torch.minimum(part[1], box[1]) - torch.maximum(part[0], box[0])).clamp(min=0)
+    return float((sides / (part[1] - part[0])).prod()), float((sides / (box[1] - box[0])).prod())
+
+
+def _explain(shown: Tensor, box: Tensor, before: int, after: int) -> str:
+    """Which unit, and turn of the axis `before` to that `after`, have `shown` fill the `box`."""
+    units = [1.0, *(10.0**power for power in (3, -3, 2, -2, 1, -1))]
+    for times, (order, signs) in product(units, _turns(before, after)):
+        ends = times * shown[:, list(order)] * shown.new_tensor(signs)
+        held, filled = _share(ends.sort(0).values, box)
+        if held < ALL or filled < FILLED:
+            continue
+        words = list[str]()
+        if before != after:
+            turned = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
+            up = f"as if {'xyz'[before]} were up in the one and {'xyz'[after]} in the other"
+            words.append(f"({turned}) of the cameras as its (x, y, z), {up}")
+        if times != 1:
+            words.append(f"lengths of the cameras times {times:g}, as of another unit")
+        return f", but would fit with {', and '.join(words)}" if words else ""
+    return ""
+
+
+def _turns(before: int, after: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Which axes, with which signs, come to be x, y and z where the upright one does, by turns.
+
+    That which moves the fewest is the first; where it is the same already, none is moved.
+    """
+    turns = []
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        is_even = order[1] == (order[0] + 1) % 3
+        if order[after] == before and signs[after] > 0 and (math.prod(signs) > 0) == is_even:
+            turns.append((order, signs))
+    turns.sort(key=lambda turn: sum(i != axis for i, axis in enumerate(turn[0])) - sum(turn[1]) / 9)
+    return turns[:1] if before == after else turns

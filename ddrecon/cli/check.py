@@ -22,6 +22,7 @@ from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
 from ddrecon.terms import engine_of_scene, needed_terms
+from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
 
@@ -51,13 +52,24 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
     return [support for support in found if support is not None]
 
 
+def asks_support(scene: Scene) -> bool:
+    """Whether `scene` asks for a support of its density."""
+    density = scene.optimize.parameters.get("density") if scene.optimize else None
+    return density is not None and density.support is not None
+
+
 def describe(
-    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = (), has_slabs: bool = False
+    scene: Scene,
+    expert: dict[str, Any],
+    supports: Sequence[Support] = (),
+    has_slabs: bool = False,
+    up: str = "y",
 ) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
-    that are not at their default; `has_slabs`: ranks are to share out its cells.
+    that are not at their default; `has_slabs`: ranks are to share out its cells; `up` is
+    `volume.up`.
     """
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
@@ -66,6 +78,10 @@ def describe(
     loss = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
+    support = None
+    with suppress(SceneError) if not asks_support(scene) else nullcontext():
+        upright = upright_axis([view.camera for view in scene.views]), "xyz".index(up)
+        support = describe_support(supports, grid, upright)
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],
@@ -85,7 +101,7 @@ def describe(
         "physics": needed_terms(scene),
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
-        "support": describe_support(supports, grid),
+        "support": support,
         "engine": engine_of_scene(scene, has_slabs),
         "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),

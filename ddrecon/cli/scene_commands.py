@@ -43,7 +43,12 @@ def check(session: Session, scene: Path) -> None:
     scenes = map(session.build, each_frame(scene_file))
     first = next(scenes)
     supports = supports_of(chain([first], scenes))
-    report = describe(first, expert, supports, session.share == "cells")
+    has_slabs, up = session.share == "cells", getattr(scene_file.tree.volume, "up", "y")
+    report = describe(first, expert, supports, has_slabs, up)
+    if doubt := (report["support"] or {}).get("doubt"):
+        if "cells" not in report["support"]:
+            raise scene_file.refused("volume.bounds", doubt)
+        warn(f"volume.bounds: {doubt}", DataWarning, 2)
     session.show(report, lines(report))
 
 

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.hull import HullError, bound_smoke, find_shown, hull_of
+from ddrecon.hull import (
+    OUTSIDE,
+    HullError,
+    bound_smoke,
+    bounds_text,
+    doubt_box,
+    find_shown,
+    hull_of,
+)
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
@@ -32,7 +40,10 @@ class Support:
     margin: float
 
     def on(self, grid: Grid) -> Tensor:
-        """Whether medium may be in each cell of `grid`, bool [z, y, x]; SceneError if in none."""
+        """Whether medium may be in each cell of `grid`, bool [z, y, x].
+
+        Raises SceneError if in none, or if all that the views show lies beyond the grid.
+        """
         pairs = [
             hull_of(view.camera, shown, grid, self.margin)
             for view, shown in zip(self.views, self.shown, strict=True)
@@ -41,6 +52,9 @@ class Support:
         # What a view does not see may hold some.
         hulls = may_hold | ~seen
         hull = hulls.all(0)
+        doubt = None if bool(may_hold.all(0).any()) else doubt_support([self], grid).get("doubt")
+        if doubt is not None and doubt.startswith(OUTSIDE):
+            raise SceneError(f"volume.bounds: {doubt}")
         if not bool((hull & seen.any(0)).any()):
             parts = hulls.float().mean((1, 2, 3)).tolist()
             part, view = min(zip(parts, (view.name for view in self.views), strict=True))
@@ -52,35 +66,49 @@ class Support:
         return hull
 
 
-def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] | None:
+def describe_support(
+    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
+) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
-    That is the part of the cells of `grid` that any keeps, and the corners (x, y, z) of the box
-    that would do, where the pictures tell.
+    That is the part of the cells of `grid` that any keeps, and what `doubt_support` says.
     """
     if not supports:
         return None
-    kept = torch.stack([support.on(grid) for support in supports]).any(0)
-    described: dict[str, Any] = {"cells": float(kept.float().mean())}
+    described = doubt_support(supports, grid, upright)
+    if not described.get("doubt", "").startswith(OUTSIDE):
+        kept = torch.stack([support.on(grid) for support in supports]).any(0)
+        described["cells"] = float(kept.float().mean())
+    return described
+
+
+def doubt_support(
+    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
+) -> dict[str, Any]:
+    """The corners (x, y, z) of the `box` that would do, and what is in `doubt` of that of `grid`.
+
+    Neither where the pictures do not tell; `upright` is as for `doubt_box`.
+    """
     with suppress(HullError):
         frames = [(support.views, support.shown) for support in supports]
-        described["box"] = bound_smoke(frames, supports[0].margin).tolist()
-    return described
+        box = bound_smoke(frames, supports[0].margin)
+        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz), upright)
+        return {"box": box.tolist()} | ({} if doubt is None else {"doubt": doubt})
+    return {}
 
 
 def support_text(support: dict[str, Any]) -> str:
     """What `describe_support` says, as a line."""
     described = f"pictures leave smoke in {100 * support['cells']:.3g} % of the cells"
     if "box" in support:
-        low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in support["box"])
-        described += f", within bounds: {{min: [{low}], max: [{high}]}}"
+        described += f"; what they show fits in {bounds_text(torch.tensor(support['box']))}"
     return described
 
 
 def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     """The support of density that `settings` ask for, by the views of `train`; None is anywhere.
 
-    Raises SceneError where a view shows nothing at all, or no cell is left.
+    Raises SceneError where a view shows nothing at all.
     """
     density = settings.parameters.get("density")
     if density is None or density.support is None:
@@ -94,6 +122,4 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
         known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
         by = known[density.support]
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
-    support = Support(train.views, shown, density.support_margin)
-    support.on(train.volume.grid)
-    return support
+    return Support(train.views, shown, density.support_margin)

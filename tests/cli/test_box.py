@@ -94,7 +94,7 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
     assert read_scene(dark).tree.volume == bright
     told = run("check", "auto.yaml").stdout
     assert f"from {list(bright.bounds.min)} to {list(bright.bounds.max)}" in told
-    assert "within bounds: {min: [" in told
+    assert "what they show fits in bounds: {min: [" in told
     least, most = re.search("cells: (.*) to (.*) pixels wide", told).groups()
     assert float(least) < 2 < float(most)
 
@@ -117,3 +117,25 @@ def test_what_pictures_do_not_tell_is_asked_for(
     scene(**make)
     (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))
     assert line in told
+
+
+def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
+    scene: Callable[..., Path], run: Callable[..., Result], refuse
+) -> None:
+    """By `check` and, where the support is asked for, before anything is optimized."""
+    box = "volume.bounds={{min: [{0}, 0, {0}], max: [{1}, 1, {1}]}}"
+    scene()
+    still = (
+        "frames=null",
+        "volume.resolution=[8, 8, 8]",
+        *(f"views.{i}.image=v{i}_0.npy" for i in range(3)),
+    )
+    options = ["auto.yaml", *(word for override in still for word in ("-D", override))]
+    auto = "-D", "optimize.parameters.density.support=auto"
+    away = *options, "-D", box.format(0.45, 0.9)
+    refused = [refuse(2, "check", *away), refuse(2, "check", *away, *auto)]
+    refused.append(refuse(2, "optimize", *away, *auto, "-o", "run"))
+    assert all("volume.bounds: no overlap" in told[0] for told in refused)
+    assert "max: [" in refused[0][0] and not Path("run").exists()
+    told = run("check", *options, "-D", box.format(-9, 9))
+    assert told.exit_code == 0 and "volume.bounds: far too large" in told.stderr
