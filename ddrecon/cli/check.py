@@ -18,12 +18,16 @@ from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene
+from ddrecon.scene_file.box import CELL
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
 from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
+
+WIDE = 4.0
+"""Cells that are at least so many pixels wide to all views are told."""
 
 
 def memory_estimate(scene: Scene) -> int:
@@ -128,7 +132,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"grid: {sizes}, from {low} to {high}",
         f"views: {len(report['views'])}",
         *views,
-        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide",
+        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide{_advise_on_cells(min(widths))}",
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
@@ -138,3 +142,13 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
+
+
+def _advise_on_cells(width: float) -> str:
+    """What to change where all views see cells at least so many pixels wide."""
+    if width < WIDE:
+        return ""
+    return (
+        f", which show less than the pictures: {CELL:g} would do, by smaller cells "
+        f"(volume.resolution: auto) or by pictures {width / CELL:.2g} times smaller"
+    )

@@ -78,6 +78,7 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
         assert pixel < min(ends) <= max(ends) < 9 * pixel
     cells = np.subtract(volume.bounds.max, volume.bounds.min) / volume.resolution
     np.testing.assert_allclose(cells, 2 * pixel, rtol=0.05)
+    np.testing.assert_allclose(cells, cells[0], rtol=1e-6)
     dump_scene(describe(found), Path("plain.yaml"))
     assert "auto" not in Path("plain.yaml").read_text()
     assert read_scene("plain.yaml").tree == found.tree
@@ -139,3 +140,19 @@ def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
     assert "max: [" in refused[0][0] and not Path("run").exists()
     told = run("check", *options, "-D", box.format(-9, 9))
     assert told.exit_code == 0 and "volume.bounds: far too large" in told.stderr
+
+
+def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
+    scene: Callable[..., Path], run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With by how much smaller pictures would do."""
+    scene()
+    told = run("check", "auto.yaml", "-D", "volume.resolution=[4, 4, 4]").stdout
+    (width,) = re.findall("cells: (.*) to", told)
+    assert f"by pictures {float(width) / 2:.1g}" in told and "times smaller" in told
+    assert "times smaller" not in run("check", "auto.yaml").stdout
+    x, y, z = read_scene("auto.yaml").tree.volume.resolution
+    monkeypatch.setattr("ddrecon.scene_file.box.MANY_CELLS", x * y * z // 8 + 1)
+    told = run("check", "auto.yaml").stderr
+    assert f"{x} x {y} x {z} cells two pixels wide take hours: pictures 2 times smaller" in told
+    assert told.count("take hours") == 1
