@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.hull import (
@@ -21,9 +22,12 @@ from ddrecon.hull import (
     find_shown,
     hull_of,
 )
+from ddrecon.march.box import cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
+LOOKED_AT = 8192
+"""At most about so many pixels of a view are looked along to see what is cut off."""
 KEY = "optimize.parameters.density.support"
 
 
@@ -44,11 +48,7 @@ class Support:
 
         Raises SceneError if in none, or if all that the views show lies beyond the grid.
         """
-        pairs = [
-            hull_of(view.camera, shown, grid, self.margin)
-            for view, shown in zip(self.views, self.shown, strict=True)
-        ]
-        may_hold, seen = (torch.stack(cells) for cells in zip(*pairs, strict=True))
+        may_hold, seen = self._hulls(grid)
         # What a view does not see may hold some.
         hulls = may_hold | ~seen
         hull = hulls.all(0)
@@ -64,6 +64,41 @@ class Support:
                 " or raise support_margin"
             )
         return hull
+
+    def _hulls(self, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Which cells may hold medium by each view, and which it sees: bool [V, z, y, x] each."""
+        pairs = [
+            hull_of(view.camera, shown, grid, self.margin)
+            for view, shown in zip(self.views, self.shown, strict=True)
+        ]
+        may_hold, seen = zip(*pairs, strict=True)
+        return torch.stack(may_hold), torch.stack(seen)
+
+    def find_cut(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
+        """Of each view, which pixels show something where no cell of `grid` is left.
+
+        Their indices, among every n-th of the pixels that show something, n, and for each view how
+        many of these pixels it alone has left without a cell.
+        """
+        may_hold, seen = self._hulls(grid)
+        leaves_out = (~may_hold & seen).flatten(1)
+        for view, shown in zip(self.views, self.shown, strict=True):
+            every = 1 + int(shown.sum()) // LOOKED_AT
+            index = shown.flatten().nonzero()[::every, 0]
+            rays = cast_rays(view.camera).select(index)
+            crossing = cross_box(grid, rays)
+            index, rays = index[crossing.hit], rays.select(crossing.hit)
+            count = 2 * max(grid.shape)
+            far = (torch.arange(count, device=index.device) + 0.5) / count
+            far = crossing.near[:, None] + far * (crossing.far - crossing.near)[:, None]
+            places = rays.origin[:, None] + far[..., None] * rays.direction[:, None]
+            low, step = (places.new_tensor(x) for x in (grid.lower, grid.spacing))
+            most = index.new_tensor(grid.shape) - 1
+            z, y, x = ((places - low) / step).long().clamp(min=0).minimum(most).unbind(-1)
+            out = leaves_out[:, (z * grid.shape[1] + y) * grid.shape[2] + x]
+            is_cut, by = (out.any(0)).all(1), out.sum(0)
+            alone = [int((is_cut & ((by == 1) & one).any(1)).sum()) for one in out]
+            yield index[is_cut], every, alone
 
 
 def describe_support(
