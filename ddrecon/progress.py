@@ -7,8 +7,16 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from tqdm import tqdm
+
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 """`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
+
+
+IN_A_LOG = 30.0
+"""Seconds between two states of a bar in a file, each of which is a line there."""
+SHORT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+"""A bar beside which there is room for what it says, in 80 columns."""
 
 
 def bar_settings(is_quiet: bool) -> dict[str, Any]:
@@ -17,4 +25,13 @@ def bar_settings(is_quiet: bool) -> dict[str, Any]:
     A terminal that says it has no room, as some containers' do, gets 80 columns and 24 rows.
     """
     columns, rows = shutil.get_terminal_size()
-    return {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}
+    settings = {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}
+    if not sys.stderr.isatty():
+        settings |= {"mininterval": IN_A_LOG, "maxinterval": IN_A_LOG}
+    return settings
+
+
+def say(what: str, is_quiet: bool) -> None:
+    """Says on stderr, above all bars, `what` is being done now; unless `is_quiet`."""
+    if not is_quiet:
+        tqdm.write(what, file=sys.stderr)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -258,8 +259,10 @@ def optimize(
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
+    from ddrecon.progress import say
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
+    say("reading pictures and fitting the scene to them", session.is_quiet)
     built, environment = session.build(scene_file), session.environment()
     if not is_first():
         follow_run(built, scene_file, resume=resume, preview_every=preview_every)
@@ -267,7 +270,7 @@ def optimize(
     choice = {"may_exist": overwrite, "resume": resume}
     with open_run(built, scene_file, output, environment, **choice) as (run, folder):
         summary = drive_run(run, folder, preview_every, session.is_quiet)
-    session.show(summary, summary_lines(summary, output))
+    session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
 
 
 @click.command()

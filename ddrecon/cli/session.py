@@ -9,8 +9,9 @@ import platform
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -52,6 +53,7 @@ class Session:
     report: Path | None = None
     share: str = "views"
     place: torch.device | None = None
+    begun: float = field(default_factory=monotonic)
 
     def start(self) -> torch.device:
         """Sets torch and the engine up as the options say; the device to compute on.

@@ -6,6 +6,7 @@ Target and render of a view stand side by side as they are displayed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -46,6 +47,8 @@ SHOWN = 24
 """Views whose pictures are on the page; all are in the folder."""
 PIXELS = 1_200_000
 """So many pixels all pictures of views have together, at most."""
+FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"
+"""Why held-out views seem to get worse where the resolution changes."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
 
@@ -66,7 +69,7 @@ def write_run_report(
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
         section("Volume", volume_section(findings, summary)),
-        section("Loss", side_by_side(*curves(rows))),
+        section("Loss", side_by_side(*curves(rows)), *_explain_steps(rows)),
         section("Views", *view_section(findings)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", settings)),
@@ -144,9 +147,24 @@ def curves(rows: Sequence[Row]) -> list[str]:
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
     if tests:
         quality["held out"] = tests
+    steps = [float(row.iteration) for row in _steps(rows)]
     return [
-        draw_curve("loss", losses, "iteration", is_logarithmic=True),
-        draw_curve("PSNR [dB]", quality, "iteration"),
+        draw_curve("loss", losses, "iteration", is_logarithmic=True, steps=steps),
+        draw_curve("PSNR [dB]", quality, "iteration", steps=steps),
+    ]
+
+
+def _steps(rows: Sequence[Row]) -> list[Row]:
+    """The first row of each resolution but the first."""
+    return [row for before, row in pairwise(rows) if row.cells != before.cells]
+
+
+def _explain_steps(rows: Sequence[Row]) -> list[str]:
+    if not (steps := _steps(rows)):
+        return []
+    at = ", ".join(str(row.iteration) for row in steps)
+    return [
+        paragraph(f"A line from top to bottom: the cells are finer from there ({at}). {FINER}.")
     ]
 
 

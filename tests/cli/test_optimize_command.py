@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,26 @@ def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
     assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
     assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
+
+
+def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(run: Run) -> None:
+    """By its lines and the curves of its report: held-out views seem to get worse there."""
+    options = "-D", "volume.resolution=[16, 16, 16]", "-D", "optimize.refine_at=[0.5]"
+    start = time.monotonic()
+    told = run("optimize", "scene.yaml", "-o", "one", *options)
+    taken = time.monotonic() - start
+    cells = [row["cells"] for row in rows("one")]
+    (step,) = (i + 1 for i in range(1, 4) if cells[i] != cells[i - 1])
+    assert (
+        f"iteration {step}: 4,096 cells from here; PSNRs are of pictures as coarse" in told.stderr
+    )
+    page = Path("one/report.html").read_text()
+    assert page.count("stroke-dasharray") == 2 and f"finer from there ({step})" in page
+    of_all, of_iterations = (
+        float(re.search(words, told.stdout).group(1))
+        for words in (r"and (\S+) s with all", r"iterations in (\S+) s")
+    )
+    assert of_iterations < of_all <= taken + 0.1
 
 
 def test_divergence_keeps_the_last_good_state(run: Run) -> None:
