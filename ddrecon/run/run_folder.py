@@ -32,7 +32,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import write_run_report
+from ddrecon.run.report import found_numbers, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
@@ -166,7 +166,8 @@ class RunFolder(Checkpoints):
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
         write_json(self.path / "summary.json", summary)
-        write_run_report(self.path / "report.html", found, rows, summary, self.environment)
+        numbers, environment = found_numbers(run, scene), self.environment
+        write_run_report(self.path / "report.html", found, rows, summary, environment, numbers)
         return summary
 
     def _store(self, scene: Scene, name: str) -> Any:

@@ -164,6 +164,22 @@ def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(run: Ru
     assert of_iterations < of_all <= taken + 0.1
 
 
+def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
+    """As parameters.json has them; of a camera by how much it moved."""
+    searched = ["lights.0.irradiance={init: 2}", "views.front.exposure={init: 0.9}"]
+    searched += ["views.front.camera={}"]
+    options = [f"optimize.parameters.{each}" for each in searched]
+    succeed(*OPTIMIZE, "one", *(word for option in options for word in ("-D", option)))
+    page, found = Path("one/report.html").read_text(), read_json("one/parameters.json")
+    for name, start in (("lights.0.irradiance", 2), ("views.front.exposure", 0.9)):
+        values = ", ".join(f"{x:.4g}" for x in np.ravel(found[name]))
+        cells = [name, ", ".join([f"{start:.4g}"] * np.size(found[name])), values]
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+    (moved,) = re.findall(r"moved by ([\d.]+) pixels, turned by [\d.e-]+ degrees", page)
+    matrix = np.array(found["views.front.camera"]["matrix"])
+    assert (float(moved) > 0) == (abs(matrix[:3, 3] - [0, 0, 2.5]).max() > 1e-3)
+
+
 def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     # Without smoothing, which would keep steps short.
     overrides = [f"optimize.parameters.density.{each}" for each in ("lr=1e37", "tv=0")]
