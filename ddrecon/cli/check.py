@@ -15,7 +15,13 @@ from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
-from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
+from ddrecon.reconstruct.support import (
+    Support,
+    describe_support,
+    find_cut,
+    find_support,
+    support_text,
+)
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene
 from ddrecon.scene_file.box import CELL
@@ -86,6 +92,8 @@ def describe(
     with suppress(SceneError) if not asks_support(scene) else nullcontext():
         upright = upright_axis([view.camera for view in scene.views]), "xyz".index(up)
         support = describe_support(supports, grid, upright)
+        if support is not None and "cells" in support:
+            support["cut"] = find_cut(supports[0], grid)
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],

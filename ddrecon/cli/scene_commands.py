@@ -6,7 +6,7 @@ scene file, are shown at once.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -37,19 +37,23 @@ def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
     from ddrecon.cli.check import describe, lines, supports_of
+    from ddrecon.progress import tell
     from ddrecon.scene_file.frames import each_frame
     from ddrecon.scene_file.load import find_expert_keys
 
     expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
-    first = next(scenes)
-    supports = supports_of(chain([first], scenes))
     has_slabs, up = session.share == "cells", getattr(scene_file.tree.volume, "up", "y")
-    report = describe(first, expert, supports, has_slabs, up)
-    if doubt := (report["support"] or {}).get("doubt"):
-        if "cells" not in report["support"]:
-            raise scene_file.refused("volume.bounds", doubt)
-        warn(f"volume.bounds: {doubt}", DataWarning, 2)
+    with tell("reading pictures, and looking at what they show", session.is_quiet):
+        first = next(scenes)
+        supports = supports_of(chain([first], scenes))
+        report = describe(first, expert, supports, has_slabs, up)
+    support = report["support"] or {}
+    if (doubt := support.get("doubt")) and "cells" not in support:
+        raise scene_file.refused("volume.bounds", doubt)
+    for told in (doubt and f"volume.bounds: {doubt}", support.get("cut")):
+        if told is not None:
+            warn(told, DataWarning, 2)
     session.show(report, lines(report))
 
 
@@ -259,16 +263,19 @@ def optimize(
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
-    from ddrecon.progress import say
+    from ddrecon.progress import tell
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
-    say("reading pictures and fitting the scene to them", session.is_quiet)
-    built, environment = session.build(scene_file), session.environment()
+    with tell("reading pictures and building the scene", session.is_quiet):
+        built, environment = session.build(scene_file), session.environment()
     if not is_first():
         follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         return
     choice = {"may_exist": overwrite, "resume": resume}
-    with open_run(built, scene_file, output, environment, **choice) as (run, folder):
+    with ExitStack() as stack:
+        with tell("looking at what the pictures show", session.is_quiet):
+            opened = open_run(built, scene_file, output, environment, **choice)
+            run, folder = stack.enter_context(opened)
         summary = drive_run(run, folder, preview_every, session.is_quiet)
     session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
 

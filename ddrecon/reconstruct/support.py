@@ -28,6 +28,8 @@ from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
 LOOKED_AT = 8192
 """At most about so many pixels of a view are looked along to see what is cut off."""
+LOST = 0.002
+"""What a support cuts off is told from this part of a view's light on."""
 KEY = "optimize.parameters.density.support"
 
 
@@ -74,7 +76,7 @@ class Support:
         may_hold, seen = zip(*pairs, strict=True)
         return torch.stack(may_hold), torch.stack(seen)
 
-    def find_cut(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
+    def cut_pixels(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
         """Of each view, which pixels show something where no cell of `grid` is left.
 
         Their indices, among every n-th of the pixels that show something, n, and for each view how
@@ -130,6 +132,25 @@ def doubt_support(
         doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz), upright)
         return {"box": box.tolist()} | ({} if doubt is None else {"doubt": doubt})
     return {}
+
+
+def find_cut(support: Support, grid: Grid) -> str | None:
+    """Whether `support` leaves no cell of `grid` where views show smoke, and which view does it."""
+    cut, by = dict[str, float](), [0] * len(support.views)
+    for view, (index, every, alone) in zip(support.views, support.cut_pixels(grid), strict=True):
+        assert view.image is not None
+        strength = (view.image - (0.0 if view.background is None else view.background)).abs()
+        light = strength.amax(0).flatten()
+        part = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
+        if part > LOST:
+            cut[view.name], by = part, [a + b for a, b in zip(by, alone, strict=True)]
+    if not cut:
+        return None
+    names = ", ".join(f"{name} ({100 * part:.2g} % of its light)" for name, part in cut.items())
+    blamed = "the cameras"
+    if max(by) > 0:
+        blamed = f"camera {support.views[by.index(max(by))].name}, which alone shows nothing there"
+    return f"support? it cuts off what views show: {names}; check {blamed}, or raise {KEY}_margin"
 
 
 def support_text(support: dict[str, Any]) -> str:

@@ -13,12 +13,11 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
 from ddrecon.hull import bounds_text
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
-from ddrecon.reconstruct.support import Support
+from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
 
 OVERFIT = 6.0
@@ -28,7 +27,7 @@ GAIN = 1.15
 SHIFT = 0.5
 """A render that fits better when moved by more pixels was seen by another camera."""
 EXPLAINED = 0.3
-"""The part of a residual that a factor, or what is cut off, has to explain."""
+"""The part of a residual that a factor has to explain."""
 MOVED = 0.2
 """The part that such a move has to explain: a volume fitted to other views hides the rest."""
 GHOSTS = 0.01
@@ -66,7 +65,7 @@ def diagnose(
         least = max(EXPLAINED, share)
     found = {
         "overfit": overfit,
-        "support": support and find_cut(support, images, scene.volume.grid),
+        "support": support and find_cut(support, scene.volume.grid),
         "exposure": find_exposure(trained, images, usual, least),
         "cameras": find_shift(trained, images, max(MOVED, share or 0) if least < 1 else 1.0),
         # What is overfit would only become more so.
@@ -105,27 +104,6 @@ def find_ghosts(volume: Volume, box: Tensor | None) -> str | None:
     return (
         f"{100 * part:.2g} % of the density is where the pictures show no smoke and few cameras "
         f"look: take volume.{bounds_text(box)}, raise optimize.parameters.density.tv"
-    )
-
-
-def find_cut(support: Support, images: Mapping[str, Tensor], grid: Grid) -> str | None:
-    """Whether the support leaves no cell where pictures show what explains their residuals."""
-    cut, by = dict[str, float](), [0] * len(support.views)
-    for view, (index, every, alone) in zip(support.views, support.find_cut(grid), strict=True):
-        residual = (target_of(view) - images[view.name]) * _weight(view)
-        power = residual.square().sum(0).flatten()
-        part = every * float(power[index].sum()) / (float(power.sum()) or 1.0)
-        if part > EXPLAINED:
-            cut[view.name], by = part, [a + b for a, b in zip(by, alone, strict=True)]
-    if not cut:
-        return None
-    names = ", ".join(f"{name} ({100 * min(part, 1):.0f} %)" for name, part in cut.items())
-    blamed = ""
-    if max(by) > 0:
-        blamed = f" View {support.views[by.index(max(by))].name} alone shows nothing there:"
-    return (
-        "support? smoke is cut off: most of what renders lack is where no cell is left, in "
-        f"{names}.{blamed} check that camera, or raise optimize.parameters.density.support_margin"
     )
 
 

@@ -13,7 +13,7 @@ from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import claim_folder
-from ddrecon.progress import SHORT, bar_settings, say
+from ddrecon.progress import SHORT, bar_settings, say, tell
 from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
@@ -137,12 +137,10 @@ def drive_run(
         return f"PSNR {row.psnr:.1f}{test} dB"
 
     advance(run, make_iteration, folder, is_quiet, title)
-    say("rendering what was found, and writing it with its report", is_silent)
-    if cells_are_shared():
+    if not cells_are_shared():
+        leave_ranks()  # what is left the first one does by itself
+    with tell("rendering what was found, and writing it with its report", is_silent):
         return folder.finish(run)
-    # What is left the first rank does by itself.
-    leave_ranks()
-    return folder.finish(run)
 
 
 def advance(

@@ -164,6 +164,17 @@ def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(run: Ru
     assert of_iterations < of_all <= taken + 0.1
 
 
+def test_what_takes_long_before_and_after_the_bar_is_told(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "..." not in run("optimize", "scene.yaml", "-o", "short").stderr
+    monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
+    told = run("optimize", "scene.yaml", "-o", "long").stderr
+    stages = ("reading pictures", "looking at what", "optimize:", "rendering what was found")
+    places = [told.index(stage) for stage in stages]
+    assert places == sorted(places) and run(*OPTIMIZE, "quiet").stderr == ""
+
+
 def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
     """As parameters.json has them; of a camera by how much it moved."""
     searched = ["lights.0.irradiance={init: 2}", "views.front.exposure={init: 0.9}"]
