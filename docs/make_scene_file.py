@@ -536,7 +536,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "mask, or alpha, says is empty; `auto`: nor where it is as dark as its darkest "
                 "tenth, within noise. Left out: anywhere."
             ),
-            "support_margin": "Pixels by which what a view shows is widened for that.",
+            "support_margin": (
+                "Pixels by which what a view shows is widened for that; 2 unless given. As many as "
+                "the cameras may be off."
+            ),
         },
     ),
 ]

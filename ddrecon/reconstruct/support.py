@@ -178,4 +178,4 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
         known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
         by = known[density.support]
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
-    return Support(train.views, shown, density.support_margin)
+    return Support(train.views, shown, density.margin)

@@ -75,7 +75,7 @@ def _find_box(scene_file: SceneFile) -> Tensor:
             yield views, [find_shown(view, density.support or AUTO) for view in views]
 
     try:
-        return bound_smoke(frames(), density.support_margin)
+        return bound_smoke(frames(), density.margin)
     except HullError as error:
         what = f"auto: {error}; or give min and max in numbers"
         raise scene_file.refused("volume.bounds", what) from error
