@@ -172,7 +172,7 @@ class ParameterSettings:
     brightness of the targets.
 
     `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
-    brighter than black; widened by `support_margin` pixels, `MARGIN` unless given. None is anywhere.
+    brighter than black; widened by `support_margin` pixels, or `MARGIN`. None is anywhere.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {

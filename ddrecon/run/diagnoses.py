@@ -65,7 +65,7 @@ def diagnose(
         least = max(EXPLAINED, share)
     found = {
         "overfit": overfit,
-        "support": support and find_cut(support, scene.volume.grid),
+        "support": None if support is None else find_cut(support, scene.volume.grid),
         "exposure": find_exposure(trained, images, usual, least),
         "cameras": find_shift(trained, images, max(MOVED, share or 0) if least < 1 else 1.0),
         # What is overfit would only become more so.

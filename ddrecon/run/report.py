@@ -105,8 +105,8 @@ def found_numbers(run: Reconstruction, scene: Scene) -> list[tuple[str, str, str
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
             found.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
-            texts = (", ".join(f"{x:.4g}" for x in numbers.tolist()) for numbers in (start, value))
-            found.append((parameter.name, *texts))
+            begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
+            found.append((parameter.name, begun, ended))
     return found
 
 
