@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import permutations, product
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from torch.nn.functional import adaptive_max_pool2d, avg_pool2d, max_pool2d, nor
 from ddrecon.cameras import Camera, cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid, array_order
-from ddrecon.pictures.noise import estimate_noise
+from ddrecon.pictures.noise import estimate_noise, least_noise
 from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 
@@ -24,11 +25,24 @@ DARKEST = 0.1
 """So much of each picture, at least, is background. Chosen on the capture, as what follows."""
 DEVIATIONS = 4.0
 """Black is less than so many deviations of noise above it."""
+TAIL = 0.98
+"""This part of black is within two deviations."""
+TOGETHER = 0.4
+"""Smoke is where this part of neighbors show something; what noise shows stands alone."""
 MOST_PIXELS = 256
-"""For a box, pictures of more pixels along a side are made smaller."""
+"""Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""
 BOX_CELLS, SHRINKS = 48, 0.97
 """A box is cut to the cells that are left of so many along each side, again and again until no side
 shrinks below this part of itself."""
+
+
+FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
+"""A box is far too large if less than the first part of it may hold smoke, far too small if it has
+less than the second of what may, and cuts off what reaches beyond it by the third of a side. It
+fits what it has more than the last of."""
+
+
+OUTSIDE = "no overlap"
 
 
 class HullError(SceneError):
@@ -39,20 +53,13 @@ def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    with `auto`, where the brightest color is above black, or differs from the view's background
-    by more than noise, or is not known. Raises HullError where that is most of its edges.
+    with `auto`, where it is brighter than its black, or differs from its background, by more than
+    noise, or is not known. Raises HullError where that is most of its edges.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
         return view.mask > 0
-    image, behind = view.image, view.background
-    if support == AUTO and behind is not None:
-        # A background that is a picture errs as well.
-        noise = estimate_noise(image, view.step).deviation(behind) * math.sqrt(2)
-        differs = ((image - behind).abs() / noise).amax(0)
-        shown = differs > _darkest(differs) + DEVIATIONS
-    else:
-        shown = image.amax(0) > (brightest_black(image, view.step) if support == AUTO else 0.0)
+    shown = _tell_from_noise(view) if support == AUTO else view.image.amax(0) > 0
     shown = shown if view.mask is None else shown | (view.mask == 0)
     edges = torch.cat([shown[[0, -1]].flatten(), shown[:, [0, -1]].flatten()])
     if support == AUTO and float(edges.float().mean()) > 0.5:
@@ -64,19 +71,53 @@ def find_shown(view: View, support: str) -> Tensor:
     return shown
 
 
-def brightest_black(image: Tensor, step: float) -> float:
-    """The radiance up to which a picture `image` [3, h, w] may be black, by its own noise.
+def _tell_from_noise(view: View) -> Tensor:
+    """Where the picture of `view` shows more than noise: bool [h, w].
 
-    Its black is what the darkest part of its pixels, `DARKEST`, does not exceed; what is brighter
-    than that by `DEVIATIONS` of the noise there (E9.2) shows something.
+    A first guess of its noise (E9.2), which bright smoke may mislead, tells what is surely smoke;
+    what lies away from that is black, and says how far black goes. Noise that is not normal, such
+    as compression leaves, goes beyond; but its pixels stand alone.
     """
-    black = _darkest(image.amax(0))
-    return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
+    image, behind = view.image, view.background
+    assert image is not None
+    guess, least = (find(image, view.step) for find in (estimate_noise, least_noise))
+    if behind is None:
+        values = image.amax(0)
+        black = _darkest(values)
+        unit, smallest = guess.deviation(black), least.deviation(black)
+    else:
+        # A background that is a picture errs as well.
+        noise = guess.deviation(behind) * math.sqrt(2)
+        values = ((image - behind).abs() / noise).amax(0)
+        black, unit = _darkest(values), torch.ones(())
+        smallest = (least.deviation(behind) * math.sqrt(2) / noise).median()
+    reach = math.ceil(max(values.shape) / MOST_PIXELS)
+    floor = black + DEVIATIONS * unit
+    dark = values[~_widen(_together(values > floor, reach), 4 * reach, is_cut=True)]
+    if len(dark) >= DARKEST * values.numel():
+        middle, high = (_at_part(dark, part) for part in (0.5, TAIL))
+        floor = torch.maximum(
+            middle + (high - middle) * DEVIATIONS / 2, black + DEVIATIONS * smallest
+        )
+    shown = values > floor
+    return shown & _widen(_together(shown, reach), reach, is_cut=True)
+
+
+def _together(shown: Tensor, reach: int) -> Tensor:
+    """Where enough pixels of `shown` [h, w] within `reach` rows and columns are true."""
+    side, pixels = 2 * reach + 1, shown.float()[None]
+    rows = avg_pool2d(pixels, (side, 1), 1, (reach, 0))
+    return avg_pool2d(rows, (1, side), 1, (0, reach))[0] > TOGETHER
 
 
 def _darkest(values: Tensor) -> Tensor:
     """What the part `DARKEST` of `values` does not exceed."""
-    return values.flatten().kthvalue(max(1, round(DARKEST * values.numel()))).values
+    return _at_part(values.flatten(), DARKEST)
+
+
+def _at_part(values: Tensor, part: float) -> Tensor:
+    """What this `part` of `values` [n] does not exceed."""
+    return values.kthvalue(max(1, round(part * len(values)))).values
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
@@ -106,14 +147,18 @@ def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[T
     return wide[row, column].view(grid.shape), is_seen.view(grid.shape)
 
 
-def _widen(shown: Tensor, reach: int) -> Tensor:
+def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
     """Where any pixel of `shown` [h, w] within `reach` rows and columns is true.
 
-    Also so far beyond its edges, [h + 2 reach, w + 2 reach]: there it goes on as it ends.
+    Also so far beyond its edges, [h + 2 reach, w + 2 reach], where it goes on as it ends; unless it
+    `is_cut` there.
     """
-    pixels = pad(shown.float()[None, None], [2 * reach] * 4, "replicate")
-    side = 2 * reach + 1
-    return max_pool2d(max_pool2d(pixels, (side, 1), 1), (1, side), 1)[0, 0] > 0
+    pixels, side = shown.float()[None, None], 2 * reach + 1
+    beside = reach if is_cut else 0
+    if not is_cut:
+        pixels = pad(pixels, [2 * reach] * 4, "replicate")
+    rows = max_pool2d(pixels, (side, 1), 1, (beside, 0))
+    return max_pool2d(rows, (1, side), 1, (0, beside))[0, 0] > 0
 
 
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
@@ -173,3 +218,75 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     if bool((box == cube).any()):
         raise HullError("the views leave it open; more from other sides may close it")
     return box
+
+
+def bounds_text(box: Tensor) -> str:
+    """The corners `box` [2, 3] as a scene file has them."""
+    low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in box.tolist())
+    return f"bounds: {{min: [{low}], max: [{high}]}}"
+
+
+def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | None:
+    """What is wrong with a scene's `box` where pictures show smoke in the box `shown`, [2, 3] each.
+
+    It says how they differ, which axes or unit of the cameras would explain it, and what to write.
+    `upright` are the axes (0, 1, 2: x, y, z) that point up by the cameras and by the scene.
+    """
+    held, filled = _share(shown, box)
+    lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
+    end, axis = divmod(int(lacks.argmax()), 3)
+    if held == 0:
+        what = f"{OUTSIDE}, the pictures show smoke elsewhere"
+    elif filled < FILLED:
+        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
+    elif held < HELD:
+        what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+    elif float(lacks[end, axis]) > CUT:
+        beyond = f"{('below', 'above')[end]} {float(box[end, axis]):.3g} along {'xyz'[axis]}"
+        what = f"cut off, the pictures show smoke {beyond}"
+    else:
+        return None
+    # Where up does not tell of a turn, the longest side may.
+    longest = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
+    reason = _explain(shown, box, *(upright if upright[0] != upright[1] else longest))
+    up = f" and up: {'xyz'[upright[0]]}" if upright[0] != upright[1] else ""
+    return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
+
+
+def _share(part: Tensor, box: Tensor) -> tuple[float, float]:
+    """What shares of the boxes `part` and `box` lie in both."""
+    sides = (torch.minimum(part[1], box[1]) - torch.maximum(part[0], box[0])).clamp(min=0)
+    return float((sides / (part[1] - part[0])).prod()), float((sides / (box[1] - box[0])).prod())
+
+
+def _explain(shown: Tensor, box: Tensor, before: int, after: int) -> str:
+    """Which unit, and turn of the axis `before` to that `after`, have `shown` fill the `box`."""
+    units = [1.0, *(10.0**power for power in (3, -3, 2, -2, 1, -1))]
+    for times, (order, signs) in product(units, _turns(before, after)):
+        ends = times * shown[:, list(order)] * shown.new_tensor(signs)
+        held, filled = _share(ends.sort(0).values, box)
+        if held < ALL or filled < FILLED:
+            continue
+        words = list[str]()
+        if before != after:
+            turned = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
+            up = f"as if {'xyz'[before]} were up in the one and {'xyz'[after]} in the other"
+            words.append(f"({turned}) of the cameras as its (x, y, z), {up}")
+        if times != 1:
+            words.append(f"lengths of the cameras times {times:g}, as of another unit")
+        return f", but would fit with {', and '.join(words)}" if words else ""
+    return ""
+
+
+def _turns(before: int, after: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Which axes, with which signs, come to be x, y and z where the upright one does, by turns.
+
+    That which moves the fewest is the first; where it is the same already, none is moved.
+    """
+    turns = []
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        is_even = order[1] == (order[0] + 1) % 3
+        if order[after] == before and signs[after] > 0 and (math.prod(signs) > 0) == is_even:
+            turns.append((order, signs))
+    turns.sort(key=lambda turn: sum(i != axis for i, axis in enumerate(turn[0])) - sum(turn[1]) / 9)
+    return turns[:1] if before == after else turns

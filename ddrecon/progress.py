@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from threading import Timer
 from typing import Any
+
+from tqdm import tqdm
 
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 """`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
+
+
+IN_A_LOG = 30.0
+"""Seconds between two states of a bar in a file, each of which is a line there."""
+LONG = 2.0
+"""After so many seconds it is said what is being done."""
+SHORT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+"""A bar beside which there is room for what it says, in 80 columns."""
 
 
 def bar_settings(is_quiet: bool) -> dict[str, Any]:
@@ -17,4 +29,25 @@ def bar_settings(is_quiet: bool) -> dict[str, Any]:
     A terminal that says it has no room, as some containers' do, gets 80 columns and 24 rows.
     """
     columns, rows = shutil.get_terminal_size()
-    return {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}
+    settings = {"file": sys.stderr, "disable": is_quiet, "ncols": columns - 1, "nrows": rows}
+    if not sys.stderr.isatty():
+        settings |= {"mininterval": IN_A_LOG, "maxinterval": IN_A_LOG}
+    return settings
+
+
+def say(what: str, is_quiet: bool) -> None:
+    """Says on stderr, above all bars, `what` is being done now; unless `is_quiet`."""
+    if not is_quiet:
+        tqdm.write(what, file=sys.stderr)
+
+
+@contextmanager
+def tell(what: str, is_quiet: bool) -> Iterator[None]:
+    """Says `what` is being done until the block ends, where that takes long."""
+    timer = Timer(LONG, say, (f"{what} ...", is_quiet))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

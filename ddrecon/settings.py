@@ -181,6 +181,10 @@ AUTO: Literal["auto"] = "auto"
 MASKS = "masks"
 
 
+MARGIN = 2.0
+"""By how many pixels what a view shows is widened, unless a scene says."""
+
+
 @dataclass(frozen=True)
 class ParameterSettings:
     """How one parameter is optimized.
@@ -195,7 +199,7 @@ class ParameterSettings:
     brightness of the targets.
 
     `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
-    brighter than black; widened by `support_margin` pixels. None is anywhere.
+    brighter than black; widened by `support_margin` pixels, or `MARGIN`. None is anywhere.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -210,7 +214,12 @@ class ParameterSettings:
     tv: float | None = bounded(None, minimum=0)
     field: bool | None = None
     support: str | None = one_of(None, (MASKS, AUTO))
-    support_margin: float = bounded(2.0, minimum=0, maximum=1000, expert=True)
+    support_margin: float | None = bounded(None, minimum=0, maximum=1000)
+
+    @property
+    def margin(self) -> float:
+        """By how many pixels what a view shows is widened."""
+        return MARGIN if self.support_margin is None else self.support_margin
 
     def violations(self) -> Iterator[Violation]:
         low = -math.inf if self.min is None else self.min

@@ -538,10 +538,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
-                "mask, or alpha, says is empty; `auto`: nor where it is as dark as its darkest "
-                "tenth, within noise. Left out: anywhere."
+                "mask, or alpha, says is empty; `auto`: nor where it is as dark as it is away from "
+                "smoke, within noise. Left out: anywhere."
             ),
-            "support_margin": "Pixels by which what a view shows is widened for that.",
+            "support_margin": (
+                "Pixels by which what a view shows is widened for that; 2 unless given. As many as "
+                "the cameras may be off."
+            ),
         },
     ),
 ]

@@ -1,13 +1,48 @@
-"""How work that takes long shows how far it is."""
+"""A bar has room in 80 columns, and does not fill the log of a farm."""
 
+import io
 import os
 import pty
+import re
+import sys
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 from tqdm import tqdm
 
 from ddrecon.progress import bar_settings
+from ddrecon.run.drive import advance
+
+
+class FakeRun:
+    """A run of so many iterations, which take no time."""
+
+    def __init__(self, count: int):
+        self.schedule, self.iteration = SimpleNamespace(is_auto=False, most=count), 0
+
+    @property
+    def is_done(self) -> bool:
+        return self.iteration == self.schedule.most
+
+    def step(self) -> str:
+        """One more iteration, and what is said of it."""
+        self.iteration += 1
+        return "PSNR 41.3/31.2 dB"
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_bar_of_80_columns_and_a_log(monkeypatch: pytest.MonkeyPatch, is_terminal: bool) -> None:
+    stderr = io.StringIO()
+    stderr.isatty = lambda: is_terminal  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", stderr)
+    monkeypatch.setenv("COLUMNS", "80")
+    run, folder = FakeRun(1000), SimpleNamespace(save_in_time=lambda run: None)
+    advance(run, run.step, folder, is_quiet=False, title="optimize")  # type: ignore[arg-type]
+    *states, last = stderr.getvalue().rstrip().split("\r")
+    assert len(last) < 80 and last.endswith("PSNR 41.3/31.2 dB]")
+    assert len(re.search(r"\|(.*)\|", last).group(1)) >= 10  # type: ignore[union-attr]
+    assert is_terminal or len(states) <= 2
 
 
 def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:

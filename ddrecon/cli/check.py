@@ -15,14 +15,25 @@ from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views
-from ddrecon.reconstruct.support import Support, describe_support, find_support, support_text
+from ddrecon.reconstruct.support import (
+    Support,
+    describe_support,
+    find_cut,
+    find_support,
+    support_text,
+)
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
+from ddrecon.scene_file.box import CELL
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
 from ddrecon.terms import engine_of_scene, needed_terms
+from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
+
+WIDE = 4.0
+"""Cells that are at least so many pixels wide to all views are told."""
 
 
 def memory_estimate(scene: Scene) -> int:
@@ -48,20 +59,27 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
             auto = replace(density, support=density.support or AUTO)
             with nullcontext() if density.support else suppress(SceneError):
                 support = find_support(train, replace(settings, parameters={"density": auto}))
-                if support is not None:
-                    # Without its pictures: those of a whole film take more memory than there is.
+                if support is not None and found:
+                    # Of a film the first pictures alone: all take more memory than there is.
                     views = [View(view.name, view.camera) for view in support.views]
-                    found.append(replace(support, views=views))
+                    support = replace(support, views=views)
+                found += [] if support is None else [support]
     return found
 
 
+def asks_support(scene: Scene) -> bool:
+    """Whether `scene` asks for a support of its density."""
+    density = scene.optimize.parameters.get("density") if scene.optimize else None
+    return density is not None and density.support is not None
+
+
 def describe(
-    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = ()
+    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = (), up: str = "y"
 ) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
-    that are not at their default.
+    that are not at their default; `up` is `volume.up`.
     """
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
@@ -70,6 +88,12 @@ def describe(
     loss = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
+    support = None
+    with suppress(SceneError) if not asks_support(scene) else nullcontext():
+        upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
+        support = describe_support(supports, grid, upright)
+        if support is not None and "cells" in support:
+            support["cut"] = find_cut(supports[0], grid)
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],
@@ -89,7 +113,7 @@ def describe(
         "physics": needed_terms(scene),
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
-        "support": describe_support(supports, grid),
+        "support": support,
         "engine": engine_of_scene(scene),
         "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
@@ -116,7 +140,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"grid: {sizes}, from {low} to {high}",
         f"views: {len(report['views'])}",
         *views,
-        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide",
+        f"cells: {min(widths):.2g} to {max(widths):.2g} pixels wide{_advise_on_cells(min(widths))}",
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
@@ -126,3 +150,13 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
+
+
+def _advise_on_cells(width: float) -> str:
+    """What to change where all views see cells at least so many pixels wide."""
+    if width < WIDE:
+        return ""
+    return (
+        f", which show less than the pictures: {CELL:g} would do, by smaller cells "
+        f"(volume.resolution: auto) or by pictures {width / CELL:.2g} times smaller"
+    )

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -36,6 +37,7 @@ def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     scene_file = session.read(scene)
     from ddrecon.cli.check import describe, lines, supports_of
+    from ddrecon.progress import tell
     from ddrecon.scene_file.frames import each_frame, require_frames
     from ddrecon.scene_file.load import find_expert_keys
 
@@ -43,9 +45,17 @@ def check(session: Session, scene: Path) -> None:
         require_frames(scene_file)
     expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
-    first = next(scenes)
-    supports = supports_of(chain([first], scenes))
-    report = describe(first, expert, supports)
+    up = getattr(scene_file.tree.volume, "up", "y")
+    with tell("reading pictures, and looking at what they show", session.is_quiet):
+        first = next(scenes)
+        supports = supports_of(chain([first], scenes))
+        report = describe(first, expert, supports, up)
+    support = report["support"] or {}
+    if (doubt := support.get("doubt")) and "cells" not in support:
+        raise scene_file.refused("volume.bounds", doubt)
+    for told in (doubt and f"volume.bounds: {doubt}", support.get("cut")):
+        if told is not None:
+            warn(told, DataWarning, 2)
     session.show(report, lines(report))
 
 
@@ -302,16 +312,19 @@ def optimize(
     if of_films := [option for option, value in given.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
     from ddrecon.io.files.folders import RUN, claim_folder
+    from ddrecon.progress import tell
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
 
     if not is_first():
         follow_run(session.build(scene_file), scene_file, resume=resume)
         return
     with claim_folder(output, RUN, overwrite=overwrite, resume=resume) as claimed:
-        built, environment = session.build(scene_file), session.environment()
-        run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
+        with tell("reading pictures and building the scene", session.is_quiet):
+            built, environment = session.build(scene_file), session.environment()
+        with tell("looking at what the pictures show", session.is_quiet):
+            run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
         summary = drive_run(run, folder, preview_every, session.is_quiet)
-    session.show(summary, summary_lines(summary, output))
+    session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
 
 
 @click.command()

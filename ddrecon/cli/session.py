@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -52,6 +53,7 @@ class Session:
     report: Path | None = None
     place: torch.device | None = None
     options: Mapping[str, str] = field(default_factory=dict)
+    begun: float = field(default_factory=monotonic)
 
     def start(self) -> torch.device:
         """Sets torch and the engine up as the options say; the device to compute on.

@@ -49,9 +49,9 @@ def estimate_noise(image: Tensor, step: float) -> Noise:
     do not have (Immerkaer 1996, doi:10.1006/cviu.1996.0060), by their median, so that edges hardly
     count; a line through the variances is read and shot noise. A small picture has read noise only.
     """
-    least = LEAST * float(image.square().mean().sqrt().clamp(min=torch.finfo(image.dtype).tiny))
+    least = least_noise(image, step)
     if min(image.shape[1:]) < 3:
-        return Noise(least, 0.0, step)
+        return least
     colors = image[:, None]
     # Second differences of second differences: 0 where values are linear in rows or columns.
     line = image.new_tensor([1.0, -2.0, 1.0])
@@ -65,7 +65,13 @@ def estimate_noise(image: Tensor, step: float) -> Noise:
     if step:  # which the differences have in them
         variances = (variances - (step / display_slope(levels)) ** 2 / 12).clamp(min=0)
     read_square, shot = _fit_line(levels.double(), variances.double())
-    return Noise(max(read_square**0.5, least), shot, step)
+    return Noise(max(read_square**0.5, least.read), shot, step)
+
+
+def least_noise(image: Tensor, step: float) -> Noise:
+    """The least noise that `image` [3, h, w] has."""
+    size = image.square().mean().sqrt().clamp(min=torch.finfo(image.dtype).tiny)
+    return Noise(LEAST * float(size), 0.0, step)
 
 
 def _fit_line(places: Tensor, values: Tensor) -> tuple[float, float]:

@@ -56,6 +56,8 @@ class Problem:
         powers = [target.power for target in targets_of(train, loss, noises).values()]
         power = float(torch.stack(powers).mean())
         support = find_support(train, settings)
+        if support is not None:
+            support.on(train.volume.grid)  # or there is nothing to find
         levels = factors(scene, settings.refine_at)
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 

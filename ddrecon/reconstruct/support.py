@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -10,12 +10,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.hull import HullError, bound_smoke, find_shown, hull_of
+from ddrecon.hull import (
+    OUTSIDE,
+    HullError,
+    bound_smoke,
+    bounds_text,
+    doubt_box,
+    find_shown,
+    hull_of,
+)
+from ddrecon.march.box import cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
+LOOKED_AT = 8192
+"""At most about so many pixels of a view are looked along to see what is cut off."""
+LOST = 0.002
+"""What a support cuts off is told from this part of a view's light on."""
 KEY = "optimize.parameters.density.support"
 
 
@@ -32,15 +46,17 @@ class Support:
     margin: float
 
     def on(self, grid: Grid) -> Tensor:
-        """Whether medium may be in each cell of `grid`, bool [z, y, x]; SceneError if in none."""
-        pairs = [
-            hull_of(view.camera, shown, grid, self.margin)
-            for view, shown in zip(self.views, self.shown, strict=True)
-        ]
-        may_hold, seen = (torch.stack(cells) for cells in zip(*pairs, strict=True))
+        """Whether medium may be in each cell of `grid`, bool [z, y, x].
+
+        Raises SceneError if in none, or if all that the views show lies beyond the grid.
+        """
+        may_hold, seen = self._hulls(grid)
         # What a view does not see may hold some.
         hulls = may_hold | ~seen
         hull = hulls.all(0)
+        doubt = None if bool(may_hold.all(0).any()) else doubt_support([self], grid).get("doubt")
+        if doubt is not None and doubt.startswith(OUTSIDE):
+            raise SceneError(f"volume.bounds: {doubt}")
         if not bool((hull & seen.any(0)).any()):
             parts = hulls.float().mean((1, 2, 3)).tolist()
             part, view = min(zip(parts, (view.name for view in self.views), strict=True))
@@ -51,36 +67,104 @@ class Support:
             )
         return hull
 
+    def _hulls(self, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Which cells may hold medium by each view, and which it sees: bool [V, z, y, x] each."""
+        pairs = [
+            hull_of(view.camera, shown, grid, self.margin)
+            for view, shown in zip(self.views, self.shown, strict=True)
+        ]
+        may_hold, seen = zip(*pairs, strict=True)
+        return torch.stack(may_hold), torch.stack(seen)
 
-def describe_support(supports: Sequence[Support], grid: Grid) -> dict[str, Any] | None:
+    def cut_pixels(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
+        """Of each view, which pixels show something where no cell of `grid` is left.
+
+        Their indices, among every n-th of the pixels that show something, n, and for each view how
+        many of these pixels it alone has left without a cell.
+        """
+        may_hold, seen = self._hulls(grid)
+        leaves_out = (~may_hold & seen).flatten(1)
+        for view, shown in zip(self.views, self.shown, strict=True):
+            every = 1 + int(shown.sum()) // LOOKED_AT
+            index = shown.flatten().nonzero()[::every, 0]
+            rays = cast_rays(view.camera).select(index)
+            crossing = cross_box(grid, rays)
+            index, rays = index[crossing.hit], rays.select(crossing.hit)
+            count = 2 * max(grid.shape)
+            far = (torch.arange(count, device=index.device) + 0.5) / count
+            far = crossing.near[:, None] + far * (crossing.far - crossing.near)[:, None]
+            places = rays.origin[:, None] + far[..., None] * rays.direction[:, None]
+            low, step = (places.new_tensor(x) for x in (grid.lower, grid.spacing))
+            most = index.new_tensor(grid.shape) - 1
+            z, y, x = ((places - low) / step).long().clamp(min=0).minimum(most).unbind(-1)
+            out = leaves_out[:, (z * grid.shape[1] + y) * grid.shape[2] + x]
+            is_cut, by = (out.any(0)).all(1), out.sum(0)
+            alone = [int((is_cut & ((by == 1) & one).any(1)).sum()) for one in out]
+            yield index[is_cut], every, alone
+
+
+def describe_support(
+    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
+) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
-    That is the part of the cells of `grid` that any keeps, and the corners (x, y, z) of the box
-    that would do, where the pictures tell.
+    That is the part of the cells of `grid` that any keeps, and what `doubt_support` says.
     """
     if not supports:
         return None
-    kept = torch.stack([support.on(grid) for support in supports]).any(0)
-    described: dict[str, Any] = {"cells": float(kept.float().mean())}
+    described = doubt_support(supports, grid, upright)
+    if not described.get("doubt", "").startswith(OUTSIDE):
+        kept = torch.stack([support.on(grid) for support in supports]).any(0)
+        described["cells"] = float(kept.float().mean())
+    return described
+
+
+def doubt_support(
+    supports: Sequence[Support], grid: Grid, upright: tuple[int, int] = (1, 1)
+) -> dict[str, Any]:
+    """The corners (x, y, z) of the `box` that would do, and what is in `doubt` of that of `grid`.
+
+    Neither where the pictures do not tell; `upright` is as for `doubt_box`.
+    """
     with suppress(HullError):
         frames = [(support.views, support.shown) for support in supports]
-        described["box"] = bound_smoke(frames, supports[0].margin).tolist()
-    return described
+        box = bound_smoke(frames, supports[0].margin)
+        doubt = doubt_box(box, box.new_tensor(grid.bounds_xyz), upright)
+        return {"box": box.tolist()} | ({} if doubt is None else {"doubt": doubt})
+    return {}
+
+
+def find_cut(support: Support, grid: Grid) -> str | None:
+    """Whether `support` leaves no cell of `grid` where views show smoke, and which view does it."""
+    cut, by = dict[str, float](), [0] * len(support.views)
+    for view, (index, every, alone) in zip(support.views, support.cut_pixels(grid), strict=True):
+        assert view.image is not None
+        strength = (view.image - (0.0 if view.background is None else view.background)).abs()
+        light = strength.amax(0).flatten()
+        part = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
+        if part > LOST:
+            cut[view.name], by = part, [a + b for a, b in zip(by, alone, strict=True)]
+    if not cut:
+        return None
+    names = ", ".join(f"{name} ({100 * part:.2g} % of its light)" for name, part in cut.items())
+    blamed = "the cameras"
+    if max(by) > 0:
+        blamed = f"camera {support.views[by.index(max(by))].name}, which alone shows nothing there"
+    return f"support? it cuts off what views show: {names}; check {blamed}, or raise {KEY}_margin"
 
 
 def support_text(support: dict[str, Any]) -> str:
     """What `describe_support` says, as a line."""
     described = f"pictures leave smoke in {100 * support['cells']:.3g} % of the cells"
     if "box" in support:
-        low, high = (", ".join(f"{x:.3g}" for x in corner) for corner in support["box"])
-        described += f", within bounds: {{min: [{low}], max: [{high}]}}"
+        described += f"; what they show fits in {bounds_text(torch.tensor(support['box']))}"
     return described
 
 
 def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     """The support of density that `settings` ask for, by the views of `train`; None is anywhere.
 
-    Raises SceneError where a view shows nothing at all, or no cell is left.
+    Raises SceneError where a view shows nothing at all.
     """
     density = settings.parameters.get("density")
     if density is None or density.support is None:
@@ -94,6 +178,4 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
         known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
         by = known[density.support]
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
-    support = Support(train.views, shown, density.support_margin)
-    support.on(train.volume.grid)
-    return support
+    return Support(train.views, shown, density.margin)

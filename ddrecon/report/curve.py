@@ -22,10 +22,15 @@ MOST = 500
 
 
 def draw_curve(
-    title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False
+    title: str,
+    series: Mapping[str, Sequence[Point]],
+    across: str,
+    is_logarithmic: bool = False,
+    steps: Sequence[float] = (),
 ) -> str:
     """The `series` of points (x, y) as lines of an SVG with a legend; `across` says what x is.
 
+    Lines from top to bottom mark what changes at the `steps` of x.
     With `is_logarithmic`, y > 0 is drawn by its logarithm. There must be at least one point; those
     that are not finite are left out.
     """
@@ -49,6 +54,9 @@ def draw_curve(
         parts.append(_text(LEFT - 6, y + 4, label, "end"))
     for value in ticks(left, right):
         parts.append(_text(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
+    for x in map(across_at, steps):
+        ends = f'x1="{x:.1f}" y1="{TOP}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM}"'
+        parts.append(f'<line {ends} stroke="currentColor" stroke-dasharray="4 4"/>')
     parts.append(_line(HEIGHT - BOTTOM, 0.7))
     parts.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
     # The curves, and their names in the legend.

@@ -13,9 +13,12 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
+from ddrecon.hull import bounds_text
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
-from ddrecon.scene import View
+from ddrecon.reconstruct.support import Support, find_cut
+from ddrecon.scene import Scene, View
 
 OVERFIT = 6.0
 """Held-out views this much worse than those trained on [dB] are not explained by noise."""
@@ -24,7 +27,11 @@ GAIN = 1.15
 SHIFT = 0.5
 """A render that fits better when moved by more pixels was seen by another camera."""
 EXPLAINED = 0.3
-"""The part of a residual that a factor or such a move has to explain."""
+"""The part of a residual that a factor has to explain."""
+MOVED = 0.2
+"""The part that such a move has to explain: a volume fitted to other views hides the rest."""
+GHOSTS = 0.01
+"""Views held out are worse for density where no picture shows smoke, from this part of it on."""
 WORTHWHILE = 0.1
 """A run is unfinished where as many iterations again would take this part off its loss."""
 SURE = 3.0
@@ -32,19 +39,22 @@ SURE = 3.0
 
 
 def diagnose(
-    views: Sequence[View],
+    scene: Scene,
     images: Mapping[str, Tensor],
     quality: Mapping[str, Mapping[str, float]],
     rows: Sequence[Row],
+    support: Support | None = None,
+    box: Tensor | None = None,
 ) -> list[dict[str, str]]:
-    """What seems to be wrong with a run that has rendered `images` of its `views`.
+    """What seems to be wrong with a run that has found `scene` and rendered `images` of its views.
 
-    `quality` has the PSNR of each, `rows` are its log. Each is a word that names its `kind`, and a
-    sentence, its `text`.
+    `quality` has the PSNR of each, `rows` are its log, `support` is where density was sought and
+    `box` [2, 3] holds what its pictures show. Each is a word that names its `kind`, and a sentence,
+    its `text`.
     """
-    seen = [view for view in views if view.image is not None]
+    seen = [view for view in scene.views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
-    overfit = find_overfit(seen, quality)
+    overfit = find_overfit(seen, quality, find_ghosts(scene.volume, box))
     gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
     usual, share = median(gains) if len(gains) > 2 else 1.0, _promised_share(rows, sure=0)
     # What is not yet explained is no picture's fault as long as going on may explain it: that is
@@ -55,24 +65,45 @@ def diagnose(
         least = max(EXPLAINED, share)
     found = {
         "overfit": overfit,
+        "support": None if support is None else find_cut(support, scene.volume.grid),
         "exposure": find_exposure(trained, images, usual, least),
-        "cameras": find_shift(trained, images, least),
+        "cameras": find_shift(trained, images, max(MOVED, share or 0) if least < 1 else 1.0),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
     }
     return [{"kind": kind, "text": text} for kind, text in found.items() if text is not None]
 
 
-def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float]]) -> str | None:
-    """Whether views that were held out are far worse than those trained on."""
+def find_overfit(
+    views: Sequence[View], quality: Mapping[str, Mapping[str, float]], ghosts: str | None
+) -> str | None:
+    """Whether views that were held out are far worse than those trained on, perhaps by `ghosts`."""
     test, train = (
         [quality[v.name]["psnr"] for v in views if v.is_test is k] for k in (True, False)
     )
     if not test or not train or mean(train) - mean(test) < OVERFIT:
         return None
+    advice = ghosts or "raise optimize.parameters.density.tv"
     return (
         f"overfit: views held out are {mean(train) - mean(test):.1f} dB worse than those trained "
-        "on; raise optimize.parameters.density.tv, add views, or look for cameras that are off"
+        f"on; {advice}, add views, or look for cameras that are off"
+    )
+
+
+def find_ghosts(volume: Volume, box: Tensor | None) -> str | None:
+    """Whether density is where few cameras look: outside the `box` [2, 3] of what pictures show."""
+    if box is None:
+        return None
+    centers = reversed(volume.grid.centers(volume.density))
+    inside = torch.ones_like(volume.density, dtype=torch.bool)
+    for places, low, high in zip(centers, *box.tolist(), strict=True):
+        inside &= (low <= places) & (places <= high)
+    part = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
+    if part < GHOSTS:
+        return None
+    return (
+        f"{100 * part:.2g} % of the density is where the pictures show no smoke and few cameras "
+        f"look: take volume.{bounds_text(box)}, raise optimize.parameters.density.tv"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,14 @@ from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder
-from ddrecon.progress import bar_settings
+from ddrecon.progress import SHORT, bar_settings, say, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import support_text
 from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.quality import describe_loss, loss_text
-from ddrecon.run.report import registered_text
+from ddrecon.run.report import FINER, registered_text
 from ddrecon.run.run_folder import CHECKPOINTS, SCENE, Checkpoints, RunFolder, write_scene
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, referenced_files
@@ -105,19 +104,22 @@ def drive_run(
     `preview_every` counts iterations between pictures; `title` is that of the progress bar, of a
     frame that of a film.
     """
-    if not is_quiet and title == OPTIMIZE:
-        loss = describe_loss(run.problem.settings, run.problem.train)
-        tqdm.write(loss_text(loss), file=sys.stderr)
+    is_silent = is_quiet or title != OPTIMIZE
+    say(loss_text(describe_loss(run.problem.settings, run.problem.train)), is_silent)
+    cells = 0
 
     def make_iteration() -> str:
+        nonlocal cells
         row = run.step()
         folder.log.add(row)
+        if cells not in (0, row.cells):
+            say(f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}", is_silent)
+        cells = row.cells
         if preview_every and row.iteration % preview_every == 0:
             folder.preview(run)
         known = run.total.test_psnr
         test = "" if known is None else f"/{known:.1f}"
-        solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
-        return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
+        return f"PSNR {row.psnr:.1f}{test} dB"
 
     advance(run, make_iteration, folder, is_quiet, title)
     # What is left the first rank does by itself.
@@ -127,7 +129,8 @@ def drive_run(
         return tqdm(views, desc=what, leave=False, **bar_settings(is_quiet))
 
     try:
-        return folder.finish(run, show)
+        with tell("rendering what was found, and writing it with its report", is_silent):
+            return folder.finish(run, show)
     except KeyboardInterrupt:
         made = f"after {run.iteration} iterations"
         raise KeyboardInterrupt(f"{made}; write its results with --resume") from None
@@ -147,7 +150,8 @@ def advance(
     failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.most
-    bar = tqdm(total=total, initial=run.iteration, desc=title, **bar_settings(is_quiet))
+    form, settings = SHORT if total else None, bar_settings(is_quiet)
+    bar = tqdm(total=total, initial=run.iteration, desc=title, bar_format=form, **settings)
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:
         try:
@@ -168,10 +172,14 @@ def advance(
             ) from error
 
 
-def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
-    """The `summary` of a run that is done, in `folder`, as lines."""
+def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list[str]:
+    """The `summary` of a run that is done, in `folder`, as lines; all of it took so many `seconds`.
+
+    Those of its iterations count what was done before it was resumed, too.
+    """
     line = (
-        f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: "
+        f"{summary['iterations']} iterations in {summary['seconds']:.1f} s, and {seconds:.1f} s "
+        "with all before and after: "
         f"loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
     )
     if summary["test_psnr"] is not None:

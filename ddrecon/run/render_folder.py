@@ -33,6 +33,8 @@ GRADIENT = ".gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
 AT_REST = 0.01
 """Light that a transport round changes by a smaller part has come to rest."""
+FEW = 12
+"""Of more views only the first and the last are printed."""
 PARTS = (".reduced", ".single", ".multiple")
 
 
@@ -144,12 +146,17 @@ def require_variation(scene: Scene, parameter: str) -> None:
 
 
 def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
-    """What `render` prints of its `report`: files, quality and time of each view."""
+    """What `render` prints of its `report`: files, quality and time of each view.
+
+    Where there are more than a few, those between the first and the last are counted.
+    """
     lines = []
     for name, files in report["files"].items():
         notes = [f"{report['seconds']['views'][name]:.2f} s"]
         notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
         lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
+    if len(lines) > FEW:
+        lines[1:-1] = [f"... {len(lines) - 2} views between them, in render.json"]
     if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
         lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
     if "rounds" in report:

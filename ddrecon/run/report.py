@@ -5,7 +5,9 @@ Target and render of a view stand side by side as they are displayed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -16,6 +18,7 @@ from ddrecon.engine import name_engines
 from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -36,6 +39,7 @@ from ddrecon.report.page import (
 from ddrecon.report.pictures import find_white, pixels, projections, shrink, slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.quality import Findings
+from ddrecon.run.registration import shift_between
 from ddrecon.scene import Scene, View
 from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
@@ -47,6 +51,10 @@ PIXELS = 1_200_000
 """So many pixels all pictures of views have together, at most."""
 GOES_ON = {"kind": "running", "text": "goes on"}
 """How a run has `ended` that has not."""
+LISTED = 12
+"""More numbers of one parameter are not listed."""
+FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"
+"""Why held-out views seem to get worse where the resolution changes."""
 LARGEST = 256
 """Pixels along the longer side of a picture, at most."""
 
@@ -57,8 +65,12 @@ def write_run_report(
     rows: Sequence[Row],
     summary: Mapping[str, Any],
     environment: Mapping[str, Any],
+    numbers: Sequence[tuple[str, str, str]],
 ) -> None:
-    """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log."""
+    """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log.
+
+    `numbers` are those of `found_numbers`.
+    """
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene))
     known = {key: value for key, value in environment.items() if key != "engines"}
@@ -67,8 +79,9 @@ def write_run_report(
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
         section("Volume", volume_section(findings, summary)),
-        section("Loss", side_by_side(*curves(rows))),
+        section("Loss", side_by_side(*curves(rows)), *_explain_steps(rows)),
         section("Views", *view_section(findings)),
+        *([section("Numbers found", table(["", "start", "found"], numbers))] if numbers else []),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", settings)),
         section("Versions", versions(known)),
@@ -76,6 +89,27 @@ def write_run_report(
     title = f"ddrecon: {path.absolute().parent.name}"
     goes_on = summary["ended"]["kind"] == GOES_ON["kind"]
     write_page(path, title, _lead(scene, summary), sections, is_alive=True, goes_on=goes_on)
+
+
+def found_numbers(run: Reconstruction, scene: Scene) -> list[tuple[str, str, str]]:
+    """What `run` has found that is neither a field nor a map: its name, start and value in `scene`.
+
+    Of a pose that is by how much the camera moved and turned.
+    """
+    found = []
+    for parameter in run.parameters:
+        start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
+        if parameter.key == "camera" and parameter.view is not None:
+            before, after = (of.view(parameter.view).camera for of in (run.problem.scene, scene))
+            moved = shift_between(before, after, scene.volume)
+            cosine = ((before.pose[:, :3] * after.pose[:, :3]).sum() - 1) / 2
+            turned = math.degrees(math.acos(min(1.0, float(cosine))))
+            text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
+            found.append((parameter.name, "as given", text))
+        elif not parameter.is_field and len(value) <= LISTED:
+            begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
+            found.append((parameter.name, begun, ended))
+    return found
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
@@ -146,9 +180,24 @@ def curves(rows: Sequence[Row]) -> list[str]:
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
     if tests:
         quality["held out"] = tests
+    steps = [float(row.iteration) for row in _steps(rows)]
     return [
-        draw_curve("loss", losses, "iteration", is_logarithmic=True),
-        draw_curve("PSNR [dB]", quality, "iteration"),
+        draw_curve("loss", losses, "iteration", is_logarithmic=True, steps=steps),
+        draw_curve("PSNR [dB]", quality, "iteration", steps=steps),
+    ]
+
+
+def _steps(rows: Sequence[Row]) -> list[Row]:
+    """The first row of each resolution but the first."""
+    return [row for before, row in pairwise(rows) if row.cells != before.cells]
+
+
+def _explain_steps(rows: Sequence[Row]) -> list[str]:
+    if not (steps := _steps(rows)):
+        return []
+    at = ", ".join(str(row.iteration) for row in steps)
+    return [
+        paragraph(f"A line from top to bottom: the cells are finer from there ({at}). {FINER}.")
     ]
 
 

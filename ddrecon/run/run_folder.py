@@ -32,7 +32,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import GOES_ON, write_run_report
+from ddrecon.run.report import GOES_ON, found_numbers, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
@@ -159,13 +159,14 @@ class RunFolder(Checkpoints):
             if start >= self.next_page:
                 found = find_results(run)
                 summary = _summary(run) | {"ended": GOES_ON}
-                self._report(found, summary | {"views": found.quality, "diagnoses": []})
+                self._report(run, found, summary | {"views": found.quality, "diagnoses": []})
                 seconds = monotonic() - start
                 self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
 
-    def _report(self, found: Findings, summary: Mapping[str, Any]) -> None:
-        rows = self.log.rows(summary["iterations"])
-        write_run_report(self.path / REPORT, found, rows, summary, self.environment)
+    def _report(self, run: Reconstruction, found: Findings, summary: Mapping[str, Any]) -> None:
+        rows, numbers = self.log.rows(run.iteration), found_numbers(run, found.scene)
+        path = self.path / REPORT
+        write_run_report(path, found, rows, summary, self.environment, numbers)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -183,12 +184,14 @@ class RunFolder(Checkpoints):
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)
-        diagnoses = diagnose(scene.views, found.images, found.quality, rows)
-        summary = _summary(run) | {"views": found.quality, "diagnoses": diagnoses}
+        summary, support = _summary(run) | {"views": found.quality}, run.problem.support
+        box = summary.get("support", {}).get("box")
+        box = None if box is None else torch.tensor(box)
+        summary["diagnoses"] = diagnose(scene, found.images, found.quality, rows, support, box)
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
-        self._report(found, summary)
+        self._report(run, found, summary)
         write_json(self.path / SUMMARY, summary)
         return summary
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from statistics import mean
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import pixel_width
+from ddrecon.errors import DataWarning
 from ddrecon.hull import HullError, bound_smoke, find_shown
 from ddrecon.scene import View
 from ddrecon.scene_file.build_views import build_views
@@ -21,6 +23,8 @@ from ddrecon.settings import AUTO, ParameterSettings
 
 CELL = 2.0
 """How many pixels wide a cell is."""
+MANY_CELLS = 2**22
+"""More cells than these take hours."""
 
 
 def fit_volume(scene_file: SceneFile) -> SceneFile:
@@ -43,12 +47,17 @@ def fit_volume(scene_file: SceneFile) -> SceneFile:
         cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
         x, y, z = (max(1, math.ceil(side / cell)) for side in sides.tolist())
         resolution = x, y, z
+        if x * y * z > MANY_CELLS:
+            times = math.ceil((x * y * z / MANY_CELLS) ** (1 / 3))
+            fewer = f"pictures {times} times smaller along each side make {times**3} times fewer"
+            what = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
+            warnings.warn(f"volume.resolution: {what}", DataWarning, 2)
         sides = cell * sides.new_tensor(resolution)
     if not isinstance(bounds, Bounds):
         digits = 3 - math.floor(math.log10(float(sides.max())))
-        low, high = (
-            [round(x, digits) for x in (middle + end * sides).tolist()] for end in (-0.5, 0.5)
-        )
+        low = [round(x, digits) for x in (middle - sides / 2).tolist()]
+        # Sides have more digits, or cells would be no cubes.
+        high = [round(x + side, digits + 5) for x, side in zip(low, sides.tolist(), strict=True)]
         bounds = Bounds((low[0], low[1], low[2]), (high[0], high[1], high[2]))
     volume = replace(tree.volume, bounds=bounds, resolution=resolution)
     return replace(scene_file, tree=replace(tree, volume=volume))
@@ -66,7 +75,7 @@ def _find_box(scene_file: SceneFile) -> Tensor:
             yield views, [find_shown(view, density.support or AUTO) for view in views]
 
     try:
-        return bound_smoke(frames(), density.support_margin)
+        return bound_smoke(frames(), density.margin)
     except HullError as error:
         what = f"auto: {error}; or give min and max in numbers"
         raise scene_file.refused("volume.bounds", what) from error

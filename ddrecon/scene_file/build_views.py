@@ -10,7 +10,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, cast_rays, edge_places, image_places, look_at, project
+from ddrecon.cameras import (
+    Camera,
+    cast_rays,
+    edge_places,
+    image_places,
+    look_at,
+    pixel_width,
+    project,
+)
 from ddrecon.errors import FormatError, Problems
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
@@ -27,6 +35,9 @@ READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "mask": read_mask,
 }
 """What reads the pictures of a view, by their keys."""
+SAME_UNIT = "are volume.bounds and the cameras in the same unit?"
+USUAL = 0.3, 10.0
+"""Pictures are so many times as wide as the box where cameras have its unit."""
 CHECKED = 1000
 """Within an image, distortion is checked at so many places; and at all of its edges."""
 COARSER = 8
@@ -189,15 +200,15 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
 
     Others may see it by chance.
     """
+    unit = _explain_unit(cameras, grid)
     if all(_looks_at(camera, grid) for camera in blind):
-        return (
-            "it is in the picture, but smaller than a pixel: are volume.bounds and the cameras in"
-            " the same unit?"
-        )
+        return f"it is in the picture, but smaller than a pixel: {unit or SAME_UNIT}"
     for what, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
         turned = [replace(camera, pose=convert(camera.pose)) for camera in cameras]
         if all(_looks_at(camera, grid) for camera in turned):
             return f"it would with matrices read otherwise; they seem to be {what}"
+    if unit:
+        return unit
     pose = blind[0].pose.double()
     is_behind = torch.dot(pose.new_tensor(grid.center_xyz) - pose[:, 3], -pose[:, 2]) < 0
     return (
@@ -205,6 +216,21 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
         " view or width, and that volume.bounds has the units and axes of the cameras, whose"
         " matrices are camera to world with x right, y up and z backward (OpenGL's axes)"
     )
+
+
+def _explain_unit(cameras: Sequence[Camera], grid: Grid) -> str:
+    """By which factor on lengths all `cameras` would see the box at a usual size, if by any."""
+    fits, middle = list[tuple[float, float]](), cameras[0].pose.new_tensor(grid.center_xyz)
+    for times in (10.0**power for power in (-3, -2, -1, 1, 2, 3)):
+        scale = middle.new_tensor([1, 1, 1, times])
+        scaled = [replace(camera, pose=camera.pose * scale) for camera in cameras]
+        widths = [pixel_width(c, middle) * c.size[1] for c in scaled if _looks_at(c, grid)]
+        least, most = (end(widths, default=1.0) / math.dist(*grid.bounds_xyz) for end in (min, max))
+        if len(widths) == len(cameras) and USUAL[0] < least <= most < USUAL[1]:
+            fits.append((abs(math.log(least * most)), times))
+    if not fits:
+        return ""
+    return f"it would with lengths of the cameras times {min(fits)[1]:g}: {SAME_UNIT}"
 
 
 def _inverse(pose: Tensor) -> Tensor:

@@ -149,6 +149,8 @@ def _read_text(node: Node, kinds: Sequence[Any], rule: Rule) -> str | Path:
         raise node.refused(f"expected text that can be printed, found {describe_found(node)}")
     if Path in kinds:
         return path_in(rule.folder, text)
+    if choices and text not in choices:
+        raise _refused(node, rule)
     _check_choice(node, choices or rule.limits.get("choices", ()), rule)
     return text
 

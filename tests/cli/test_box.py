@@ -78,6 +78,7 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
         assert pixel < min(ends) <= max(ends) < 9 * pixel
     cells = np.subtract(volume.bounds.max, volume.bounds.min) / volume.resolution
     np.testing.assert_allclose(cells, 2 * pixel, rtol=0.05)
+    np.testing.assert_allclose(cells, cells[0], rtol=1e-6)
     dump_scene(describe(found), Path("plain.yaml"))
     assert "auto" not in Path("plain.yaml").read_text()
     assert read_scene("plain.yaml").tree == found.tree
@@ -94,7 +95,7 @@ def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
     assert read_scene(dark).tree.volume == bright
     told = run("check", "auto.yaml").stdout
     assert f"from {list(bright.bounds.min)} to {list(bright.bounds.max)}" in told
-    assert "within bounds: {min: [" in told
+    assert "what they show fits in bounds: {min: [" in told
     least, most = re.search("cells: (.*) to (.*) pixels wide", told).groups()
     assert float(least) < 2 < float(most)
 
@@ -117,3 +118,41 @@ def test_what_pictures_do_not_tell_is_asked_for(
     scene(**make)
     (told, *_) = refuse(2, "check", "auto.yaml", *(word for o in overrides for word in ("-D", o)))
     assert line in told
+
+
+def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
+    scene: Callable[..., Path], run: Callable[..., Result], refuse
+) -> None:
+    """By `check` and, where the support is asked for, before anything is optimized."""
+    box = "volume.bounds={{min: [{0}, 0, {0}], max: [{1}, 1, {1}]}}"
+    scene()
+    still = (
+        "frames=null",
+        "volume.resolution=[8, 8, 8]",
+        *(f"views.{i}.image=v{i}_0.npy" for i in range(3)),
+    )
+    options = ["auto.yaml", *(word for override in still for word in ("-D", override))]
+    auto = "-D", "optimize.parameters.density.support=auto"
+    away = *options, "-D", box.format(0.45, 0.9)
+    refused = [refuse(2, "check", *away), refuse(2, "check", *away, *auto)]
+    refused.append(refuse(2, "optimize", *away, *auto, "-o", "run"))
+    assert all("volume.bounds: no overlap" in told[0] for told in refused)
+    assert "max: [" in refused[0][0] and not Path("run").exists()
+    told = run("check", *options, "-D", box.format(-9, 9))
+    assert told.exit_code == 0 and "volume.bounds: far too large" in told.stderr
+
+
+def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
+    scene: Callable[..., Path], run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With by how much smaller pictures would do."""
+    scene()
+    told = run("check", "auto.yaml", "-D", "volume.resolution=[4, 4, 4]").stdout
+    (width,) = re.findall("cells: (.*) to", told)
+    assert f"by pictures {float(width) / 2:.1g}" in told and "times smaller" in told
+    assert "times smaller" not in run("check", "auto.yaml").stdout
+    x, y, z = read_scene("auto.yaml").tree.volume.resolution
+    monkeypatch.setattr("ddrecon.scene_file.box.MANY_CELLS", x * y * z // 8 + 1)
+    told = run("check", "auto.yaml").stderr
+    assert f"{x} x {y} x {z} cells two pixels wide take hours: pictures 2 times smaller" in told
+    assert told.count("take hours") == 1

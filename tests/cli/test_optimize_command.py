@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -154,6 +155,53 @@ def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
     assert "register: " in loud.stderr
     assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
+
+
+def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(run: Run) -> None:
+    """By its lines and the curves of its report: held-out views seem to get worse there."""
+    options = "-D", "volume.resolution=[16, 16, 16]", "-D", "optimize.refine_at=[0.5]"
+    start = time.monotonic()
+    told = run("optimize", "scene.yaml", "-o", "one", *options)
+    taken = time.monotonic() - start
+    cells = [row["cells"] for row in rows("one")]
+    (step,) = (i + 1 for i in range(1, 4) if cells[i] != cells[i - 1])
+    assert (
+        f"iteration {step}: 4,096 cells from here; PSNRs are of pictures as coarse" in told.stderr
+    )
+    page = Path("one/report.html").read_text()
+    assert page.count("stroke-dasharray") == 2 and f"finer from there ({step})" in page
+    of_all, of_iterations = (
+        float(re.search(words, told.stdout).group(1))
+        for words in (r"and (\S+) s with all", r"iterations in (\S+) s")
+    )
+    assert of_iterations < of_all <= taken + 0.1
+
+
+def test_what_takes_long_before_and_after_the_bar_is_told(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "..." not in run("optimize", "scene.yaml", "-o", "short").stderr
+    monkeypatch.setattr("ddrecon.progress.LONG", 0.0)
+    told = run("optimize", "scene.yaml", "-o", "long").stderr
+    stages = ("reading pictures", "looking at what", "optimize:", "rendering what was found")
+    places = [told.index(stage) for stage in stages]
+    assert places == sorted(places) and run(*OPTIMIZE, "quiet").stderr == ""
+
+
+def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
+    """As parameters.json has them; of a camera by how much it moved."""
+    searched = ["lights.0.irradiance={init: 2}", "views.front.exposure={init: 0.9}"]
+    searched += ["views.front.camera={}"]
+    options = [f"optimize.parameters.{each}" for each in searched]
+    succeed(*OPTIMIZE, "one", *(word for option in options for word in ("-D", option)))
+    page, found = Path("one/report.html").read_text(), read_json("one/parameters.json")
+    for name, start in (("lights.0.irradiance", 2), ("views.front.exposure", 0.9)):
+        values = ", ".join(f"{x:.4g}" for x in np.ravel(found[name]))
+        cells = [name, ", ".join([f"{start:.4g}"] * np.size(found[name])), values]
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+    (moved,) = re.findall(r"moved by ([\d.]+) pixels, turned by [\d.e-]+ degrees", page)
+    matrix = np.array(found["views.front.camera"]["matrix"])
+    assert (float(moved) > 0) == (abs(matrix[:3, 3] - [0, 0, 2.5]).max() > 1e-3)
 
 
 def test_divergence_keeps_the_last_good_state(run: Run) -> None:

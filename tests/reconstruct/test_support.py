@@ -12,9 +12,10 @@ from media import box_grid, make_camera, tensor
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
-from ddrecon.hull import brightest_black, hull_of
+from ddrecon.hull import find_shown, hull_of
+from ddrecon.pictures import srgb
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
@@ -126,8 +127,41 @@ def test_auto_tells_black_from_faint_smoke_by_the_noise(read: float) -> None:
     faint = torch.zeros(120, 90, dtype=torch.bool)
     faint[40:80, 30:60] = True
     image[:, faint] += 8 * read
-    shown = image.amax(0) > brightest_black(image, 0.0)
+    shown = find_shown(View("", CAMERAS["pinhole"], image), "auto")
     assert shown[faint].float().mean() > 0.99 and shown[~faint].float().mean() < 0.001
+
+
+def speckle(block: int, part: float) -> torch.Tensor:
+    """1 to 3 in this part of [320, 320] pixels and 0 in others, by blocks of a half of such."""
+    generator = torch.Generator().manual_seed(2)
+    values = torch.randint(1, 4, (320, 320), generator=generator).float()
+    shape = (320 // block, 320 // block)
+    blocks = torch.rand(shape, generator=generator) < part * (1 if block == 1 else 2)
+    blocks = blocks.repeat_interleave(block, 0).repeat_interleave(block, 1)
+    return values * blocks * (torch.rand(320, 320, generator=generator) < (0.5 if block > 1 else 1))
+
+
+@pytest.mark.parametrize(
+    ("uneven", "block", "part"),
+    [(0, 1, 0.01), (0, 4, 0.01), (0, 1, 0.2), (50, 1, 0)],
+)
+def test_auto_takes_no_noise_of_compression_for_smoke(
+    uneven: float, block: int, part: float
+) -> None:
+    """A picture of 8 bits shows a cloud, how `uneven` it may be, its faint stem, and no noise."""
+    y, x = torch.arange(320)[:, None], torch.arange(320)
+    cloud = (x - 160) ** 2 + (y - 120) ** 2 < 80**2
+    stem = (y > 200) & ((x - 160).abs() < 4) & (y < 300)
+    # Uneven where it is thin.
+    core = (x - 160) ** 2 + (y - 120) ** 2 < 50**2
+    thin = 80 + uneven * torch.sin(2 * x) * torch.sin(2 * y)
+    bright = torch.where(core, 220, torch.where(cloud, thin, 7.0 * stem))
+    encoded = torch.maximum(bright.round(), speckle(block, part)) / 255
+    image = torch.from_numpy(srgb.decode(encoded.numpy())).float().expand(3, -1, -1)
+    shown = find_shown(View("", CAMERAS["pinhole"], image, step=1 / 255), "auto")
+    assert bool(shown[cloud | stem].all())
+    away = torch.nn.functional.max_pool2d((cloud | stem).float()[None], 9, 1, 4)[0] == 0
+    assert float(shown[away].float().mean()) < 2e-4
 
 
 def refusal(scene: Scene) -> str:

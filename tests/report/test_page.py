@@ -98,6 +98,9 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
     points = [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]
     (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
+    stepped = draw_curve("a", {"": [(0.0, 1.0), (2.0, 3.0), (8.0, 1.0)]}, "x", steps=[2.0])
+    (at,) = re.findall(r'<line x1="([\d.]+)" [^>]*dasharray', stepped)
+    assert float(at) == places(stepped)[0][1][0]
     assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
 
 

@@ -13,6 +13,7 @@ from ddrecon.cameras import twist
 from ddrecon.losses import Target
 from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.support import Support
 from ddrecon.renderer import render
 from ddrecon.run.diagnoses import (
     best_shift,
@@ -71,7 +72,7 @@ def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
             view.name: {"psnr": float(Target.of(view.image, view.mask).psnr_of(images[view.name]))}
             for view in scene.views
         }
-        diagnoses = diagnose(scene.views, images, quality, rows)
+        diagnoses = diagnose(found, images, quality, rows)
         told.append([each["kind"] for each in diagnoses])
     return told
 
@@ -105,6 +106,62 @@ def test_a_fault_is_told_and_no_other(kind: str) -> None:
     scene = make_scene()
     fault(scene)
     assert kinds(scene, iterations) == [kind] * (kind != "clean")
+
+
+def images_of(scene: Scene) -> dict[str, torch.Tensor]:
+    """What each view of `scene` shows, by name."""
+    with torch.no_grad():
+        return {view.name: render(scene, view.name)[0] for view in scene.views}
+
+
+AT_REST = [replace(NO_ROWS, iteration=i + 1, loss=1.0, cells=8) for i in range(60)]
+"""The log of a run that has come to rest."""
+
+
+@pytest.mark.parametrize("rows", [0, 4])
+def test_what_a_support_cuts_off_is_told_with_the_view_that_does(rows: int) -> None:
+    """One of seven cameras is off by some rows, so that it shows nothing where the others do."""
+    scene = make_scene()
+    shown = [view.image.amax(0) > 0.3 * view.image.max() for view in scene.views]
+    shown[3] = torch.roll(shown[3], -rows, 0)
+    support, grid = Support(scene.views, shown, 0.0), scene.volume.grid
+    found = with_values(scene, {"density": scene.volume.density * support.on(grid)})
+    quality = {view.name: {"psnr": 30.0} for view in scene.views}
+    told = diagnose(found, images_of(found), quality, AT_REST, support)
+    texts = [each["text"] for each in told if each["kind"] == "support"]
+    assert len(texts) == (rows > 0)
+    assert all(f"check camera {scene.views[3].name}, which alone" in text for text in texts)
+
+
+@pytest.mark.parametrize("corner", [0.0, 0.1])
+def test_density_in_corners_that_few_cameras_see_asks_for_a_tighter_box(corner: float) -> None:
+    """Where views held out are far worse; or else for more smoothing, as ever."""
+    scene = make_scene("views.6.split=test")
+    density = torch.zeros(scene.volume.grid.shape)
+    density[3:5, 3:5, 3:5], density[0, 0, 0] = 1.0, 8 * corner
+    found = with_values(scene, {"density": density})
+    quality = {view.name: {"psnr": 24.0 if view.is_test else 31.0} for view in scene.views}
+    box = torch.tensor(scene.volume.grid.bounds_xyz) / 2
+    (told,) = diagnose(found, images_of(scene), quality, AT_REST, None, box)[:1]
+    assert told["kind"] == "overfit" and "density.tv" in told["text"]
+    assert ("take volume.bounds: {min: [" in told["text"]) == (corner > 0)
+
+
+def test_a_camera_is_told_though_a_volume_fitted_to_all_hides_most_of_it() -> None:
+    """A render that is moved would fit a decibel better, by a quarter of what it leaves."""
+    scene = make_scene("volume.resolution=[16, 16, 16]")
+    images = images_of(scene)
+    for view in scene.views:
+        view.image = images[view.name].clone()
+    wrong, image = scene.views[2], images[scene.views[2].name]
+    slope = torch.roll(image, 1, 2) - image
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    wrong.image = image + 2 * slope + noise * 2 * slope.square().mean().sqrt() * 3.5**0.5
+    (right, down), explained = best_shift(wrong, image)
+    assert 0.2 < explained < 0.3 and abs(down) < 0.5 < right
+    quality = {view.name: {"psnr": 30.0} for view in scene.views}
+    (told,) = diagnose(scene, images, quality, AT_REST)
+    assert told["kind"] == "cameras" and wrong.name in told["text"]
 
 
 SIDE = (

@@ -171,3 +171,4 @@ def test_a_dumped_scene_reads_back_as_the_same_tree(read: Read, text: str, tmp_p
     (tmp_path / "elsewhere").mkdir()
     dump_scene(describe(scene_file), tmp_path / "elsewhere" / "scene.yaml")
     assert read_scene(tmp_path / "elsewhere" / "scene.yaml").tree == scene_file.tree
+    assert "support_margin" not in (tmp_path / "elsewhere" / "scene.yaml").read_text()

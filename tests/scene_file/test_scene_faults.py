@@ -67,6 +67,8 @@ lights=[{{type: ambien, radiance: 1}}] => found 'ambien'; did you mean 'ambient'
 lights=[{{type: point, position: [0, 1], intensity: 1}}] => position: expected a list of 3 numbers
 lights=[{{type: environment, file: gone.exr}}] => lights.0.file: gone.exr does not exist
 lights.0.direction=[0, 0, 0] => lights.0.direction: must not be zero
+optimize.iterations=3x => optimize.iterations: expected a whole number or auto, found '3x'
+volume.bounds=wide => volume.bounds: expected a mapping or auto, found 'wide'
 views=[] => views: expected a list with at least one entry
 views=ring => views: expected a list with at least one entry or a mapping, found 'ring'
 views={{images: "*.exr"}} => views: missing ring or transforms or colmap
