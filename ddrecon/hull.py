@@ -37,12 +37,13 @@ shrinks below this part of itself."""
 
 
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
-"""A box is far too large if less than the first part of it may hold smoke, far too small if it has
-less than the second of what may, and cuts off what reaches beyond it by the third of a side. It
-fits what it has more than the last of."""
+"""A box is far too large if less than the first part of it may hold smoke, is elsewhere or far too
+small if it has less than the second of what may, and cuts off what reaches beyond it by the third
+of a side. It fits what it has more than the last of."""
 
 
 OUTSIDE = "no overlap"
+"""What `doubt_box` begins with where a box is elsewhere."""
 
 
 class HullError(SceneError):
@@ -235,12 +236,12 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     held, filled = _share(shown, box)
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
-    if held == 0:
-        what = f"{OUTSIDE}, the pictures show smoke elsewhere"
-    elif filled < FILLED:
-        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
+    if held < HELD and filled < 0.5:
+        what = f"{OUTSIDE}, {100 * held:.2g} % of where the pictures show smoke is in them"
     elif held < HELD:
         what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+    elif filled < FILLED:
+        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
     elif float(lacks[end, axis]) > CUT:
         beyond = f"{('below', 'above')[end]} {float(box[end, axis]):.3g} along {'xyz'[axis]}"
         what = f"cut off, the pictures show smoke {beyond}"

@@ -92,7 +92,7 @@ def describe(
     with suppress(SceneError) if not asks_support(scene) else nullcontext():
         upright = upright_axis([view.camera for view in scene.views]), "xyz".index(up)
         support = describe_support(supports, grid, upright)
-        if support is not None and "cells" in support:
+        if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
     return {
         "resolution": list(reversed(grid.shape)),

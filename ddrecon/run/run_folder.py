@@ -158,10 +158,9 @@ class RunFolder(Checkpoints):
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)
-        summary, support = _summary(run) | {"views": found.quality}, run.problem.support
-        box = summary.get("support", {}).get("box")
-        box = None if box is None else torch.tensor(box)
-        summary["diagnoses"] = diagnose(scene, found.images, found.quality, rows, support, box)
+        summary, of = _summary(run) | {"views": found.quality}, run.problem.support
+        results = scene, found.images, found.quality, rows
+        summary["diagnoses"] = diagnose(*results, of, summary.get("support"))
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
