@@ -6,7 +6,7 @@ Target and render of a view stand side by side as they are displayed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -18,8 +18,8 @@ from ddrecon.engine import name_engines
 from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -89,16 +89,18 @@ def write_run_report(
     write_page(path, title, _lead(scene, summary), sections, is_alive=True)
 
 
-def found_numbers(run: Reconstruction, scene: Scene) -> list[tuple[str, str, str]]:
-    """What `run` has found that is neither a field nor a map: its name, start and value in `scene`.
+def found_numbers(
+    parameters: Iterable[Parameter], given: Scene, scene: Scene
+) -> list[tuple[str, str, str]]:
+    """What `parameters` are neither fields nor maps: their names, starts and values in `scene`.
 
-    Of a pose that is by how much the camera moved and turned.
+    Of a pose that is by how much the camera moved and turned from where it is in `given`.
     """
     found = []
-    for parameter in run.parameters:
+    for parameter in parameters:
         start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
         if parameter.key == "camera" and parameter.view is not None:
-            before, after = (of.view(parameter.view).camera for of in (run.problem.scene, scene))
+            before, after = (of.view(parameter.view).camera for of in (given, scene))
             moved = shift_between(before, after, scene.volume.grid)
             cosine = ((before.pose[:, :3] * after.pose[:, :3]).sum() - 1) / 2
             turned = math.degrees(math.acos(min(1.0, float(cosine))))

@@ -165,8 +165,9 @@ class RunFolder(Checkpoints):
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
         write_json(self.path / "summary.json", summary)
-        numbers, environment = found_numbers(run, scene), self.environment
-        write_run_report(self.path / "report.html", found, rows, summary, environment, numbers)
+        numbers = found_numbers(run.parameters, run.problem.scene, scene)
+        page = self.path / "report.html"
+        write_run_report(page, found, rows, summary, self.environment, numbers)
         return summary
 
     def _store(self, scene: Scene, name: str) -> Any:
