@@ -27,7 +27,7 @@ DEVIATIONS = 4.0
 """Black is less than so many deviations of noise above it."""
 TAIL = 0.98
 """This part of black is within two deviations."""
-TOGETHER = 0.4
+TOGETHER = 0.3
 """Smoke is where this part of neighbors show something; what noise shows stands alone."""
 MOST_PIXELS = 256
 """Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""

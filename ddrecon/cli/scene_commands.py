@@ -191,7 +191,7 @@ def _render(
         if choice.count is not None:
             report["ring"] = write_ring(views, output)
         write_json(output / "render.json", report)
-    return report, render_lines(report, output)
+    return report, render_lines(report, output, session.quiet)
 
 
 @click.command()
