@@ -96,7 +96,7 @@ def _tell_from_noise(view: View) -> Tensor:
     floor = black + DEVIATIONS * unit
     dark = values[~_widen(_together(values > floor, reach), 4 * reach, is_cut=True)]
     if len(dark) >= DARKEST * values.numel():
-        middle, high = (_at_part(dark, part) for part in (0.5, TAIL))
+        middle, high = (_quantile(dark, share) for share in (0.5, TAIL))
         floor = torch.maximum(
             middle + (high - middle) * DEVIATIONS / 2, black + DEVIATIONS * smallest
         )
@@ -113,12 +113,12 @@ def _together(shown: Tensor, reach: int) -> Tensor:
 
 def _darkest(values: Tensor) -> Tensor:
     """What the part `DARKEST` of `values` does not exceed."""
-    return _at_part(values.flatten(), DARKEST)
+    return _quantile(values.flatten(), DARKEST)
 
 
-def _at_part(values: Tensor, part: float) -> Tensor:
-    """What this `part` of `values` [n] does not exceed."""
-    return values.kthvalue(max(1, round(part * len(values)))).values
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """What this `share` of `values` [n] does not exceed."""
+    return values.kthvalue(max(1, round(share * len(values)))).values
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
@@ -254,10 +254,11 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
 
 
-def _share(part: Tensor, box: Tensor) -> tuple[float, float]:
-    """What shares of the boxes `part` and `box` lie in both."""
-    sides = (torch.minimum(part[1], box[1]) - torch.maximum(part[0], box[0])).clamp(min=0)
-    return float((sides / (part[1] - part[0])).prod()), float((sides / (box[1] - box[0])).prod())
+def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
+    """What shares of the boxes `shown` and `box` lie in both."""
+    sides = (torch.minimum(shown[1], box[1]) - torch.maximum(shown[0], box[0])).clamp(min=0)
+    held, filled = ((sides / (corners[1] - corners[0])).prod() for corners in (shown, box))
+    return float(held), float(filled)
 
 
 def _explain(shown: Tensor, box: Tensor, before: int, after: int) -> str:

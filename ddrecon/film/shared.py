@@ -15,7 +15,7 @@ from ddrecon.errors import FormatError, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.reconstruct.together import Together
-from ddrecon.run.report import found_numbers
+from ddrecon.run.report import list_numbers
 from ddrecon.run.result import plain, poses_of, put_values
 from ddrecon.run.run_folder import write_values
 from ddrecon.variables.values import EVERY
@@ -35,8 +35,8 @@ def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
         else:
             values[p.name] = poses.get(p.name) or plain(value)
     spread = {name: value.tolist() for name, value in together.spread().items()}
-    found = found_numbers(together.shared, together.runs[0].problem.scene, scene)
-    texts = {name: text for name, _, text in found}
+    before = together.runs[0].problem.scene
+    texts = {name: text for name, _, text in list_numbers(together.shared, before, scene)}
     write_json(path, {"frames": numbers, "values": values, "spread": spread, "texts": texts})
 
 

@@ -100,11 +100,11 @@ def find_ghosts(volume: Volume, box: Sequence[Sequence[float]]) -> str | None:
     inside = torch.ones_like(volume.density, dtype=torch.bool)
     for places, low, high in zip(centers, *box, strict=True):
         inside &= (low <= places) & (places <= high)
-    part = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
-    if part < GHOSTS:
+    share = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
+    if share < GHOSTS:
         return None
     return (
-        f"{100 * part:.2g} % of the density is where the pictures show no smoke and few cameras "
+        f"{100 * share:.2g} % of the density is where the pictures show no smoke and few cameras "
         f"look: take volume.{bounds_text(torch.tensor(box))}, raise optimize.parameters.density.tv"
     )
 

@@ -68,7 +68,7 @@ def write_run_report(
 ) -> None:
     """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log.
 
-    `numbers` are those of `found_numbers`.
+    `numbers` are those of `list_numbers`.
     """
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
@@ -89,27 +89,27 @@ def write_run_report(
     write_page(path, title, _lead(scene, summary), sections, is_alive=True)
 
 
-def found_numbers(
-    parameters: Iterable[Parameter], given: Scene, scene: Scene
+def list_numbers(
+    parameters: Iterable[Parameter], before: Scene, scene: Scene
 ) -> list[tuple[str, str, str]]:
-    """What `parameters` are neither fields nor maps: their names, starts and values in `scene`.
+    """Those of `parameters` that are neither fields nor maps: their names, starts and values in `scene`.
 
-    Of a pose that is by how much the camera moved and turned from where it is in `given`.
+    Of a pose that is by how much the camera moved and turned from where it is in `before`.
     """
-    found = []
+    rows = []
     for parameter in parameters:
         start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
         if parameter.key == "camera" and parameter.view is not None:
-            before, after = (of.view(parameter.view).camera for of in (given, scene))
-            moved = shift_between(before, after, scene.volume.grid)
-            cosine = ((before.pose[:, :3] * after.pose[:, :3]).sum() - 1) / 2
-            turned = math.degrees(math.acos(min(1.0, float(cosine))))
+            old, new = (world.view(parameter.view).camera for world in (before, scene))
+            moved = shift_between(old, new, scene.volume.grid)
+            apart = float((new.pose - old.pose)[:, :3].norm())  # sqrt(8) sin(angle / 2)
+            turned = math.degrees(2 * math.asin(min(1.0, apart / math.sqrt(8))))
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
-            found.append((parameter.name, "as given", text))
+            rows.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
             begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
-            found.append((parameter.name, begun, ended))
-    return found
+            rows.append((parameter.name, begun, ended))
+    return rows
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:

@@ -32,7 +32,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import found_numbers, write_run_report
+from ddrecon.run.report import list_numbers, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, dump_scene, read_scene, referenced_files
@@ -158,14 +158,14 @@ class RunFolder(Checkpoints):
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)
-        summary, of = _summary(run) | {"views": found.quality}, run.problem.support
+        summary, support = _summary(run) | {"views": found.quality}, run.problem.support
         results = scene, found.images, found.quality, rows
-        summary["diagnoses"] = diagnose(*results, of, summary.get("support"))
+        summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
         write_json(self.path / "summary.json", summary)
-        numbers = found_numbers(run.parameters, run.problem.scene, scene)
+        numbers = list_numbers(run.parameters, run.problem.scene, scene)
         page = self.path / "report.html"
         write_run_report(page, found, rows, summary, self.environment, numbers)
         return summary
