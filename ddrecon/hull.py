@@ -84,22 +84,23 @@ def _tell_from_noise(view: View) -> Tensor:
     guess, least = (find(image, view.step) for find in (estimate_noise, least_noise))
     if behind is None:
         values = image.amax(0)
-        black = _darkest(values)
+        black = _quantile(values.flatten(), DARKEST)
         unit, smallest = guess.deviation(black), least.deviation(black)
     else:
         # A background that is a picture errs as well.
         noise = guess.deviation(behind) * math.sqrt(2)
         values = ((image - behind).abs() / noise).amax(0)
-        black, unit = _darkest(values), torch.ones(())
+        black, unit = _quantile(values.flatten(), DARKEST), torch.ones(())
         smallest = (least.deviation(behind) * math.sqrt(2) / noise).median()
     reach = math.ceil(max(values.shape) / MOST_PIXELS)
     floor = black + DEVIATIONS * unit
     dark = values[~_widen(_together(values > floor, reach), 4 * reach, is_cut=True)]
     if len(dark) >= DARKEST * values.numel():
         middle, high = (_quantile(dark, share) for share in (0.5, TAIL))
-        floor = torch.maximum(
-            middle + (high - middle) * DEVIATIONS / 2, black + DEVIATIONS * smallest
-        )
+        tail = middle + (high - middle) * DEVIATIONS / 2
+        # Faint smoke that the guess takes for black does not raise it.
+        floor = torch.minimum(tail, torch.maximum(floor, high))
+        floor = torch.maximum(floor, black + DEVIATIONS * smallest)
     shown = values > floor
     return shown & _widen(_together(shown, reach), reach, is_cut=True)
 
@@ -109,11 +110,6 @@ def _together(shown: Tensor, reach: int) -> Tensor:
     side, pixels = 2 * reach + 1, shown.float()[None]
     rows = avg_pool2d(pixels, (side, 1), 1, (reach, 0))
     return avg_pool2d(rows, (1, side), 1, (0, reach))[0] > TOGETHER
-
-
-def _darkest(values: Tensor) -> Tensor:
-    """What the part `DARKEST` of `values` does not exceed."""
-    return _quantile(values.flatten(), DARKEST)
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:

@@ -92,9 +92,9 @@ def write_run_report(
 def list_numbers(
     parameters: Iterable[Parameter], before: Scene, scene: Scene
 ) -> list[tuple[str, str, str]]:
-    """Those of `parameters` that are neither fields nor maps: their names, starts and values in `scene`.
+    """Names, starts and values of those of `parameters` that are neither fields nor maps.
 
-    Of a pose that is by how much the camera moved and turned from where it is in `before`.
+    Of a pose the value is by how much the camera of `scene` is moved and turned from that `before`.
     """
     rows = []
     for parameter in parameters:
