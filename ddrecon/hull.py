@@ -42,7 +42,7 @@ small if it has less than the second of what may, and cuts off what reaches beyo
 of a side. It fits what it has more than the last of."""
 
 
-OUTSIDE = "no overlap"
+OUTSIDE = "no overlap", "hardly any overlap"
 """What `doubt_box` begins with where a box is elsewhere."""
 
 
@@ -233,7 +233,9 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
     if held < HELD and filled < 0.5:
-        what = f"{OUTSIDE}, {100 * held:.2g} % of where the pictures show smoke is in them"
+        what = (
+            f"{OUTSIDE[held > 0]}, {100 * held:.2g} % of where the pictures show smoke is in them"
+        )
     elif held < HELD:
         what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
     elif filled < FILLED:
