@@ -32,7 +32,7 @@ from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
-WIDE = 4.0
+WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
