@@ -27,7 +27,7 @@ DEVIATIONS = 4.0
 """Black is less than so many deviations of noise above it."""
 TAIL = 0.98
 """This part of black is within two deviations."""
-TOGETHER = 0.4
+TOGETHER = 0.3
 """Smoke is where this part of neighbors show something; what noise shows stands alone."""
 MOST_PIXELS = 256
 """Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""
@@ -37,12 +37,13 @@ shrinks below this part of itself."""
 
 
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
-"""A box is far too large if less than the first part of it may hold smoke, far too small if it has
-less than the second of what may, and cuts off what reaches beyond it by the third of a side. It
-fits what it has more than the last of."""
+"""A box is far too large if less than the first part of it may hold smoke, is elsewhere or far too
+small if it has less than the second of what may, and cuts off what reaches beyond it by the third
+of a side. It fits what it has more than the last of."""
 
 
-OUTSIDE = "no overlap"
+OUTSIDE = "no overlap", "hardly any overlap"
+"""What `doubt_box` begins with where a box is elsewhere."""
 
 
 class HullError(SceneError):
@@ -83,22 +84,23 @@ def _tell_from_noise(view: View) -> Tensor:
     guess, least = (find(image, view.step) for find in (estimate_noise, least_noise))
     if behind is None:
         values = image.amax(0)
-        black = _darkest(values)
+        black = _quantile(values.flatten(), DARKEST)
         unit, smallest = guess.deviation(black), least.deviation(black)
     else:
         # A background that is a picture errs as well.
         noise = guess.deviation(behind) * math.sqrt(2)
         values = ((image - behind).abs() / noise).amax(0)
-        black, unit = _darkest(values), torch.ones(())
+        black, unit = _quantile(values.flatten(), DARKEST), torch.ones(())
         smallest = (least.deviation(behind) * math.sqrt(2) / noise).median()
     reach = math.ceil(max(values.shape) / MOST_PIXELS)
     floor = black + DEVIATIONS * unit
     dark = values[~_widen(_together(values > floor, reach), 4 * reach, is_cut=True)]
     if len(dark) >= DARKEST * values.numel():
-        middle, high = (_at_part(dark, part) for part in (0.5, TAIL))
-        floor = torch.maximum(
-            middle + (high - middle) * DEVIATIONS / 2, black + DEVIATIONS * smallest
-        )
+        middle, high = (_quantile(dark, share) for share in (0.5, TAIL))
+        tail = middle + (high - middle) * DEVIATIONS / 2
+        # Faint smoke that the guess takes for black does not raise it.
+        floor = torch.minimum(tail, torch.maximum(floor, high))
+        floor = torch.maximum(floor, black + DEVIATIONS * smallest)
     shown = values > floor
     return shown & _widen(_together(shown, reach), reach, is_cut=True)
 
@@ -110,14 +112,9 @@ def _together(shown: Tensor, reach: int) -> Tensor:
     return avg_pool2d(rows, (1, side), 1, (0, reach))[0] > TOGETHER
 
 
-def _darkest(values: Tensor) -> Tensor:
-    """What the part `DARKEST` of `values` does not exceed."""
-    return _at_part(values.flatten(), DARKEST)
-
-
-def _at_part(values: Tensor, part: float) -> Tensor:
-    """What this `part` of `values` [n] does not exceed."""
-    return values.kthvalue(max(1, round(part * len(values)))).values
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """What this `share` of `values` [n] does not exceed."""
+    return values.kthvalue(max(1, round(share * len(values)))).values
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
@@ -235,12 +232,14 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     held, filled = _share(shown, box)
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
-    if held == 0:
-        what = f"{OUTSIDE}, the pictures show smoke elsewhere"
-    elif filled < FILLED:
-        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
+    if held < HELD and filled < 0.5:
+        what = (
+            f"{OUTSIDE[held > 0]}, {100 * held:.2g} % of where the pictures show smoke is in them"
+        )
     elif held < HELD:
         what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+    elif filled < FILLED:
+        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
     elif float(lacks[end, axis]) > CUT:
         beyond = f"{('below', 'above')[end]} {float(box[end, axis]):.3g} along {'xyz'[axis]}"
         what = f"cut off, the pictures show smoke {beyond}"
@@ -253,10 +252,11 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
 
 
-def _share(part: Tensor, box: Tensor) -> tuple[float, float]:
-    """What shares of the boxes `part` and `box` lie in both."""
-    sides = (torch.minimum(part[1], box[1]) - torch.maximum(part[0], box[0])).clamp(min=0)
-    return float((sides / (part[1] - part[0])).prod()), float((sides / (box[1] - box[0])).prod())
+def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
+    """What shares of the boxes `shown` and `box` lie in both."""
+    sides = (torch.minimum(shown[1], box[1]) - torch.maximum(shown[0], box[0])).clamp(min=0)
+    held, filled = ((sides / (corners[1] - corners[0])).prod() for corners in (shown, box))
+    return float(held), float(filled)
 
 
 def _explain(shown: Tensor, box: Tensor, before: int, after: int) -> str:

@@ -20,6 +20,11 @@ def stand_on_z(box: torch.Tensor) -> torch.Tensor:
 FAULTS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], int, list[str]]] = {
     "none": (lambda box: box, Y, []),
     "moved": (lambda box: box + torch.tensor([0.0, 0.0, -0.5]), Y, ["no overlap"]),
+    "hardly there": (
+        lambda box: box - torch.tensor([0.0, 0.0, 0.39]),
+        Y,
+        ["hardly any overlap", "3.6 %"],
+    ),
     "cut": (lambda box: box - torch.tensor([0.0, 0.4, 0.0]), Y, ["cut off", "below 0 along y"]),
     "long": (lambda box: 1000 * box, Y, ["no overlap", "lengths of the cameras times 0.001,"]),
     "short": (lambda box: box / 100, Y, ["far too large", "lengths of the cameras times 100,"]),

@@ -32,7 +32,7 @@ from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
-WIDE = 4.0
+WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
@@ -92,7 +92,7 @@ def describe(
     with suppress(SceneError) if not asks_support(scene) else nullcontext():
         upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
         support = describe_support(supports, grid, upright)
-        if support is not None and "cells" in support:
+        if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
     return {
         "resolution": list(reversed(grid.shape)),

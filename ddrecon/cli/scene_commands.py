@@ -217,7 +217,7 @@ def _render_views(
     if choice.count is not None:
         report["ring"] = write_ring(views, output)
     write_json(output / "render.json", report)
-    return report, render_lines(report, output)
+    return report, render_lines(report, output, session.quiet)
 
 
 def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:

@@ -121,19 +121,22 @@ def _strip(path: Path) -> np.ndarray:
 def _calibration(shared: Mapping[str, Any]) -> list[str]:
     """What all frames share, and by how much those that found it disagree."""
 
-    def text_of(value: Any) -> str:
-        if not isinstance(value, float | list):
-            return f"in {SHARED}"
-        return ", ".join(f"{number:.4g}" for number in np.ravel(value))
+    def text_of(numbers: Any) -> str:
+        return ", ".join(f"{number:.4g}" for number in np.ravel(numbers))
 
-    values, spread = shared["values"], shared.get("spread", {})
-    rows = [(name, text_of(value), text_of(spread.get(name, []))) for name, value in values.items()]
+    texts, rows = shared.get("texts", {}), []
+    for name in shared["values"]:
+        spread = shared.get("spread", {}).get(name, [])
+        if name.endswith(".camera") and spread:
+            spread = f"turned {text_of(spread[:3])} rad, moved {text_of(spread[3:])} u"
+        else:
+            spread = text_of(spread)
+        rows.append((name, texts.get(name, f"in {SHARED}"), spread))
     frames = ", ".join(map(str, shared.get("frames", [])))
     return [
         paragraph(
             f"Found from frames {frames} together. The last column is the standard deviation, from "
-            "frame to frame, of what each alone would change with its volume as it is; of a camera "
-            "three turns [rad] and three shifts."
+            "frame to frame, of what each alone would change with its volume as it is."
         ),
         table(["number", "value", "spread"], rows),
     ]

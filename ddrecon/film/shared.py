@@ -15,6 +15,7 @@ from ddrecon.errors import FormatError, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.reconstruct.together import Together
+from ddrecon.run.report import list_numbers
 from ddrecon.run.result import plain, poses_of, put_values
 from ddrecon.run.run_folder import write_values
 from ddrecon.variables.values import EVERY
@@ -34,7 +35,9 @@ def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
         else:
             values[p.name] = poses.get(p.name) or plain(value)
     spread = {name: value.tolist() for name, value in together.spread().items()}
-    write_json(path, {"frames": numbers, "values": values, "spread": spread})
+    before = together.runs[0].problem.scene
+    texts = {name: text for name, _, text in list_numbers(together.shared, before, scene)}
+    write_json(path, {"frames": numbers, "values": values, "spread": spread, "texts": texts})
 
 
 def read_shared(path: Path) -> dict[str, Any]:

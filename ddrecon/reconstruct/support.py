@@ -99,7 +99,7 @@ class Support:
             z, y, x = ((places - low) / step).long().clamp(min=0).minimum(most).unbind(-1)
             out = leaves_out[:, (z * grid.shape[1] + y) * grid.shape[2] + x]
             is_cut, by = (out.any(0)).all(1), out.sum(0)
-            alone = [int((is_cut & ((by == 1) & one).any(1)).sum()) for one in out]
+            alone = [int((is_cut & ((by == 1) & outside).any(1)).sum()) for outside in out]
             yield index[is_cut], every, alone
 
 
@@ -141,12 +141,12 @@ def find_cut(support: Support, grid: Grid) -> str | None:
         assert view.image is not None
         strength = (view.image - (0.0 if view.background is None else view.background)).abs()
         light = strength.amax(0).flatten()
-        part = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
-        if part > LOST:
-            cut[view.name], by = part, [a + b for a, b in zip(by, alone, strict=True)]
+        share = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
+        if share > LOST:
+            cut[view.name], by = share, [a + b for a, b in zip(by, alone, strict=True)]
     if not cut:
         return None
-    names = ", ".join(f"{name} ({100 * part:.2g} % of its light)" for name, part in cut.items())
+    names = ", ".join(f"{name} ({100 * share:.2g} % of its light)" for name, share in cut.items())
     blamed = "the cameras"
     if max(by) > 0:
         blamed = f"camera {support.views[by.index(max(by))].name}, which alone shows nothing there"

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from statistics import mean, median
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,17 +45,20 @@ def diagnose(
     quality: Mapping[str, Mapping[str, float]],
     rows: Sequence[Row],
     support: Support | None = None,
-    box: Tensor | None = None,
+    described: Mapping[str, Any] | None = None,
 ) -> list[dict[str, str]]:
     """What seems to be wrong with a run that has found `scene` and rendered `images` of its views.
 
-    `quality` has the PSNR of each, `rows` are its log, `support` is where density was sought and
-    `box` [2, 3] holds what its pictures show. Each is a word that names its `kind`, and a sentence,
-    its `text`.
+    `quality` has the PSNR of each, `rows` are its log, `support` is where density was sought, which
+    is `described`. Each is a word that names its `kind`, and a sentence, its `text`.
     """
     seen = [view for view in scene.views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
-    overfit = find_overfit(seen, quality, find_ghosts(scene.volume, box))
+    described = described or {}
+    ghosts = find_ghosts(scene.volume, described["box"]) if "box" in described else None
+    overfit, doubt = find_overfit(seen, quality, ghosts), described.get("doubt")
+    if support is not None:
+        doubt = f"volume.bounds? {doubt}" if doubt else find_cut(support, scene.volume.grid)
     gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
     usual, share = median(gains) if len(gains) > 2 else 1.0, _promised_share(rows, sure=0)
     # What is not yet explained is no picture's fault as long as going on may explain it: that is
@@ -65,7 +69,7 @@ def diagnose(
         least = max(EXPLAINED, share)
     found = {
         "overfit": overfit,
-        "support": None if support is None else find_cut(support, scene.volume.grid),
+        "support": doubt,
         "exposure": find_exposure(trained, images, usual, least),
         "cameras": find_shift(trained, images, max(MOVED, share or 0) if least < 1 else 1.0),
         # What is overfit would only become more so.
@@ -90,20 +94,18 @@ def find_overfit(
     )
 
 
-def find_ghosts(volume: Volume, box: Tensor | None) -> str | None:
-    """Whether density is where few cameras look: outside the `box` [2, 3] of what pictures show."""
-    if box is None:
-        return None
+def find_ghosts(volume: Volume, box: Sequence[Sequence[float]]) -> str | None:
+    """Whether density is where few cameras look: outside the `box` (x, y, z) of what all show."""
     centers = reversed(volume.grid.centers(volume.density))
     inside = torch.ones_like(volume.density, dtype=torch.bool)
-    for places, low, high in zip(centers, *box.tolist(), strict=True):
+    for places, low, high in zip(centers, *box, strict=True):
         inside &= (low <= places) & (places <= high)
-    part = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
-    if part < GHOSTS:
+    share = 1 - float((volume.density * inside).sum() / volume.density.sum().clamp(min=1e-30))
+    if share < GHOSTS:
         return None
     return (
-        f"{100 * part:.2g} % of the density is where the pictures show no smoke and few cameras "
-        f"look: take volume.{bounds_text(box)}, raise optimize.parameters.density.tv"
+        f"{100 * share:.2g} % of the density is where the pictures show no smoke and few cameras "
+        f"look: take volume.{bounds_text(torch.tensor(box))}, raise optimize.parameters.density.tv"
     )
 
 

@@ -145,17 +145,17 @@ def require_variation(scene: Scene, parameter: str) -> None:
         raise UsageError(f"--gradient {parameter}: {error}{guess}") from None
 
 
-def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
+def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[str]:
     """What `render` prints of its `report`: files, quality and time of each view.
 
-    Where there are more than a few, those between the first and the last are counted.
+    Of more than a few views, and of several if it `is_quiet`, only the first and the last.
     """
     lines = []
     for name, files in report["files"].items():
         notes = [f"{report['seconds']['views'][name]:.2f} s"]
         notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
         lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
-    if len(lines) > FEW:
+    if len(lines) > (2 if is_quiet else FEW):
         lines[1:-1] = [f"... {len(lines) - 2} views between them, in render.json"]
     if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
         lines.append(f"no .exr: EXR {advice('OpenImageIO')}")

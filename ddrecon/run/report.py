@@ -6,7 +6,7 @@ Target and render of a view stand side by side as they are displayed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -18,8 +18,8 @@ from ddrecon.engine import name_engines
 from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
@@ -69,7 +69,7 @@ def write_run_report(
 ) -> None:
     """Writes the report of `findings` to `path`, beside scene.yaml; `rows` are the log.
 
-    `numbers` are those of `found_numbers`.
+    `numbers` are those of `list_numbers`.
     """
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene))
@@ -91,25 +91,27 @@ def write_run_report(
     write_page(path, title, _lead(scene, summary), sections, is_alive=True, goes_on=goes_on)
 
 
-def found_numbers(run: Reconstruction, scene: Scene) -> list[tuple[str, str, str]]:
-    """What `run` has found that is neither a field nor a map: its name, start and value in `scene`.
+def list_numbers(
+    parameters: Iterable[Parameter], before: Scene, scene: Scene
+) -> list[tuple[str, str, str]]:
+    """Names, starts and values of those of `parameters` that are neither fields nor maps.
 
-    Of a pose that is by how much the camera moved and turned.
+    Of a pose the value is by how much the camera of `scene` is moved and turned from that `before`.
     """
-    found = []
-    for parameter in run.parameters:
+    rows = []
+    for parameter in parameters:
         start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
         if parameter.key == "camera" and parameter.view is not None:
-            before, after = (of.view(parameter.view).camera for of in (run.problem.scene, scene))
-            moved = shift_between(before, after, scene.volume)
-            cosine = ((before.pose[:, :3] * after.pose[:, :3]).sum() - 1) / 2
-            turned = math.degrees(math.acos(min(1.0, float(cosine))))
+            old, new = (world.view(parameter.view).camera for world in (before, scene))
+            moved = shift_between(old, new, scene.volume)
+            apart = float((new.pose - old.pose)[:, :3].norm())  # sqrt(8) sin(angle / 2)
+            turned = math.degrees(2 * math.asin(min(1.0, apart / math.sqrt(8))))
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
-            found.append((parameter.name, "as given", text))
+            rows.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
             begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
-            found.append((parameter.name, begun, ended))
-    return found
+            rows.append((parameter.name, begun, ended))
+    return rows
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:

@@ -32,7 +32,7 @@ from ddrecon.run.checkpoint import (
 from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import GOES_ON, found_numbers, write_run_report
+from ddrecon.run.report import GOES_ON, list_numbers, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
@@ -164,7 +164,8 @@ class RunFolder(Checkpoints):
                 self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
 
     def _report(self, run: Reconstruction, found: Findings, summary: Mapping[str, Any]) -> None:
-        rows, numbers = self.log.rows(run.iteration), found_numbers(run, found.scene)
+        rows = self.log.rows(run.iteration)
+        numbers = list_numbers(run.parameters, run.problem.scene, found.scene)
         path = self.path / REPORT
         write_run_report(path, found, rows, summary, self.environment, numbers)
 
@@ -185,9 +186,8 @@ class RunFolder(Checkpoints):
         self._pictures(found, "")
         rows = self.log.rows(run.iteration)
         summary, support = _summary(run) | {"views": found.quality}, run.problem.support
-        box = summary.get("support", {}).get("box")
-        box = None if box is None else torch.tensor(box)
-        summary["diagnoses"] = diagnose(scene, found.images, found.quality, rows, support, box)
+        results = scene, found.images, found.quality, rows
+        summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
         seen = [one["registered"] for one in found.quality.values() if "registered" in one]
         if seen:
             summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}

@@ -230,7 +230,7 @@ def _explain_unit(cameras: Sequence[Camera], grid: Grid) -> str:
             fits.append((abs(math.log(least * most)), times))
     if not fits:
         return ""
-    return f"it would with lengths of the cameras times {min(fits)[1]:g}: {SAME_UNIT}"
+    return f"it would be seen with lengths of the cameras times {min(fits)[1]:g}: {SAME_UNIT}"
 
 
 def _inverse(pose: Tensor) -> Tensor:

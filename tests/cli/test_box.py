@@ -147,7 +147,7 @@ def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
 ) -> None:
     """With by how much smaller pictures would do."""
     scene()
-    told = run("check", "auto.yaml", "-D", "volume.resolution=[4, 4, 4]").stdout
+    told = run("check", "auto.yaml", "-D", "volume.resolution=[3, 3, 3]").stdout
     (width,) = re.findall("cells: (.*) to", told)
     assert f"by pictures {float(width) / 2:.1g}" in told and "times smaller" in told
     assert "times smaller" not in run("check", "auto.yaml").stdout

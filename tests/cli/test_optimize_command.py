@@ -199,9 +199,11 @@ def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
         values = ", ".join(f"{x:.4g}" for x in np.ravel(found[name]))
         cells = [name, ", ".join([f"{start:.4g}"] * np.size(found[name])), values]
         assert "".join(f"<td>{cell}</td>" for cell in cells) in page
-    (moved,) = re.findall(r"moved by ([\d.]+) pixels, turned by [\d.e-]+ degrees", page)
+    ((moved, turned),) = re.findall(r"moved by (\S+) pixels, turned by (\S+) degrees", page)
     matrix = np.array(found["views.front.camera"]["matrix"])
-    assert (float(moved) > 0) == (abs(matrix[:3, 3] - [0, 0, 2.5]).max() > 1e-3)
+    # It looked along -z: its turn is what its matrix is.
+    angle = np.degrees(np.arcsin(np.linalg.norm(matrix[:3, :3] - np.eye(3)) / 8**0.5) * 2)
+    assert float(moved) > 0 and float(turned) == pytest.approx(angle, rel=0.05)
 
 
 def test_divergence_keeps_the_last_good_state(run: Run) -> None:

@@ -131,22 +131,23 @@ def test_auto_tells_black_from_faint_smoke_by_the_noise(read: float) -> None:
     assert shown[faint].float().mean() > 0.99 and shown[~faint].float().mean() < 0.001
 
 
-def speckle(block: int, part: float) -> torch.Tensor:
-    """1 to 3 in this part of [320, 320] pixels and 0 in others, by blocks of a half of such."""
+def speckle(block: int, share: float) -> torch.Tensor:
+    """[320, 320]: 1 to 3 in this `share` of pixels, half of some blocks, and 0 in others."""
     generator = torch.Generator().manual_seed(2)
     values = torch.randint(1, 4, (320, 320), generator=generator).float()
     shape = (320 // block, 320 // block)
-    blocks = torch.rand(shape, generator=generator) < part * (1 if block == 1 else 2)
+    within = 1.0 if block == 1 else 0.5
+    blocks = torch.rand(shape, generator=generator) < share / within
     blocks = blocks.repeat_interleave(block, 0).repeat_interleave(block, 1)
-    return values * blocks * (torch.rand(320, 320, generator=generator) < (0.5 if block > 1 else 1))
+    return values * blocks * (torch.rand(320, 320, generator=generator) < within)
 
 
 @pytest.mark.parametrize(
-    ("uneven", "block", "part"),
+    ("uneven", "block", "share"),
     [(0, 1, 0.01), (0, 4, 0.01), (0, 1, 0.2), (50, 1, 0)],
 )
 def test_auto_takes_no_noise_of_compression_for_smoke(
-    uneven: float, block: int, part: float
+    uneven: float, block: int, share: float
 ) -> None:
     """A picture of 8 bits shows a cloud, how `uneven` it may be, its faint stem, and no noise."""
     y, x = torch.arange(320)[:, None], torch.arange(320)
@@ -156,7 +157,7 @@ def test_auto_takes_no_noise_of_compression_for_smoke(
     core = (x - 160) ** 2 + (y - 120) ** 2 < 50**2
     thin = 80 + uneven * torch.sin(2 * x) * torch.sin(2 * y)
     bright = torch.where(core, 220, torch.where(cloud, thin, 7.0 * stem))
-    encoded = torch.maximum(bright.round(), speckle(block, part)) / 255
+    encoded = torch.maximum(bright.round(), speckle(block, share)) / 255
     image = torch.from_numpy(srgb.decode(encoded.numpy())).float().expand(3, -1, -1)
     shown = find_shown(View("", CAMERAS["pinhole"], image, step=1 / 255), "auto")
     assert bool(shown[cloud | stem].all())

@@ -141,7 +141,7 @@ def test_density_in_corners_that_few_cameras_see_asks_for_a_tighter_box(corner: 
     density[3:5, 3:5, 3:5], density[0, 0, 0] = 1.0, 8 * corner
     found = with_values(scene, {"density": density})
     quality = {view.name: {"psnr": 24.0 if view.is_test else 31.0} for view in scene.views}
-    box = torch.tensor(scene.volume.grid.bounds_xyz) / 2
+    box = {"box": (torch.tensor(scene.volume.grid.bounds_xyz) / 2).tolist()}
     (told,) = diagnose(found, images_of(scene), quality, AT_REST, None, box)[:1]
     assert told["kind"] == "overfit" and "density.tv" in told["text"]
     assert ("take volume.bounds: {min: [" in told["text"]) == (corner > 0)
