@@ -19,6 +19,7 @@ from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
 from ddrecon.supported import require_above, require_settings
+from ddrecon.variables.kinds import PAIRS
 from ddrecon.variables.values import (
     is_real,
     require_legal,
@@ -100,6 +101,9 @@ class VolumeRenderer(torch.nn.Module):
         if twice := given.keys() & (values or {}):
             raise UsageError(f"{min(twice)}: given twice, by its own name and in values")
         given |= values or {}
+        if all(given.keys() & pair for pair in PAIRS):
+            names = ", ".join(sorted(given))
+            raise UsageError(f"{names}: give sigma_a and sigma_s, or sigma_t and albedo, not both")
         own = self.scene.volume.density
         with torch.autocast("cpu" if own.is_meta else own.device.type, enabled=False):
             given = {n: v.to(own.dtype) if is_real(v) else v for n, v in given.items()}

@@ -246,7 +246,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "two pairs": (
         lambda: small_layer()(sigma_a=torch.ones(1), values={"sigma_t": torch.ones(1)}),
-        "sigma_a: give sigma_a and sigma_s, or sigma_t and albedo",
+        "sigma_a, sigma_t: give sigma_a and sigma_s, or sigma_t and albedo, not both",
     ),
     "every view": (
         lambda: small_layer()(values={"views.*.camera": torch.zeros(6)}),

@@ -29,7 +29,7 @@ from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene
-from ddrecon.variables.kinds import is_of_volume, kind_of
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import (
     component_names,
     density_names,
@@ -300,9 +300,6 @@ def loss_at(
         else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
         for view in views
     ]
-    # Of cross sections that vary as the other pair, those at the point are there before.
-    inside = with_values(exact, {n: value for n, value in point.items() if is_of_volume(n)})
-    outside = {n: value for n, value in point.items() if not is_of_volume(n)}
     memory = SolveMemory(is_warm=False)
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
 
@@ -311,7 +308,7 @@ def loss_at(
         return solve_light(with_values(exact, point), memory)
 
     def loss(values: Mapping[str, Tensor]) -> Tensor:
-        changed = with_values(inside, {**outside, **values})
+        changed = with_values(exact, {**point, **values})
         is_of_views = all(name.startswith("views.") for name in values)
         light = light_at_point() if is_of_views else solve_light(changed, memory)
         images = [view_picture(light, changed, changed.view(view.name)) for view in views]

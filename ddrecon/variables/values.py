@@ -92,7 +92,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     """`scene` with its variables replaced by `values`; `scene` itself stays as it is.
 
-    A density of one number fills the grid.
+    A density of one number fills the grid. Of both pairs of cross sections, `sigma_t` and `albedo`
+    are taken.
 
     Raises UsageError for a name that is none, and for another shape, precision or device than the
     scene's.
@@ -365,8 +366,6 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         require_form(name, value, now, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
-        if both := values.keys() & CROSS_SECTIONS:
-            raise UsageError(f"{min(both)}: give sigma_a and sigma_s, or sigma_t and albedo")
         sigma_t, albedo = (
             values[name] if name in values else _volume_value(volume, name)
             for name in EXTINCTION_AND_ALBEDO
