@@ -388,14 +388,15 @@ def view_image(
     """
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
+    diffusing = replace(_without_glow(light_field), beams=(), skies=(), ground=None)
+    parts = [
+        (_without_diffuse(light_field), scene, camera, behind),
+        (diffusing, _without_background(scene), camera, None),
+    ]
+    varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
-        image = _image(light_field, scene, camera, behind).detach()
-    if derivatives == "single":
-        half = _image(_without_diffuse(light_field), scene, camera, behind)
-    else:
-        diffusing = replace(_without_glow(light_field), beams=(), skies=(), ground=None)
-        half = _image(diffusing, _without_background(scene), camera, None)
-    return image + (half - half.detach())
+        rest = _image(*fixed).detach()
+    return _image(*varied) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -408,11 +409,12 @@ def _without_glow(light_field: LightField) -> LightField:
 
 def _without_diffuse(light_field: LightField) -> LightField:
     """What comes in through faces is then what the medium would emit there."""
-    nothing, outside = torch.zeros_like(light_field.diffuse.mean), light_field.outside
-    dark, received = Moments(nothing), Received(Moments(nothing), nothing)
-    outside = None if outside is None else torch.zeros_like(outside)
-    given = replace(light_field, diffuse=dark, received=received, turned=(), outside=outside)
-    return replace(given, reflected=None)
+    outside, nothing = light_field.outside, torch.zeros_like(light_field.diffuse.mean)
+    given = replace(light_field, diffuse=Moments(nothing), turned=(), outside=None, reflected=None)
+    if outside is None or light_field.medium.emission is None:
+        return given
+    received = Received(Moments(nothing), nothing)
+    return replace(given, received=received, outside=torch.zeros_like(outside))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
