@@ -315,13 +315,14 @@ def _glow(
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
-    """Whether light may be scattered more than once.
+    """Whether light may go on in another direction more than once.
 
-    It may where the model is not `none`, and sigma_s is not 0 or is being differentiated.
+    It may where the model is not `none`, and faces reflect it inside, or sigma_s is not 0 or is
+    being differentiated.
     """
-    return settings.model != "none" and (
-        is_varied(medium.scattering.scale) or is_any_nonzero(medium.scattering.scale)
-    )
+    scale = medium.scattering.scale
+    may_turn = medium.index != 1 or is_varied(scale) or is_any_nonzero(scale)
+    return settings.model != "none" and may_turn
 
 
 def solve_diffuse(
