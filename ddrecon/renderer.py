@@ -1,8 +1,8 @@
 """The paper on one page: light not yet scattered, light scattered often, rays that collect both.
 
 `render` composes only the terms that a scene needs: no diffusion solve when the model is `none` or
-nothing scatters, no quadrature over directions unless unscattered ambient light is asked for by
-itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
+nothing scatters nor reflects, no quadrature over directions unless unscattered ambient light is
+asked for by itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 """
 
 from __future__ import annotations
@@ -389,7 +389,7 @@ def view_image(
     """
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
-    diffusing = replace(_without_glow(light_field), beams=(), skies=(), ground=None)
+    diffusing = replace(_without_glow(light_field), beams=(), ground=None)
     parts = [
         (_without_diffuse(light_field), scene, camera, behind),
         (diffusing, _without_background(scene), camera, None),
@@ -411,7 +411,8 @@ def _without_glow(light_field: LightField) -> LightField:
 def _without_diffuse(light_field: LightField) -> LightField:
     """What comes in through faces is then what the medium would emit there."""
     outside, nothing = light_field.outside, torch.zeros_like(light_field.diffuse.mean)
-    given = replace(light_field, diffuse=Moments(nothing), turned=(), outside=None, reflected=None)
+    given = replace(light_field, diffuse=Moments(nothing), skies=(), turned=(), reflected=None)
+    given = replace(given, outside=None)
     if outside is None or light_field.medium.emission is None:
         return given
     received = Received(Moments(nothing), nothing)
@@ -485,10 +486,11 @@ def _emission(
     """
     period, wide = unrolled or light_field.unrolled()
     medium = wide.medium
-    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned)
+    sky = None
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
-        diffuse = diffuse + scatter_sky(light_field.medium, light_field.skies, towards, period)
+        sky = scatter_sky(light_field.medium, light_field.skies, towards, period)
+    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned, sky)
     if light_field.has_means:
         diffuse = sharpen(medium, diffuse)
     emission = Emission(
