@@ -458,7 +458,8 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
-        at_faces = light_field.diffuse
+        at_faces, sky = light_field.diffuse, sum_unscattered_sky(medium, light_field.skies, 0)
+        at_faces = at_faces if sky is None else at_faces.plus(sky)
         if light_field.reflected is not None:
             at_faces = at_faces.plus(light_field.reflected.scaled(-1, -1, -1))
         beside = look_behind(rays, given)

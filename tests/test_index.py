@@ -85,6 +85,14 @@ def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any])
     torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
 
 
+def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matters() -> None:
+    settings = {"directional": None, "ambient": (0.7,), "model": "none"}
+    even, directed = (
+        ddrecon.render(within(1.4, random_values(5, 4, 6), g=g, **settings)) for g in (0.0, 1e-9)
+    )
+    torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
+
+
 def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
     empty, camera = 0 * random_values(4, 5, 6), make_camera((0.9, 1.3, 2.5))
     assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
