@@ -1,8 +1,8 @@
 """The paper on one page: light not yet scattered, light scattered often, rays that collect both.
 
 `render` composes only the terms that a scene needs: no diffusion solve when the model is `none` or
-nothing scatters, no quadrature over directions unless unscattered ambient light is asked for by
-itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
+nothing scatters nor reflects, no quadrature over directions unless unscattered ambient light is
+asked for by itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 """
 
 from __future__ import annotations
@@ -296,13 +296,14 @@ def _glow(
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
-    """Whether light may be scattered more than once.
+    """Whether light may go on in another direction more than once.
 
-    It may where the model is not `none`, and sigma_s is not 0 or is being differentiated.
+    It may where the model is not `none`, and faces reflect it inside, or sigma_s is not 0 or is
+    being differentiated.
     """
-    return settings.model != "none" and (
-        is_varied(medium.scattering.scale) or is_any_nonzero(medium.scattering.scale)
-    )
+    scale = medium.scattering.scale
+    may_turn = medium.index != 1 or is_varied(scale) or is_any_nonzero(scale)
+    return settings.model != "none" and may_turn
 
 
 def solve_diffuse(
@@ -369,14 +370,15 @@ def view_image(
     """
     if derivatives == "all":
         return _image(light_field, scene, camera, behind)
+    diffusing = replace(_without_glow(light_field), beams=(), ground=None)
+    parts = [
+        (_without_diffuse(light_field), scene, camera, behind),
+        (diffusing, _without_background(scene), camera, None),
+    ]
+    varied, fixed = parts if derivatives == "single" else reversed(parts)
     with torch.no_grad():
-        image = _image(light_field, scene, camera, behind).detach()
-    if derivatives == "single":
-        half = _image(_without_diffuse(light_field), scene, camera, behind)
-    else:
-        diffusing = replace(_without_glow(light_field), beams=(), skies=(), ground=None)
-        half = _image(diffusing, _without_background(scene), camera, None)
-    return image + (half - half.detach())
+        rest = _image(*fixed).detach()
+    return _image(*varied) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -389,11 +391,13 @@ def _without_glow(light_field: LightField) -> LightField:
 
 def _without_diffuse(light_field: LightField) -> LightField:
     """What comes in through faces is then what the medium would emit there."""
-    nothing, outside = torch.zeros_like(light_field.diffuse.mean), light_field.outside
-    dark, received = Moments(nothing), Received(Moments(nothing), nothing)
-    outside = None if outside is None else torch.zeros_like(outside)
-    given = replace(light_field, diffuse=dark, received=received, turned=(), outside=outside)
-    return replace(given, reflected=None)
+    outside, nothing = light_field.outside, torch.zeros_like(light_field.diffuse.mean)
+    given = replace(light_field, diffuse=Moments(nothing), skies=(), turned=(), reflected=None)
+    given = replace(given, outside=None)
+    if outside is None or light_field.medium.emission is None:
+        return given
+    received = Received(Moments(nothing), nothing)
+    return replace(given, received=received, outside=torch.zeros_like(outside))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -435,7 +439,8 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
-        at_faces = light_field.diffuse
+        at_faces, sky = light_field.diffuse, sum_unscattered_sky(medium, light_field.skies, 0)
+        at_faces = at_faces if sky is None else at_faces.plus(sky)
         if light_field.reflected is not None:
             at_faces = at_faces.plus(light_field.reflected.scaled(-1, -1, -1))
         beside = look_behind(rays, given)
@@ -463,10 +468,11 @@ def _emission(
     """
     period, wide = unrolled or light_field.unrolled()
     medium = wide.medium
-    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned)
+    sky = None
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
-        diffuse = diffuse + scatter_sky(light_field.medium, light_field.skies, towards, period)
+        sky = scatter_sky(light_field.medium, light_field.skies, towards, period)
+    diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned, sky)
     if light_field.has_means:
         diffuse = sharpen(medium, diffuse)
     emission = Emission(

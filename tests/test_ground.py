@@ -89,6 +89,14 @@ def test_an_empty_box_leaves_the_light_of_sun_lamp_beam_and_sky() -> None:
     torch.testing.assert_close(render(scene)[0], expected, rtol=1e-7, atol=0)
 
 
+@pytest.mark.parametrize("albedo", [0.0, 0.5])
+def test_what_a_ground_hides_of_the_sky_is_not_scattered_once_either(albedo: float) -> None:
+    """Light is followed in another way where its direction matters, even so little."""
+    settings = {"directional": None, "ambient": (1.0,), "model": "none", "albedo": (albedo,)}
+    even, directed = (render(on_ground(random_values(*SHAPE), g=g, **settings)) for g in (0, 1e-9))
+    torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
+
+
 def test_a_map_lies_under_the_box_from_low_to_high_and_beyond_it_is_its_mean() -> None:
     scene = on_ground(torch.zeros(SHAPE, dtype=torch.float64), travel=(0, -1, 0))
     rows, columns = 8, 10

@@ -70,15 +70,27 @@ def test_an_index_of_nearly_one_changes_nearly_nothing(changes: dict[str, Any]) 
     assert face_resistance(1 + 1e-9) == pytest.approx(2, rel=1e-6)
 
 
-@pytest.mark.parametrize("changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}])
+CLEAR = {"sigma_s": (0.0,), "transport_rounds": 1}
+
+
+@pytest.mark.parametrize("changes", [{}, {"g": 0.7, "transport_rounds": 2, "degree": 5}, CLEAR])
 def test_even_light_is_n_squared_times_as_bright_inside(changes: dict[str, Any]) -> None:
+    """Where nothing scatters as well, since faces reflect light inside."""
     medium = {"sigma_a": (0.0,), "sigma_s": (6.0,), "directional": None, "ambient": (0.7,)}
     camera = make_camera((0.0, 0.0, 2.5), is_perspective=False)
-    scene = within(1.4, random_values(5, 4, 6), camera=camera, **medium, **changes)
+    scene = within(1.4, random_values(5, 4, 6), camera=camera, **(medium | changes))
     expected = torch.full((1, 5, 4, 6), 4 * math.pi * 0.7 * 1.4**2, dtype=torch.float64)
     torch.testing.assert_close(ddrecon.fluence(scene), expected, rtol=1e-10, atol=0)
     seen, passed = ddrecon.render(scene), 1 - (0.4 / 2.4) ** 2
     torch.testing.assert_close(seen, torch.full_like(seen, 0.7 * passed), rtol=1e-10, atol=0)
+
+
+def test_faces_reflect_a_sky_that_is_scattered_once_wherever_its_direction_matters() -> None:
+    settings = {"directional": None, "ambient": (0.7,), "model": "none"}
+    even, directed = (
+        ddrecon.render(within(1.4, random_values(5, 4, 6), g=g, **settings)) for g in (0.0, 1e-9)
+    )
+    torch.testing.assert_close(directed, even, rtol=1e-7, atol=0)
 
 
 def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:

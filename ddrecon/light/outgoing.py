@@ -40,13 +40,18 @@ def _weigh(fraction: Tensor, moments: Tensor) -> Tensor:
 
 
 def scatter_towards(
-    medium: Medium, light: Moments, rays: Rays, turned: Sequence[TurnedBeam] = ()
+    medium: Medium,
+    light: Moments,
+    rays: Rays,
+    turned: Sequence[TurnedBeam] = (),
+    more: Tensor | None = None,
 ) -> Tensor:
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
 
-    With what the `turned` beams scatter (E8.12). As `Moments.positive_along` has it.
+    With what the `turned` beams scatter (E8.12), or with `more` of skies, of which `light` may say
+    what a ground hides. As `Moments.positive_along` has it.
     """
-    more = recompute(sum_turned, medium, rays, turned) if turned else None
+    more = recompute(sum_turned, medium, rays, turned) if turned else more
     if is_fused() and light.flux and not medium.is_cellwise and rays.pane is None:
         from ddrecon.light.fused.outgoing import scatter_fused
 

@@ -108,6 +108,8 @@ def _medium(volume: Volume) -> dict[str, Any]:
     density, sigma_a, sigma_s = (
         value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)
     )
+    if volume.support is not None:
+        density = density * volume.support.cpu()
     volume = Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
     sigma_t = volume.sigma_a + volume.sigma_s
     if is_gray(volume):

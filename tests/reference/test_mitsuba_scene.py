@@ -56,6 +56,17 @@ def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
     np.testing.assert_allclose(found, (scattering * density).permute(1, 2, 3, 0), rtol=1e-5)
 
 
+def test_outside_of_a_support_nothing_is() -> None:
+    scene, support = (
+        make_scene(random_values(*SHAPE)),
+        (random_values(*SHAPE, seed=1) > 0.5).double(),
+    )
+    inside = make_scene(scene.volume.density * support)
+    scene.volume.support = support
+    found, known = (extinction(described(each)["medium"]) for each in (scene, inside))
+    np.testing.assert_array_equal(found, known)
+
+
 def test_nothing_scatters_where_nothing_is() -> None:
     fields = dict.fromkeys(("sigma_a", "sigma_s"), torch.zeros(1, *SHAPE, dtype=torch.float64))
     everywhere = dict.fromkeys(("sigma_a", "sigma_s"), (0.0,))
