@@ -26,8 +26,7 @@ CHANGES = {
 """What every command refuses, in place of its scene."""
 TABLE = """
 render scene.yaml -o full => 2 full: holds notes.txt, which ddrecon did not write; choose another
-optimize scene.yaml -o full --overwrite => 2 full: holds notes.txt, which ddrecon did not write;
-optimize scene.yaml -o . --overwrite => 2 .: holds bad.npz, which ddrecon did not write
+optimize scene.yaml -o . --overwrite => 2 scene.yaml: was changed and would be replaced; name a c
 render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side

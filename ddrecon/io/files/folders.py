@@ -95,17 +95,18 @@ class Folder:
         paths = {up for name in self.names for up in (Path(name), *Path(name).parents)}
         return sorted(self.path / path for path in paths if (self.path / path).is_dir())[:0:-1]
 
-    def require(self, may_exist: bool) -> None:
-        """Raises UsageError where others' files are, or its own unless these `may_exist`."""
+    def require(self, overwrite: bool, resume: bool) -> None:
+        """Raises UsageError where files are that are neither to be kept nor gone on with."""
         kind, content = kind_of_folder(self.path), self.content()
-        if kind is None and content:
+        if kind is None and content and not overwrite:
             strange = f"holds {content[0]}, which ddrecon did not write"
-            raise UsageError(f"{self.path}: {strange}; choose another folder")
+            advice = "choose another folder, or say --overwrite, which keeps it"
+            raise UsageError(f"{self.path}: {strange}; {advice}")
         if kind not in (None, self.kind):
             raise UsageError(
                 f"{self.path}: is the folder of another kind of job, {kind}; choose another folder"
             )
-        if self.names and not may_exist:
+        if self.names and not (overwrite or resume):
             also = " or --resume" if self.kind in (RUN, FILM, UNCERTAINTY) else ""
             raise UsageError(
                 f"{self.path}: the folder is not empty; choose another, or say --overwrite{also}"
@@ -136,9 +137,9 @@ def claim_folder(
 
     What is there stays; a job that is to `overwrite` it clears it once it can begin. A folder in
     which nothing was written is gone afterwards. Raises UsageError where `path` is a file or cannot
-    be locked, where it is of another kind or holds files of others, where it holds its own and
-    neither is said, and where another process writes there, which `tell`, if any, is told of: then
-    that is waited for.
+    be locked, where it is of another kind, where it holds files of others and is not to be
+    overwritten, which keeps these, where it holds its own and neither is said, and where another
+    process writes there, which `tell`, if any, is told of: then that is waited for.
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: is a file; name a folder for the output")
@@ -151,7 +152,7 @@ def claim_folder(
     try:
         with hold(path / LOCK, tell):
             folder = Folder(path, kind)
-            folder.require(overwrite or resume)
+            folder.require(overwrite, resume)
             for place in (path, *folder.places()):
                 remove_temporaries(place)
             with refusals(path):
@@ -162,7 +163,7 @@ def claim_folder(
                 yield folder
             finally:
                 del claimed[key]
-                if not folder.content():
+                if not folder.names:
                     (path / MANIFEST).unlink(missing_ok=True)
     finally:
         for place in lacking:

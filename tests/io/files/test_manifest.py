@@ -64,13 +64,21 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text("mine")
     (tmp_path / MANIFEST).write_text("ddrecon strange\nscene.yaml\n")
     before = contents(tmp_path)
-    for how in ({"overwrite": True}, {"resume": True}, {}):
+    for how in ({"resume": True}, {}):
         with (
             pytest.raises(UsageError, match=r"holds scene.yaml, which ddrecon did not write"),
             claim_folder(tmp_path, RUN, **how),
         ):
             pass
     assert contents(tmp_path) == before
+
+
+def test_a_folder_of_others_that_is_overwritten_keeps_what_they_wrote(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with claim_folder(tmp_path, RUN, overwrite=True) as folder:
+        folder.clear()
+        write_json(tmp_path / "summary.json", 0)
+    assert set(contents(tmp_path)) == {MANIFEST, "notes.txt", "summary.json"}
 
 
 def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
