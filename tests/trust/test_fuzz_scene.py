@@ -95,8 +95,8 @@ def texts(draw: Callable[..., Any]) -> bytes:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, with the files that scenes name: good ones, a pipe, a loop, a folder."""
     monkeypatch.chdir(tmp_path)
-    np.save("front.npy", np.full((6, 8, 3), 0.5, np.float32))
-    np.save("to.npy", np.full((6, 8, 3), 0.5, np.float32))
+    np.save("front.npy", np.full((6, 8, 3), 0.75, np.float32))
+    np.save("to.npy", np.full((6, 8, 3), 0.75, np.float32))
     box, values = np.array([[-0.5] * 3, [0.5] * 3]), np.random.default_rng(0).random((4, 5, 6))
     write_field(Path("density.npz"), "density", values, box)
     os.mkfifo("pipe.npy")

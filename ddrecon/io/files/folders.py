@@ -157,13 +157,13 @@ def claim_folder(
                 remove_temporaries(place)
             with refusals(path):
                 note_written(path, "/")
-            claimed[key] = folder.note
+            claimed[key], is_new = folder.note, kind_of_folder(path) is None
             try:
                 folder.write()
                 yield folder
             finally:
                 del claimed[key]
-                if not folder.names:
+                if not folder.content() or (is_new and not folder.names):
                     (path / MANIFEST).unlink(missing_ok=True)
     finally:
         for place in lacking:
