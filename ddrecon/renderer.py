@@ -25,7 +25,7 @@ from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.bounced import reflected_light
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -324,7 +324,7 @@ def solve_diffuse(
         if medium.emission is not None:
             scattered = replace(scattered, mean=scattered.mean + medium.emission)
         return solve_printed(medium, diffusion, scattered, outside, by_jacobi, medium.has_flux)
-    solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
+    solve = SolverWithMemory(solve_by_multigrid, settings.tolerance, memory)
     if settings.model == "flux_limited":
         return solve_flux_limited(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux

@@ -8,7 +8,6 @@ import pytest
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
-from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES
 from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
 from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
@@ -19,7 +18,6 @@ from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
     [
         (DiffusionSettings, "closure", CLOSURES),
         (DiffusionSettings, "limiter", LIMITERS),
-        (DiffusionSettings, "solver", SOLVERS),
         (DiffusionSettings, "degree", DIRECTIONS),
         (OptimizeSettings, "loss", LOSSES),
     ],

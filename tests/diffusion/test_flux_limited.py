@@ -10,7 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion import flux_limited
 from ddrecon.diffusion.flux_limited import LIMITERS, SERIES_BELOW, Balance, steepness_square
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.errors import SolveError
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
@@ -33,7 +33,7 @@ def make():
 
 
 def make_solve(tolerance: float, memory: SolveMemory | None = None) -> SolverWithMemory:
-    return SolverWithMemory(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
+    return SolverWithMemory(solve_by_multigrid, tolerance, memory or SolveMemory())
 
 
 def test_steepness_is_that_of_central_differences_cell_by_cell():
