@@ -135,7 +135,7 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     if settings.scheme == "printed":
         method = "smooth closure, printed scheme by Jacobi iteration"
     elif settings.model == "flux_limited":
-        method = f"{settings.limiter} limiter, damped Picard iteration with multigrid"
+        method = "damped Picard iteration with multigrid"
     else:
         method = f"{settings.closure} closure, multigrid"
     terms.append(f"multiple scattering by {settings.model} diffusion, {method}")

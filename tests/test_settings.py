@@ -6,7 +6,6 @@ from dataclasses import fields
 import pytest
 
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.losses import LOSSES
 from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
@@ -17,7 +16,6 @@ from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
     ("record", "key", "table"),
     [
         (DiffusionSettings, "closure", CLOSURES),
-        (DiffusionSettings, "limiter", LIMITERS),
         (DiffusionSettings, "degree", DIRECTIONS),
         (OptimizeSettings, "loss", LOSSES),
     ],

@@ -306,6 +306,10 @@ class PrintedOperator:
         """M u, or its transpose, `[C, z, y, x]`."""
         return self.diagonal * u - self.from_neighbors(u)
 
+    def linearized(self, _: Tensor) -> PrintedOperator:
+        """The derivative of M u by u, which is M."""
+        return self
+
     def transposed(self) -> PrintedOperator:
         """M^T."""
         return replace(self, is_transposed=not self.is_transposed)

@@ -29,7 +29,7 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     assert contents(folder) == before
 
 
-LIMITED = "flux_limited diffusion, marshak limiter, damped Picard iteration with multigrid"
+LIMITED = "flux_limited diffusion, damped Picard iteration with multigrid"
 SUN = "lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]"
 LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
 PHYSICS = [
