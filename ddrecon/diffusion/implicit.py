@@ -172,7 +172,7 @@ class AutodiffOperator:
     """
 
     tensors: tuple[Tensor, ...]
-    center: Tensor | None = None
+    center: Any = None
     is_transposed: bool = False
 
     def product(self, u: Tensor, *tensors: Tensor) -> Tensor:
