@@ -1,21 +1,14 @@
-"""Iterations and time of each diffusion solver, to the same residual from the same zero start, on
-real media; ratios are to multigrid.
+"""Iterations of the diffusion solver from zero, on real media.
 
     python benchmarks/solver.py [--device cuda] [--cells 32 64 128] [--tolerances 1e-3 1e-6]
-                                [--jacobi]
 
 `--cells`: edges of cubes, measured beside 64 x 96 x 64; three colors, float32. The plume is
-`data/plume/density.npz` under its light; `--densities FILE...` adds other volumes. Solvers run in
-turns, as often as `--repeats` says, and the median of the turns' ratios counts. Multigrid's time
-includes making its grids; an adjoint solve finds them made. On a CPU, time is that of the
-processor, which others on the machine disturb less.
+`data/plume/density.npz` under its light; `--densities FILE...` adds other volumes.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
-import time
 from pathlib import Path
 
 import torch
@@ -25,7 +18,7 @@ from torch.nn.functional import interpolate
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import DirectionalLight
@@ -72,37 +65,6 @@ def resample(density: Tensor, shape: tuple[int, int, int]) -> Tensor:
     return interpolate(density[None, None], size=shape, mode="trilinear")[0, 0]
 
 
-def seconds(solver: str, operator: Operator, source: Tensor, tolerance: float) -> tuple[float, int]:
-    """Time of a solve with nothing prepared, and its iterations."""
-    fresh = Operator(operator.conductances, operator.loss)
-    clock = time.perf_counter if source.is_cuda else time.process_time
-    start = clock()
-    iterations = SOLVERS[solver](fresh, source, None, tolerance).iterations
-    return clock() - start, iterations
-
-
-def row(
-    name: str,
-    operator: Operator,
-    source: Tensor,
-    tolerance: float,
-    solvers: list[str],
-    repeats: int,
-) -> str:
-    """One line of the table."""
-    turns = [
-        {solver: seconds(solver, operator, source, tolerance) for solver in solvers}
-        for _ in range(repeats)
-    ]
-    cells = " x ".join(str(n) for n in source.shape[1:])
-    columns = [str(turns[0][solver][1]) for solver in solvers]
-    for solver in solvers[1:]:
-        columns.append(
-            f"{statistics.median(turn[solver][0] / turn['multigrid'][0] for turn in turns):.1f}"
-        )
-    return f"| {name}, {cells}, {tolerance:.0e} | {' | '.join(columns)} |"
-
-
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser()
@@ -110,30 +72,23 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="*", default=[32, 64, 128])
     parser.add_argument("--tolerances", type=float, nargs="*", default=[1e-3, 1e-6])
     parser.add_argument("--densities", type=Path, nargs="*", default=[])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--jacobi", action="store_true", help="Jacobi iteration too (minutes)")
     arguments = parser.parse_args()
     torch.set_num_threads(2)
-    solvers = ["multigrid", "conjugate_gradient", *(["jacobi"] if arguments.jacobi else [])]
-    heads = [f"{solver}: iterations" for solver in solvers] + [
-        f"time of {solver} / multigrid" for solver in solvers[1:]
-    ]
-    print(f"| medium, cells, tolerance | {' | '.join(heads)} |\n|{'---|' * (len(heads) + 1)}")
+    print("| medium, cells, tolerance | iterations |\n|---|---|")
     files = {"plume": PLUME} | {path.stem: path for path in arguments.densities}
     media = {
         name: torch.from_numpy(read_field(path, "density").values) for name, path in files.items()
     }
-    shapes = [(n, n, n) for n in arguments.cells] + [(64, 96, 64)]
-    for shape in shapes:
+    for shape in [(n, n, n) for n in arguments.cells] + [(64, 96, 64)]:
         fields = {name: (resample(values, shape), 40.0) for name, values in media.items()} | {
             "nearly empty": (torch.full(shape, 1e-3), 12.0)
         }
+        cells = " x ".join(map(str, shape))
         for name, (density, sigma_t) in fields.items():
             operator, source = system(density, sigma_t, arguments.device)
             for tolerance in arguments.tolerances:
-                print(
-                    row(name, operator, source, tolerance, solvers, arguments.repeats), flush=True
-                )
+                iterations = solve_by_multigrid(operator, source, None, tolerance).iterations
+                print(f"| {name}, {cells}, {tolerance:.0e} | {iterations} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ from ddrecon.cameras import Camera, Rays
 from ddrecon.diffusion.cells import average_cells, sharpen
 from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
-from ddrecon.diffusion.flux_limited import LIMITERS, solve_flux_limited
+from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.bounced import reflected_light
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -317,19 +317,18 @@ def solve_diffuse(
 
     `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
     """
-    if settings.scheme == "printed":
-        by_jacobi = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
-        diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
+    if (settings.model, settings.scheme) != ("p1", "conservative"):
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
         if medium.emission is not None:
             scattered = replace(scattered, mean=scattered.mean + medium.emission)
-        return solve_printed(medium, diffusion, scattered, outside, by_jacobi, medium.has_flux)
-    solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
-    if settings.model == "flux_limited":
-        return solve_flux_limited(
-            medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
-        )
+        if settings.model == "flux_limited":
+            solve = SolverWithMemory(iterate_picard, settings.tolerance, memory)
+            return solve_flux_limited(medium, scattered, outside, solve, medium.has_flux)
+        solve = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
+        diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
+        return solve_printed(medium, diffusion, scattered, outside, solve, medium.has_flux)
+    solve = SolverWithMemory(solve_by_multigrid, settings.tolerance, memory)
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)

@@ -107,12 +107,11 @@ class DiffusionSettings:
     where its gradient needs no more.
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
-    iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
-    The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
-    P1 towards transport, and keep angles to `degree`; with a `transport_tolerance` they end where
-    one changes light by less of it (docs/theory.md, section 7). Light is computed and seen in cells
-    a `refine`th as wide along the axes `refine_along`. A scene file that leaves these out gets what
-    its medium deserves.
+    iteration; the model `flux_limited` has no closure. `floor` is that of the smooth closure.
+    `transport_rounds` sweeps take P1 towards transport, and keep angles to `degree`; with a
+    `transport_tolerance` they end where one changes light by less of it (docs/theory.md, section
+    7). Light is computed and seen in cells a `refine`th as wide along the axes `refine_along`. A
+    scene file that leaves these out gets what its medium deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -124,8 +123,6 @@ class DiffusionSettings:
     scheme: str = one_of("conservative", ("conservative", "printed"), expert=True)
     closure: str = one_of("geometric", ("geometric", "smooth"), expert=True)
     floor: float = bounded(FLOOR, above=0, maximum=1e3, expert=True)
-    limiter: str = one_of("marshak", ("marshak", "levermore_pomraning"), expert=True)
-    solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"), expert=True)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = bounded(True, expert=True)
     transport_rounds: int | None = bounded(None, minimum=0, maximum=16)

@@ -62,7 +62,7 @@ def parts_in_torch(scene: Scene, is_on_gpu: bool) -> tuple[str, ...]:
     """
     settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    is_fused = is_fused and settings.solver == "multigrid" and has_kernels("diffusion", is_on_gpu)
+    is_fused = is_fused and has_kernels("diffusion", is_on_gpu)
     has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
     is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
     repeats = bool(scene.volume.grid.periodic)
@@ -135,9 +135,9 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     if settings.scheme == "printed":
         method = "smooth closure, printed scheme by Jacobi iteration"
     elif settings.model == "flux_limited":
-        method = f"{settings.limiter} limiter, damped Picard iteration with {settings.solver}"
+        method = "damped Picard iteration with multigrid"
     else:
-        method = f"{settings.closure} closure, {settings.solver}"
+        method = f"{settings.closure} closure, multigrid"
     terms.append(f"multiple scattering by {settings.model} diffusion, {method}")
     if settings.rounds:
         rounds = _count(settings.rounds, "transport round")

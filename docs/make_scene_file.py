@@ -427,8 +427,6 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "scheme": "`printed` is the paper's own discretization, for comparison.",
             "closure": "What the diffusion coefficient becomes in empty space.",
             "floor": "Of the smooth closure.",
-            "limiter": "Of the flux-limited model.",
-            "solver": "Of the linear system.",
             "tolerance": "Relative residual of a solve.",
             "warm_start": "Whether a solve begins at the last one's solution.",
             "transport_rounds": (

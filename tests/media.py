@@ -109,6 +109,20 @@ def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator
     return Operator((z, y, x), absorption + boundary_loss(diffusion, grid))
 
 
+def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:
+    """u of `operator` u = `source` of one color, by conjugate gradients alone; and iterations."""
+    scale, iteration = operator.diagonal.rsqrt(), 0
+    y, residual, direction = torch.zeros_like(source), scale * source, scale * source
+    goal, square = tolerance * float(residual.norm()), (residual**2).sum()
+    while float(square.sqrt()) > goal:
+        product = scale * operator.apply(scale * direction)
+        step = square / (direction * product).sum()
+        y, residual = y + step * direction, residual - step * product
+        previous, square, iteration = square, (residual**2).sum(), iteration + 1
+        direction = residual + square / previous * direction
+    return scale * y, iteration
+
+
 def dense_matrix(operator: Operator) -> Tensor:
     """The matrix `[C, n, n]` of `operator`, with loops and flat indices: a slow twin."""
     colors, *shape = operator.loss.shape

@@ -6,9 +6,7 @@ from dataclasses import fields
 import pytest
 
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.flux_limited import LIMITERS
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
-from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES
 from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
 from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
@@ -18,8 +16,6 @@ from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
     ("record", "key", "table"),
     [
         (DiffusionSettings, "closure", CLOSURES),
-        (DiffusionSettings, "limiter", LIMITERS),
-        (DiffusionSettings, "solver", SOLVERS),
         (DiffusionSettings, "degree", DIRECTIONS),
         (OptimizeSettings, "loss", LOSSES),
     ],

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import replace_file
@@ -159,7 +158,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 Change = Callable[[Scene], Scene]
-EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
+EXACT: dict[str, Any] = {"tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
 """The tolerance in place of that for `flux_limited`.
 
@@ -198,7 +197,6 @@ def model_of(scene: Scene) -> tuple[object, ...]:
 def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
     """What is tried, one setting at a time; a quick bench tries less."""
     for name, values in (
-        ("solver", SOLVERS),
         ("tolerance", (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)),
         ("closure", CLOSURES),
         ("model", ("p1",) if is_quick else ("p1", "flux_limited")),

@@ -87,6 +87,10 @@ class Operator:
         own = (t[color : color + 1] if len(t) > 1 else t for t in given)
         return Operator.of({}, *own)
 
+    def linearized(self, _: Tensor) -> Operator:
+        """The derivative of A u by u, which is A."""
+        return self
+
     def transposed(self) -> Operator:
         """A^T, which is A."""
         return self

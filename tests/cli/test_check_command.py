@@ -29,7 +29,7 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     assert contents(folder) == before
 
 
-LIMITED = "flux_limited diffusion, marshak limiter, damped Picard iteration with multigrid"
+LIMITED = "flux_limited diffusion, damped Picard iteration with multigrid"
 SUN = "lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]"
 LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
 PHYSICS = [
@@ -78,9 +78,9 @@ def test_json(succeed: Run) -> None:
 
 
 def test_keys_for_experts_are_told_where_they_are_not_at_their_default(succeed: Run) -> None:
-    overrides = ["-D", "diffusion.solver=jacobi", "-D", "views.0.weight=2"]
+    overrides = ["-D", "diffusion.closure=smooth", "-D", "views.0.weight=2"]
     lines = succeed("check", "scene.yaml", *overrides).stdout.splitlines()
-    assert "for experts: views.0.weight 2.0, diffusion.solver jacobi" in lines
+    assert "for experts: views.0.weight 2.0, diffusion.closure smooth" in lines
     assert not json.loads(succeed("check", "scene.yaml", "--json").stdout)["expert_keys"]
 
 

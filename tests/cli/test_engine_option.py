@@ -71,7 +71,6 @@ LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
     ({"transport_rounds": 1}, [], False, ()),
     ({"transport_rounds": 1}, [], True, ("diffusion", "transport rounds")),
     ({"model": "flux_limited"}, [PointLight(PLACE, POWER)], False, ("diffusion", "point lights")),
-    ({"solver": "jacobi"}, [], False, ("diffusion",)),
     ({"scheme": "printed"}, [], False, ("diffusion",)),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2}, [], False, ("pairs of beams",)),
     ({"g": -0.6, "degree": 3, "transport_rounds": 2, "directional": None}, [], False, ()),

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
-from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.engine import use_engine
 
@@ -25,7 +25,9 @@ def solve(
     engine: str, operator: Operator, source: Tensor, tolerance: float, guess: Tensor | None = None
 ) -> Solution:
     use_engine(engine)
-    return multigrid(Operator(operator.conductances, operator.loss), source, guess, tolerance)
+    return solve_by_multigrid(
+        Operator(operator.conductances, operator.loss), source, guess, tolerance
+    )
 
 
 def cycle(operator: Operator, source: Tensor) -> Tensor:

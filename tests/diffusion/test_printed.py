@@ -15,7 +15,14 @@ from torch import Tensor
 from ddrecon.diffusion import printed
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.printed import Ghosts, PrintedOperator, Stencils, extend, iterate_jacobi
+from ddrecon.diffusion.printed import (
+    PrintedOperator,
+    convolve,
+    extend,
+    fill_ghosts,
+    iterate_jacobi,
+    make_stencils,
+)
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -32,11 +39,15 @@ TO_ROUNDING: dict[str, Any] = {"eps": 1e-5, "atol": 1e-8, "rtol": 1e-6, "nondet_
 def make_printed(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
     """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
     kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
-    stencils, squares = Stencils.on(grid, kappa), sum(2 / h**2 for h in grid.spacing)
+    stencils, squares = make_stencils(grid, kappa), sum(2 / h**2 for h in grid.spacing)
     diagonal = 3 * random_values(colors, *grid.shape, seed=2) + kappa * squares
-    echo = Ghosts.of(kappa, Moments(torch.zeros_like(kappa)), DARK, stencils).echo
-    coefficients = printed.convolve(extend(kappa), stencils.coefficients)
-    return PrintedOperator(stencils, diagonal, coefficients, echo)
+    echo, _ = fill_ghosts(grid, kappa, None, DARK)
+    weights = torch.cat([kappa[:, None], convolve(extend(kappa), stencils[1:])], 1)
+    return PrintedOperator(grid, stencils, tensors=(diagonal, weights, echo))
+
+
+def transposed(operator: PrintedOperator) -> PrintedOperator:
+    return operator.linearized(torch.zeros_like(operator.tensors[0])).transposed()
 
 
 def smooth_scene(cells: int = 6, **changes: Any) -> Scene:
@@ -51,7 +62,7 @@ def smooth_scene(cells: int = 6, **changes: Any) -> Scene:
 
 def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> Tensor:
     """Eq. 22-24 with indices, `[n, n]` for the first color: a slow twin of the operator."""
-    grid, shape = operator.stencils.grid, operator.stencils.grid.shape
+    grid, shape = operator.grid, operator.grid.shape
     number = {cell: n for n, cell in enumerate(itertools.product(*map(range, shape)))}
     matrix = torch.zeros(len(number), len(number), dtype=kappa.dtype)
     for cell, row in number.items():
@@ -69,7 +80,7 @@ def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> T
 
 def matrix_of(operator: PrintedOperator) -> Tensor:
     """The matrix `[C, n, n]` of `operator`, column by column."""
-    shape = operator.diagonal.shape
+    shape = operator.tensors[0].shape
     columns = torch.eye(math.prod(shape[1:]), dtype=torch.float64).view(-1, 1, *shape[1:])
     return torch.stack([operator.apply(one.expand(shape)).flatten(1) for one in columns], 2)
 
@@ -79,9 +90,10 @@ def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, in
     operator = make_printed(box_grid(shape), contrast=30.0)
     kappa = 0.1 * 30.0 ** random_values(2, *shape, seed=1)[0]
     expected = matrix_by_loops(operator, kappa, 3 * random_values(2, *shape, seed=2)[0])
-    transposed = matrix_of(replace(operator, is_transposed=True))[0]
     torch.testing.assert_close(matrix_of(operator)[0], expected, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(transposed, expected.T, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        matrix_of(transposed(operator))[0], expected.T, rtol=1e-12, atol=1e-12
+    )
 
 
 def test_ghost_cells_hold_the_marshak_condition():
@@ -89,8 +101,8 @@ def test_ghost_cells_hold_the_marshak_condition():
     grid = box_grid((3, 2, 4))
     outside = torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1)
     kappa, u, *flux = (random_values(2, *grid.shape, seed=seed) for seed in range(5))
-    ghosts = Ghosts.of(kappa, Moments(u, tuple(flux)), outside, Stencils.on(grid, u))
-    around = ghosts.echo * extend(u) + ghosts.inflow
+    echo, inflow = fill_ghosts(grid, kappa, tuple(flux), outside)
+    around = echo * extend(u) + inflow
     assert torch.equal(around[:, 1:-1, 1:-1, 1:-1], u)
     for axis, h in enumerate(grid.spacing):
         ghost_cells, cells, k, q = (
@@ -182,12 +194,14 @@ def exact(operator: PrintedOperator, source: Tensor) -> Tensor:
 @pytest.mark.parametrize("is_transposed", [False, True])
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-8, 1e-13])
 def test_the_tolerance_is_a_relative_residual(tolerance: float, is_transposed: bool):
-    operator = replace(make_printed(box_grid((4, 5, 3))), is_transposed=is_transposed)
+    operator = make_printed(box_grid((4, 5, 3)))
+    operator = transposed(operator) if is_transposed else operator
     source = random_values(2, 4, 5, 3, seed=3) - 0.5
     solution = iterate_jacobi(operator, source, None, tolerance)
-    residual = (source - operator.apply(solution.value)) / operator.diagonal
+    diagonal = operator.tensors[0]
+    residual = (source - operator.apply(solution.value)) / diagonal
     assert 0 < solution.residual <= tolerance
-    assert float(residual.norm() / (source / operator.diagonal).norm()) < 2 * tolerance
+    assert float(residual.norm() / (source / diagonal).norm()) < 2 * tolerance
     errors = {"rtol": 1e3 * tolerance, "atol": 1e2 * tolerance}
     torch.testing.assert_close(solution.value, exact(operator, source), **errors)
 
@@ -224,10 +238,10 @@ def ball() -> Callable[..., Scene]:
 def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
     """At a floor of 0.1; the cell named differs most from its neighbors, by over 4 of its kappa."""
     scene = ball(20.0, 2.0, floor=0.1)
-    with pytest.raises(SolveError, match=r"and above 4 .*diffusion\.scheme=conservative") as caught:
+    with pytest.raises(SolveError, match=r"above 4; .*diffusion\.scheme=conservative") as caught:
         solve_light(scene, SolveMemory())
-    words = r"kappa changes by a factor ([\d.]+) between neighbors at cell \((\d+), (\d+), (\d+)\)"
-    told = re.match(words, str(caught.value))
+    words = r"the largest is ([\d.]+) at cell \((\d+), (\d+), (\d+)\)"
+    told = re.search(words, str(caught.value))
     assert told is not None
     factor, (x, y, z) = float(told[1]), (int(index) for index in told.groups()[1:])
     volume = scene.volume
@@ -241,10 +255,11 @@ def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
     assert caught.value.iterations < 200 and caught.value.exit_code == 4
 
 
-def test_divergence_that_the_criterion_does_not_explain_is_not_blamed_on_it():
+def test_divergence_that_the_criterion_does_not_explain_tells_the_factor_all_the_same():
     operator = make_printed(box_grid((4, 5, 3)))
-    operator = replace(operator, diagonal=operator.diagonal / 3)
-    with pytest.raises(SolveError, match=r"diverged, although kappa changes by a factor [0-3]\."):
+    diagonal, *others = operator.tensors
+    operator = replace(operator, tensors=(diagonal / 3, *others))
+    with pytest.raises(SolveError, match=r"diverged, as it may .* the largest is [0-3]\."):
         iterate_jacobi(operator, random_values(2, 4, 5, 3), None, 1e-8)
 
 
@@ -254,9 +269,9 @@ def test_slow_convergence_ends_with_an_error(monkeypatch):
         iterate_jacobi(make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3), None, 1e-8)
 
 
-@pytest.mark.parametrize("where", ["source", "diagonal", "coefficients"])
-def test_a_system_that_is_not_finite_is_an_error(where: str):
+@pytest.mark.parametrize("where", range(3))
+def test_a_system_that_is_not_finite_is_an_error(where: int):
     operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3)
-    (source if where == "source" else getattr(operator, where))[0, 0, 0, 0] = torch.nan
+    (source, *operator.tensors)[where][0, 0, 0, 0] = torch.nan
     with pytest.raises(SolveError, match="not finite"):
         iterate_jacobi(operator, source, None, 1e-8)

@@ -43,5 +43,5 @@ def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
 
 def test_keys_for_experts_stand_on_their_page_alone(manual: ModuleType) -> None:
     ordinary, expert = (manual.pages()[name] for name in ("scene_file.md", "expert_keys.md"))
-    assert "| `solver` |" in expert and "| `solver` |" not in ordinary
+    assert "| `closure` |" in expert and "| `closure` |" not in ordinary
     assert "| `tolerance` | a number, above 0, at most 0.5 |" in ordinary

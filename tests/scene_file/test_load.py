@@ -41,7 +41,6 @@ diffusion:
   model: p1                # none | p1 | flux_limited
   scheme: conservative     # or `printed`: the paper's own central differences, for comparison
   closure: smooth          # empty-space treatment, see THEORY section 5
-  solver: conjugate_gradient
   tolerance: 1e-4          # relative residual
   warm_start: true
   transport_rounds: 0

@@ -33,7 +33,7 @@ views:
     camera: {type: orthographic, width: 1, resolution: [8, 6],
              matrix: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.5], [0, 0, 0, 1]]}
 render: {samples_per_pixel: 1, background: true, tolerance: 0.05}
-diffusion: {model: p1, closure: geometric, solver: multigrid, tolerance: 1e-4, transport_rounds: 1}
+diffusion: {model: p1, closure: geometric, tolerance: 1e-4, transport_rounds: 1}
 optimize:
   iterations: 4
   loss: l2

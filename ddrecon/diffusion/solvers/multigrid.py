@@ -1,31 +1,24 @@
 """Conjugate gradients, preconditioned by a V-cycle of multigrid (Tatebe 1993, NASA CP-3224).
 
 All colors at once, each with its own scalars and its own end: one that is exact enough is left as
-it is. About ten iterations, whatever the size of the volume. Conjugate gradients alone (Hestenes
-and Stiefel 1952, doi:10.6028/jres.049.044) take more, the more cells there are; Jacobi iteration,
-the paper's method, converges on the conservative M-matrix, if slowly.
+it is. About ten iterations, whatever the size of the volume.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, require_reached
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution
 from ddrecon.engine import current_engine, has_kernels
+from ddrecon.errors import SolveError
 
 MAX_ITERATIONS = 2_000
-ALONE, JACOBI = 10, 100
-"""Conjugate gradients alone, and Jacobi iteration, may take so many times as many."""
-CHECK_EVERY = 16
-"""After so many of its iterations Jacobi's residual is looked at."""
 
 
-def multigrid(
+def solve_by_multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
     """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
@@ -37,56 +30,31 @@ def multigrid(
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
     else:
-
-        def cycle(residual: Tensor) -> Tensor:
-            return operator.once(Level.of).cycle(residual)
-
-        solution = _iterate(operator, source, guess, tolerance, MAX_ITERATIONS, cycle)
-    return require_reached("multigrid", solution, tolerance)
-
-
-def conjugate_gradient(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
-) -> Solution:
-    """The same by conjugate gradients with Jacobi's preconditioner, the diagonal."""
-    most = ALONE * MAX_ITERATIONS
-    solution = _iterate(operator, source, guess, tolerance, most, lambda residual: residual)
-    return require_reached("conjugate_gradient", solution, tolerance)
-
-
-def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
-    """The same by Jacobi iteration."""
-    system = ScaledSystem.of(operator, source)
-    y, residual = system.start(guess)
-    for iteration in range(JACOBI * MAX_ITERATIONS + 1):
-        if iteration % CHECK_EVERY == 0:
-            relative = float(system.relative(residual).max())
-            if not relative > tolerance:
-                break
-        y += residual
-        residual = system.matrix.residual(y, system.source)
-    return require_reached("jacobi", system.solution(y, iteration, relative), tolerance)
+        solution = _iterate(operator, source, guess, tolerance)
+    if not solution.residual <= tolerance:
+        raise SolveError(
+            "multigrid did not reach its tolerance",
+            solution.iterations,
+            solution.residual,
+            "raise diffusion.tolerance or use --dtype float64",
+        )
+    return solution
 
 
 def _iterate(
-    operator: Operator,
-    source: Tensor,
-    guess: Tensor | None,
-    tolerance: float,
-    most: int,
-    precondition: Callable[[Tensor], Tensor],
+    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
-    """The solution after at most so many iterations, which may not reach `tolerance`."""
+    """The solution after at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     system, tiny = ScaledSystem.of(operator, source), torch.finfo(source.dtype).tiny
     matrix = system.matrix
     y, residual = system.start(guess)
     relative = system.relative(residual)
     direction, square = torch.zeros_like(y), torch.ones_like(relative)
     iteration = 0
-    while (worst := float(relative.max())) > tolerance and iteration < most:
+    while (worst := float(relative.max())) > tolerance and iteration < MAX_ITERATIONS:
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative.double() > tolerance
-        preconditioned = precondition(residual)
+        preconditioned = operator.once(Level.of).cycle(residual)
         previous, square = square, matrix.inner(residual, preconditioned)
         direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
         product = matrix.apply(direction)

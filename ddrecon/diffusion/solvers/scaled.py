@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, sides, subtract_neighbors
-from ddrecon.errors import SolveError
 
 
 @dataclass(frozen=True)
@@ -98,15 +97,3 @@ class ScaledSystem:
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
         return Solution(self.matrix.scale * y, iterations, residual)
-
-
-def require_reached(name: str, solution: Solution, tolerance: float) -> Solution:
-    """`solution`; raises SolveError where it did not converge."""
-    if solution.residual <= tolerance:
-        return solution
-    raise SolveError(
-        f"{name} did not reach its tolerance",
-        solution.iterations,
-        solution.residual,
-        "raise diffusion.tolerance or use --dtype float64",
-    )

@@ -16,7 +16,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import steep_gradient, sweep
 from ddrecon.diffusion.rounds.transport import _mean_step, _transport_share, run_rounds
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
@@ -88,7 +88,7 @@ def test_rounds_are_sweeps_by_loops_and_dense_solves(g: float):
         torch.full((1, 1, 1, 1), 0.3, dtype=torch.float64),
         g != 0,
     )
-    solve = SolverWithMemory(SOLVERS["conjugate_gradient"], 1e-14, SolveMemory())
+    solve = SolverWithMemory(solve_by_multigrid, 1e-14, SolveMemory())
     start = solve_conservative(problem, solve)
     for rounds in (1, 2):
         expected = start

@@ -17,7 +17,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import steep_gradient, sweep
 from ddrecon.diffusion.rounds.transport import run_rounds
-from ddrecon.diffusion.solvers.multigrid import multigrid
+from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import Moments
@@ -133,7 +133,7 @@ def left_of_noise(
     problem = DiffusionProblem(
         medium, Closure("geometric", medium.grid), nothing, noise.new_zeros(1, 1, 1, 1), g != 0
     )
-    solve = SolverWithMemory(multigrid, 1e-8, SolveMemory(is_warm=False))
+    solve = SolverWithMemory(solve_by_multigrid, 1e-8, SolveMemory(is_warm=False))
     ends = (run_rounds(problem, Moments.of_harmonics(noise), solve, n, degree) for n in rounds)
     return [float(light.harmonics(medium.degree if g else 0).norm()) for light in ends]
 
