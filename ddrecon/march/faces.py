@@ -51,8 +51,9 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
         light.index_add_(1 + line, layers[:2], rise.to(light), alpha=reach)
     for index, beam in enumerate(emission.beams):
         _extend_mass(fields[f"mass {index}"], beam, emission, lines, axis)
-    for line in lines if emission.inflow is not None else []:
-        _lower(light, emission, emission.inflow, line, axis)
+    for line in lines:
+        if emission.inflow is not None:
+            _lower(light, emission, emission.inflow, line, axis)
     return fields
 
 
