@@ -38,21 +38,26 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
     grid, extinction = emission.grid, emission.extinction
-    fields = {
-        name: pad(field, (1,) * 6, mode="replicate") for name, field in emission.fields.items()
-    }
+    fields = dict[str, Tensor]()
+    for name, field in emission.fields.items():
+        # Light goes on from zeros below: torch keeps what it replicates for the backward pass.
+        mode = "constant" if name.split()[0] in ("diffuse", "mass") else "replicate"
+        fields[name] = pad(field, (1,) * 6, mode=mode)
     lines = [line for line, count in enumerate(grid.shape) if count > 1]
     light, matter = fields["diffuse"], fields["extinction"][: len(emission.diffuse)]
-    for line in lines:
+    for line in range(3):
         layers, reach = _find_layers(grid.shape[line], light.device), 0.5 if line == axis else 1.0
         depth = extinction.scale[: len(light)] * matter.index_select(1 + line, layers[2:4])
         share = for_channels(thinness(grid, depth, OPAQUE), len(light))
-        rise = share * _find_rise(light, line, layers)
-        light.index_add_(1 + line, layers[:2], rise.to(light), alpha=reach)
+        last, rise = _find_rise(light, line, layers)
+        light.index_add_(
+            1 + line, layers[:2], torch.addcmul(last, share, rise, value=reach).to(light)
+        )
     for index, beam in enumerate(emission.beams):
         _extend_mass(fields[f"mass {index}"], beam, emission, lines, axis)
-    for line in lines if emission.inflow is not None else []:
-        _lower(light, emission, emission.inflow, line, axis)
+    for line in lines:
+        if emission.inflow is not None:
+            _lower(light, emission, emission.inflow, line, axis)
     return fields
 
 
@@ -61,11 +66,12 @@ def _extend_mass(
 ) -> None:
     """Lets `mass` go on along `lines` to faces, to zero on those through which `beam` shines."""
     grid, lit = emission.grid, shine_through(beam, emission.grid)
-    layers = {line: _find_layers(grid.shape[line], mass.device) for line in lines}
-    for line in lines:
-        rise = _limit(_find_rise(mass, line, layers[line]), 0.5 * emission.extinction.mass_bound)
-        reach = 0.5 if line == axis else 1.0
-        mass.index_add_(1 + line, layers[line][:2], rise.to(mass), alpha=reach)
+    layers = [_find_layers(count, mass.device) for count in grid.shape]
+    for line in range(3):
+        last, rise = _find_rise(mass, line, layers[line])
+        limited = _limit(rise, 0.5 * emission.extinction.mass_bound)
+        change = torch.add(last, limited, alpha=0.5 if line == axis else 1.0)
+        mass.index_add_(1 + line, layers[line][:2], change.to(mass))
     for line in lines:
         on_face = mass.index_select(1 + line, layers[line][: 2 if line == axis else 4])
         on_face = on_face.unflatten(1 + line, (-1, 2)).sum(1 + line)
@@ -73,10 +79,10 @@ def _extend_mass(
         mass.index_add_(1 + line, layers[line][:2], lost.to(mass), alpha=-1)
 
 
-def _find_rise(light: Tensor, line: int, layers: Tensor) -> Tensor:
-    """By how much the outermost cells along the axis `line` have more than those before them."""
+def _find_rise(light: Tensor, line: int, layers: Tensor) -> tuple[Tensor, Tensor]:
+    """The outermost cells along the axis `line`, and how much more they have than those before."""
     last, before = light.index_select(1 + line, layers[2:]).chunk(2, 1 + line)
-    return last - before
+    return last, last - before
 
 
 def _lower(light: Tensor, emission: Emission, inflow: Inflow, line: int, axis: int | None) -> None:
@@ -110,7 +116,7 @@ def _lower(light: Tensor, emission: Emission, inflow: Inflow, line: int, axis: i
 @remember
 def _find_layers(count: int, device: torch.device) -> Tensor:
     """Both layers outside of `count` cells along an axis, the outermost two, and those before."""
-    return torch.tensor([0, count + 1, 1, count, 2, count - 1], device=device)
+    return torch.tensor([0, count + 1, 1, count, min(2, count), max(count - 1, 1)], device=device)
 
 
 def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
