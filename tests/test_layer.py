@@ -317,6 +317,15 @@ RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ),
     ({}, {"principal_point": [0.5]}, "principal_point: must be two finite numbers, found (0.5,)"),
     ({}, {"principal_point": (0.5, math.nan)}, "principal_point: must be two finite numbers"),
+    ({}, {"pixel_aspect": 0.0}, "views.view.camera: pixel_aspect must be above 0 and finite"),
+    ({}, {"pixel_aspect": math.nan}, "camera: pixel_aspect must be above 0 and finite, found nan"),
+    ({}, {"pose": 2 * torch.eye(3, 4, **DOUBLE)}, "pose must be of unit length"),
+    ({}, {"pose": torch.tensor([-1.0, 1, 1]).double().diag()[:, [0, 1, 2, 2]]}, "and not mirror"),
+    ({}, {"lens": "fish", "distortion": torch.zeros(4, **DOUBLE)}, "expected a lens among opencv,"),
+    ({}, {"lens": "fisheye"}, "views.view.distortion: lens fisheye takes [4], found NoneType"),
+    ({}, {"lens": "opencv", "distortion": torch.zeros(2, **DOUBLE)}, "takes [6], found [2]"),
+    ({"background": torch.ones(2)}, {}, "background: expected a tensor [C, 1, 1] or [C, "),
+    ({"background": 0.5}, {}, "[C, 1, 1] or [C, 4, 5], found float"),
 ]
 
 
@@ -327,6 +336,16 @@ def test_so_is_one_made_in_python(view: dict[str, Any], camera: dict[str, Any], 
     scene.views = [replace(known, camera=replace(known.camera, **camera), **view)]
     with pytest.raises(UsageError, match=re.escape(problem)):
         render(scene)
+
+
+def test_neither_lights_nor_a_ground_are_guessed() -> None:
+    scene = small_layer().scene
+    light = replace(scene.lights[0], irradiance=3.0)
+    with pytest.raises(UsageError, match=r"lights\.0\.irradiance: expected a tensor, found float"):
+        render(replace(scene, lights=[light]))
+    ground = Ground(tensor(0.5), Plane(math.nan, 1))
+    with pytest.raises(UsageError, match=r"ground\.height: must be finite, found nan"):
+        render(replace(scene, ground=ground))
 
 
 def test_one_precision_and_a_known_view() -> None:

@@ -17,13 +17,14 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import twist
+from ddrecon.cameras import Camera, twist
 from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
+from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -38,6 +39,8 @@ from ddrecon.variables.kinds import (
 
 EVERY = "views.*."
 """How names for all training views at once begin: `views.*.exposure`."""
+RIGID = 0.01
+"""How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
 Settings = TypeVar("Settings")
 
 
@@ -141,9 +144,15 @@ def require_legal(scene: Scene, view: str | None = None, *, waits: bool = False)
         if split_name(name)[1] not in EXTINCTION_AND_ALBEDO
     }
     for index, light in enumerate(scene.lights):
-        numbers |= {f"lights.{index}.{name}": getattr(light, name) for name in _tensors(light)}
+        numbers |= {
+            f"lights.{index}.{field.name}": getattr(light, field.name)
+            for field in fields(light)
+            if field.type == "Tensor"
+        }
     if scene.ground is not None:
         numbers["ground.albedo"] = scene.ground.albedo
+        if not math.isfinite(height := scene.ground.plane.height):
+            raise UsageError(f"ground.height: must be finite, found {height:g}")
     for item in scene.views if view is None else [scene.view(view)]:
         numbers |= _view_numbers(item, waits)
     for name, value in numbers.items():
@@ -163,8 +172,16 @@ def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
     if (waits or half.is_cpu) and not 0 < float(half) < math.inf:
         what = "half_width, 1 / (2 focal), must be above 0 and finite"
         raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
-    if behind is not None and (waits or behind.is_cpu) and not bool(behind.isfinite().all()):
-        raise UsageError(f"{owner}background: must be finite")
+    if (waits or pose.is_cpu) and not _is_rigid(pose.detach()):
+        what = "the first three columns of its pose must be of unit length and perpendicular"
+        raise UsageError(f"{owner}camera: {what}, and not mirror")
+    if not 0 < camera.pixel_aspect < math.inf:
+        what = f"pixel_aspect must be above 0 and finite, found {camera.pixel_aspect:g}"
+        raise UsageError(f"{owner}camera: {what}")
+    if camera.lens is not None or camera.distortion is not None:
+        _require_lens(f"{owner}distortion", camera)
+    if behind is not None:
+        _require_background(f"{owner}background", behind, camera.size, waits)
     middle = camera.principal_point
     if not isinstance(middle, Tensor) and (len(middle) != 2 or not all(map(math.isfinite, middle))):
         what = "must be two finite numbers"
@@ -173,6 +190,34 @@ def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
     parts |= {"camera": pose, "distortion": camera.distortion}
     parts["principal_point"] = middle if isinstance(middle, Tensor) else None
     return {owner + part: value for part, value in parts.items() if value is not None}
+
+
+def _is_rigid(pose: Tensor) -> bool:
+    """Whether `pose` turns and shifts; NaN is for others to tell."""
+    axes = pose[:, :3]
+    off = (axes.T @ axes - torch.eye(3).to(pose)).abs().max()
+    return not (float(off) > RIGID or float(axes.det()) < 0)
+
+
+def _require_lens(name: str, camera: Camera) -> None:
+    """Raises UsageError unless the lens of `camera` is known, with as many coefficients."""
+    if camera.lens not in LENSES:
+        raise UsageError(f"{name}: expected a lens among {', '.join(LENSES)}, found {camera.lens}")
+    count = len(LENSES[camera.lens])
+    if _shape_of(camera.distortion) != str([count]):
+        found = _shape_of(camera.distortion)
+        raise UsageError(f"{name}: lens {camera.lens} takes [{count}], found {found}")
+
+
+def _require_background(name: str, behind: Tensor, size: tuple[int, int], waits: bool) -> None:
+    """Raises UsageError unless `behind` can be what is behind a picture of this `size`."""
+    if not isinstance(behind, Tensor) or tuple(behind.shape) not in (
+        (colors, *tail) for colors in (1, 3) for tail in ((1, 1), tuple(size))
+    ):
+        what = f"expected a tensor [C, 1, 1] or [C, {size[0]}, {size[1]}]"
+        raise UsageError(f"{name}: {what}, found {_shape_of(behind)}")
+    if (waits or behind.is_cpu) and not bool(behind.isfinite().all()):
+        raise UsageError(f"{name}: must be finite")
 
 
 def _shape_of(value: object) -> str:

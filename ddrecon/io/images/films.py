@@ -22,6 +22,10 @@ FILMS = {".mp4": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska"}
 """What ffmpeg takes a suffix for: by itself it would go by content, and follow playlists."""
 OTHER_CURVES = re.compile("arib-std-b67|smpte2084|smpte428|linear|log100|log316")
 """As ffmpeg calls them: HLG, PQ, that of cinemas, none and logarithms."""
+ALPHA = re.compile(
+    r"alpha_mode *: 1|Video: [^\n]*, (yuva|rgba|bgra|argb|abgr|gbrap|ya\d)", re.IGNORECASE
+)
+"""How ffmpeg says that a film has alpha, which some encode apart from colors."""
 STREAM = ["-map", "0:V:0"]
 """The first video that is no cover."""
 AHEAD = 0.5
@@ -102,4 +106,7 @@ def _frame_times(path: Path, *_: int) -> tuple[float, ...]:
     ticks = {int(word) for word in re.findall(r"^0, *-?\d+, *(\d+),", listed, re.MULTILINE)}
     if done.returncode or base is None or not ticks:
         raise FormatError(path, "is damaged, or no film")
+    if ALPHA.search(done.stderr.decode(errors="replace")):
+        what = "has alpha, and does not say whether its colors are multiplied by it"
+        raise FormatError(path, f"{what}; save its frames as .png or .exr, or without alpha")
     return tuple(tick * int(base[1]) / int(base[2]) for tick in sorted(ticks))

@@ -78,3 +78,19 @@ def test_a_damaged_frame_is_refused(tmp_path: Path) -> None:
     assert shown(path, 0) == 0
     with pytest.raises(FormatError, match="frame 4 is damaged"):
         read_image(path, 4)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        (".mov", ("-c:v", "prores_ks", "-pix_fmt", "yuva444p10le")),
+        (".mkv", ("-c:v", "png", "-pix_fmt", "rgba")),
+        (".webm", ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p")),
+    ],
+)
+def test_films_with_alpha_are_refused(tmp_path: Path, suffix: str, options: tuple[str]) -> None:
+    """It would be lost: what is transparent would be as bright as what is not."""
+    path = tmp_path / f"film{suffix}"
+    ffmpeg("-f", "lavfi", "-i", "color=red@0.5:s=32x16:d=0.2,format=rgba", *options, path)
+    with pytest.raises(FormatError, match="has alpha, and does not say"):
+        read_image(path)
