@@ -21,11 +21,12 @@ from torch import Tensor
 
 from ddrecon.errors import UsageError
 from ddrecon.kernels.compiling import is_rehearsed, load
-from ddrecon.kernels.spare import keep_freed_memory
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 MOST = 2**31
 """Items of a launch are fewer."""
+MOST_COPIED = 2**30
+"""Bytes that copies of numbers take at most, one for each thread, if there are more than a few."""
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
 _seconds: dict[tuple[Any, int], float] = {}
@@ -41,6 +42,11 @@ def too_many(what: str, count: int) -> UsageError:
         f"{what}: {count} is too many for fused kernels, which count to 2^31; "
         "take fewer cells or pixels, or --engine torch"
     )
+
+
+def count_shares(threads: int, size: int, least: int = 2) -> int:
+    """How many of `threads` add to numbers of `size` bytes: each adds to a copy of its own."""
+    return min(threads, max(least, MOST_COPIED // max(1, size)))
 
 
 def thread_count(like: Tensor) -> int:
@@ -120,7 +126,6 @@ def _start() -> None:
 
     It does so past Python, to the process's error stream, on every machine without a GPU.
     """
-    keep_freed_memory()
     sys.stderr.flush()
     kept = os.dup(2)
     try:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares, thread_count
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission

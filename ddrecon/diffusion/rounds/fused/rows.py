@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
 from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares
 from ddrecon.kernels.text import TextKernel, declarations
 
 _ROOM = "diffusion/rounds/fused"

@@ -24,7 +24,6 @@ from ddrecon.diffusion.solvers.fused.hierarchy import (
 )
 from ddrecon.diffusion.solvers.hierarchy import STEPS
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import trim_freed_memory
 from ddrecon.kernels.text import TextKernel
 
 SUMS, VECTORS = read_names("levels.h", "Sum"), read_names("levels.h", "Vector")
@@ -37,8 +36,6 @@ SHARED = "DOWN", "COARSER", "UP", "DIRECT", "ADVANCE"
 """Launches of an iteration where they do."""
 ALONE = 1 << 19
 """Colors of so many cells are solved one after another: as fast, in a third of the memory."""
-TRIMMED = 1 << 26
-"""Before solves of so many bytes, at a peak, the system gets unused memory back."""
 
 
 def solve(
@@ -59,8 +56,6 @@ def solve(
 
     if source[0].numel() < ALONE:
         return Solution(made, *solve_part(operator, slice(None)))
-    if source.nbytes >= TRIMMED:
-        trim_freed_memory()
     counts, residuals = zip(
         *(solve_part(operator.of_color(c), slice(c, c + 1)) for c in range(len(source))),
         strict=True,
