@@ -19,7 +19,7 @@ LIMITS = {"memory.max": "anon", "memory.limit_in_bytes": "total_rss"}
 
 Files that the system keeps in memory count as free.
 """
-OVERHEAD = 1.3
+OVERHEAD = 1.5
 """How many times as much as is alive the process holds."""
 IN_PIXEL = 18
 """Numbers of a pixel: targets, those of a coarser level, what view rays meet, renders."""
@@ -55,8 +55,10 @@ def numbers_in_cell(colors: int, varied: int, moments: int, is_limited: bool) ->
     `moments`: of light that transport rounds keep, 0 without rounds; `is_limited`: by flux-limited
     diffusion. Fitted to arrays that `benchmarks/memory.py --count` finds alive.
     """
-    of_color = 8 + 16 * is_limited + (8 + 3 * moments) * (moments > 0)
-    return (16 + colors * of_color) * (1.5 if varied else 1) + 10 * varied
+    often = 12 * is_limited + (10 + moments) * (moments > 0)
+    if not varied:
+        return 16 + colors * (8 + often)
+    return 24 + colors * (12 + 2.5 * often) + 10 * varied
 
 
 def refuse_excess(needs: Needs, device: torch.device) -> str | None:

@@ -26,6 +26,7 @@ from ddrecon.diffusion.rounds.bounced import reflected_light
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers.multigrid import name_kernels
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -206,6 +207,8 @@ def _find_light(
         return replace(follow_unscattered_light(medium, lights, below), reflected=reflected)
     # The paper's own scheme knows values at centers only.
     cells = medium if settings.scheme == "printed" else average_cells(medium)
+    if not medium.grid.periodic:
+        name_kernels(medium.extinction.field)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)

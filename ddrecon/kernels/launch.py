@@ -20,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from ddrecon.errors import UsageError
-from ddrecon.kernels.compiling import is_rehearsed, load
+from ddrecon.kernels.compiling import load, name_kernel
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 MOST = 2**31
@@ -76,8 +76,6 @@ def launch(
     goes_by_time = threads is None
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
-    if is_rehearsed(kernel, device.alias):
-        return
     load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
     stream = _stream(torch.cuda.current_stream(like.device)) if like.is_cuda else None
@@ -118,6 +116,11 @@ def _share(run: Callable[[int], None], threads: int) -> float:
         if not other.cancelled():
             other.result()
     return seconds
+
+
+def launch_later(kernel: Any, like: Tensor) -> None:
+    """Has `kernel`, which will be launched where tensor `like` lies, compiled meanwhile."""
+    name_kernel(kernel, _device(like.device).alias)
 
 
 @functools.cache

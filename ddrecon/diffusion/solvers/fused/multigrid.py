@@ -18,12 +18,14 @@ from ddrecon.diffusion.solvers.fused.hierarchy import (
     ROOM,
     Hierarchy,
     margin,
+    prepare_kernel,
     read_names,
     room,
     shares_of,
 )
 from ddrecon.diffusion.solvers.hierarchy import STEPS
 from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 
 SUMS, VECTORS = read_names("levels.h", "Sum"), read_names("levels.h", "Vector")
@@ -36,6 +38,12 @@ SHARED = "DOWN", "COARSER", "UP", "DIRECT", "ADVANCE"
 """Launches of an iteration where they do."""
 ALONE = 1 << 19
 """Colors of so many cells are solved one after another: as fast, in a third of the memory."""
+
+
+def name_kernels(like: Tensor) -> None:
+    """Has the kernels of a solve on tensors `like` this compiled meanwhile."""
+    for kernel in (solve_kernel, prepare_kernel):
+        launch_later(kernel(8 * like.itemsize).kernel, like)
 
 
 def solve(
