@@ -93,8 +93,6 @@ def engine_versions() -> dict[str, str]:
 
 def _resolve(name: str, asked: str) -> str:
     """The engine that `name` stands for; `asked` begins the message of an error."""
-    if name == "warp-graph":
-        raise UsageError(f"{asked}: CUDA graphs are no longer there; take warp")
     if name not in CHOICES:
         raise UsageError(f"{asked}: no such engine; known: {', '.join(CHOICES)}")
     if name == "torch":

@@ -25,7 +25,7 @@ from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
 from ddrecon.diffusion.rounds.bounced import reflected_light
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solvers.multigrid import name_kernels, solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
@@ -206,6 +206,8 @@ def _find_light(
         return replace(follow_unscattered_light(medium, lights, below), reflected=reflected)
     # The paper's own scheme knows values at centers only.
     cells = medium if settings.scheme == "printed" else average_cells(medium)
+    if not medium.grid.periodic:
+        name_kernels(medium.extinction.field)
     # Q0 and Q1: beams and skies, not yet scattered; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)

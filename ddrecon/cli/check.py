@@ -13,7 +13,7 @@ from ddrecon.cameras import pixel_width
 from ddrecon.engine import name_engines
 from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
-from ddrecon.memory import gibibytes, memory_of
+from ddrecon.memory import gibibytes
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import (
     Support,
@@ -41,9 +41,8 @@ def memory_estimate(scene: Scene) -> int:
 
     Derivatives are counted where the scene is to be optimized.
     """
-    volume = scene.volume
-    parts = scene.views, scene.lights, scene.diffusion, scene.optimize
-    return memory_of(needs_of_scene(volume.media or {"": volume}, *parts))
+    media = scene.volume.media or {"": scene.volume}
+    return needs_of_scene(media, scene.views, scene.diffusion, scene.optimize).total
 
 
 def supports_of(frames: Iterable[Scene]) -> list[Support]:

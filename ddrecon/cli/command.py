@@ -96,13 +96,12 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
                 click.echo(line, err=True)
             sys.exit(error.exit_code)
         except (MemoryError, RuntimeError) as error:
-            from ddrecon.memory import is_shortage
+            from ddrecon.memory import explain_shortage
 
-            if debug or not is_shortage(error):
+            line = explain_shortage(error)
+            if debug or line is None:
                 raise
-            reason = str(error).partition("\n")[0] or "no more is given"
-            advice = "make volume.resolution or the images smaller, or --resume the run"
-            click.echo(f"out of memory: {reason}; {advice}", err=True)
+            click.echo(line, err=True)
             sys.exit(2)
         except KeyboardInterrupt as error:
             _show(f"interrupted {error}".strip())

@@ -65,7 +65,6 @@ class Session:
             return self.place
         import torch
 
-        from ddrecon.kernels.spare import keep_freed_memory
         from ddrecon.memory import usable_cores
 
         has_gpu = torch.cuda.is_available()
@@ -94,7 +93,6 @@ class Session:
         usual = torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else cores
         self.threads = self.threads or usual
         torch.set_num_threads(self.threads)
-        keep_freed_memory()
         torch.manual_seed(self.seed)
         return self.place
 

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -110,6 +111,10 @@ class _Found(torch.autograd.Function):
 
     @staticmethod
     def forward(function: RowFunction, numbers: Tensor, *fields: Tensor) -> Tensors:
+        if numbers.requires_grad or any(one.requires_grad for one in fields):
+            varied = _one_by_one(fields[: len(fields) - function.added])
+            kernel = function.kernel("cotangents", len(varied), 8 * numbers.itemsize)
+            launch_later(kernel.kernel, numbers)
         return function.run("values", numbers, fields)[0]
 
     @staticmethod

@@ -20,12 +20,13 @@ import warp as wp
 from torch import Tensor
 
 from ddrecon.errors import UsageError
-from ddrecon.kernels.compiling import is_rehearsed, load
-from ddrecon.kernels.spare import keep_freed_memory
+from ddrecon.kernels.compiling import load, name_kernel
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 MOST = 2**31
 """Items of a launch are fewer."""
+MOST_COPIED = 2**30
+"""Bytes that copies of numbers take at most, one for each thread, if there are more than a few."""
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
 _seconds: dict[tuple[Any, int], float] = {}
@@ -41,6 +42,11 @@ def too_many(what: str, count: int) -> UsageError:
         f"{what}: {count} is too many for fused kernels, which count to 2^31; "
         "take fewer cells or pixels, or --engine torch"
     )
+
+
+def count_shares(threads: int, size: int, least: int = 2) -> int:
+    """How many of `threads` add to numbers of `size` bytes: each adds to a copy of its own."""
+    return min(threads, max(least, MOST_COPIED // max(1, size)))
 
 
 def thread_count(like: Tensor) -> int:
@@ -70,8 +76,6 @@ def launch(
     goes_by_time = threads is None
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
-    if is_rehearsed(kernel, device.alias):
-        return
     load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
     stream = _stream(torch.cuda.current_stream(like.device)) if like.is_cuda else None
@@ -114,13 +118,17 @@ def _share(run: Callable[[int], None], threads: int) -> float:
     return seconds
 
 
+def launch_later(kernel: Any, like: Tensor) -> None:
+    """Has `kernel`, which will be launched where tensor `like` lies, compiled meanwhile."""
+    name_kernel(kernel, _device(like.device).alias)
+
+
 @functools.cache
 def _start() -> None:
     """Starts Warp; what it writes of a missing CUDA driver then is kept from the user's sight.
 
     It does so past Python, to the process's error stream, on every machine without a GPU.
     """
-    keep_freed_memory()
     sys.stderr.flush()
     kept = os.dup(2)
     try:

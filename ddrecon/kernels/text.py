@@ -26,7 +26,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ddrecon.kernels.compiling import clear_in_rehearsal
 from ddrecon.kernels.launch import MOST, launch, too_many
 
 _TYPES = {
@@ -137,9 +136,7 @@ class TextKernel:
             self.write(record, name, value)
         lists = (value if isinstance(value, list) else [value] for value in made.values())
         arrays = [array for each in lists for array in each if isinstance(array, Tensor)]
-        clear_in_rehearsal(arrays)
-        like = arrays[0]
-        return Bound(self, record, [kept, made], like)
+        return Bound(self, record, [kept, made], arrays[0])
 
     def _ready(self, name: str, value: Any) -> Any:
         is_array = isinstance(value, Tensor)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import asdict, replace
 from time import perf_counter
 from typing import Any
@@ -17,10 +16,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import current_engine
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.numerics.remember import forget_changed
-from ddrecon.ranks import from_first, rank_count
+from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
@@ -93,7 +91,6 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
-        _compile_ahead(lambda: self.copy_for_rehearsal()._iterate(start))
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -109,16 +106,6 @@ class Reconstruction:
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
             raise
-
-    def copy_for_rehearsal(self) -> Reconstruction:
-        """A copy that shares its pictures alone: they are large, and no kernel makes anything of
-        them.
-        """
-        level = self.level
-        views = *self.problem.scene.views, *level.train.views, *level.test.views
-        pictures = [picture for view in views for picture in (view.image, view.mask)]
-        targets = *level.targets.values(), *level.test_targets.values()
-        return deepcopy(self, {id(shared): shared for shared in (*pictures, *targets)})
 
     def _iterate(self, start: float) -> Row:
         """One iteration, begun at `start` [s]."""
@@ -269,15 +256,3 @@ class Reconstruction:
         """Whether test views, and SSIM, are looked at in this iteration."""
         iteration = self.iteration + 1
         return iteration % tuning.TEST_EVERY == 0 or self.schedule.is_over(iteration)
-
-
-def _compile_ahead(computation: Callable[[], object]) -> None:
-    """Has the fused kernels of `computation` compiled side by side, where none is loaded yet.
-
-    `computation` is rehearsed: called with kernels that do nothing, on what nobody else reads. Of
-    several ranks none does so, as what one of them leaves out the others would wait for.
-    """
-    if current_engine() == "warp" and rank_count() == 1:
-        from ddrecon.kernels.compiling import compile_rehearsed
-
-        compile_rehearsed(computation)

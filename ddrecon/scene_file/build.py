@@ -30,7 +30,7 @@ from ddrecon.march.windows import look_inside
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase_blend import Blend
-from ddrecon.memory import Needs, count_threads, make_room
+from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
@@ -90,8 +90,8 @@ def build_scene(
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     parameters = optimize.parameters if optimize else ()
     diffusion, _ = choose_diffusion(tree.diffusion, whole, [*media.values()], parameters)
-    needs = needs_of_scene(media, views, lights, diffusion, optimize)
-    if too_much := make_room(needs, place):
+    needs = needs_of_scene(media, views, diffusion, optimize)
+    if too_much := refuse_excess(needs, place):
         raise scene_file.refused("volume.resolution", too_much)
     # Only now each cell has a number of its own.
     media = {
@@ -239,7 +239,6 @@ def _whole_of(media: Mapping[str, Volume]) -> Volume:
 def needs_of_scene(
     media: Mapping[str, Volume],
     views: Sequence[View],
-    lights: Sequence[Light],
     diffusion: DiffusionSettings,
     optimize: OptimizeSettings | None,
 ) -> Needs:
@@ -250,22 +249,16 @@ def needs_of_scene(
     whole, parameters = _whole_of(media), optimize.parameters if optimize else {}
     colors = count_colors(whole, media.values())
     is_directed = "g" in parameters or bool((whole.phase.moments(3)[:, 1:] != 0).any())
-    varied = [_varied(name, one, media, colors) for name, one in parameters.items()]
-    z, y, x = whole.grid.shape
+    moments = count_harmonics(diffusion.angles) if is_directed else 1
+    varied = sum(_varied(name, one, media, colors) for name, one in parameters.items())
+    is_limited = diffusion.model == "flux_limited"
+    numbers = numbers_in_cell(colors, varied, moments * (diffusion.rounds > 0), is_limited)
     return Needs(
-        (x, y, z),
-        colors,
-        whole.density.element_size(),
+        resolution=whole.grid.shape[::-1],
+        # Light is computed in cells so many times as narrow along these axes.
+        numbers=numbers * diffusion.times ** len(diffusion.refine_along),
         pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
-        has_flux=is_directed,
-        has_rounds=diffusion.rounds > 0,
-        moments=count_harmonics(diffusion.angles) if is_directed else 1,
-        is_limited=diffusion.model == "flux_limited",
-        varied=sum(varied) if varied else None,
-        lights=len(lights),
-        threads=count_threads(whole.density.device),
-        times=diffusion.times,
-        along=diffusion.refine_along,
+        size=whole.density.element_size(),
     )
 
 

@@ -1,9 +1,10 @@
-"""A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
+"""Adjoints are compiled beside what is done before them: each kernel once, and none in vain."""
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,102 +20,118 @@ from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 SMALL = ["volume.resolution=[10,12,8]", "volume.g=0.3"]
-
-
-class Loads(list[object]):
-    """Kernels made ready; `unload` has the process forget those it had."""
-
-    def unload(self) -> None:
-        compiling._loaded.clear()
-        self.clear()
+LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
 
 
 @pytest.fixture
-def loads(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loads]:
-    """Which kernels are made ready while it lasts."""
-    seen = Loads()
-    real = compiling.wp.load_module
-    monkeypatch.setattr(
-        compiling.wp, "load_module", lambda module, **of: (seen.append(module), real(module, **of))
-    )
-    seen.unload()
-    yield seen
-    compiling._loaded.clear()
-
-
-def first_iteration() -> torch.Tensor:
-    run = Reconstruction(load_scene(BALL, overrides=SMALL))
-    run.step()
-    return run.parameters[0].value.detach()
+def nothing_loaded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A process that has no kernels, and two threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    monkeypatch.setattr(compiling, "_loaded", set())
+    monkeypatch.setattr(compiling, "_named", {})
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.slow
-def test_an_iteration_needs_no_other_kernels(
-    loads: Loads, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    "change", [SMALL, [*SMALL, LAMP, "optimize.parameters={density: {}, sigma_s: {}}"]]
+)
+def test_an_iteration_names_the_adjoints_that_it_launches(
+    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch, change: list[str]
 ) -> None:
     use_engine("warp")
-    with caplog.at_level(logging.DEBUG, LOG):
-        ahead = first_iteration()
-    assert "ended early" not in caplog.text
-    # All were made ready by the rehearsal, each once; now as an iteration comes to them.
-    side_by_side = list(loads)
-    loads.unload()
-    monkeypatch.setattr("ddrecon.reconstruct.loop._compile_ahead", lambda _: None)
-    assert torch.equal(first_iteration(), ahead)
-    assert len(side_by_side) == len(set(side_by_side))
-    assert set(side_by_side) == set(loads)
+    launched = dict[Any, bool]()
+    load = compiling.load
+
+    def note(kernel: Any, device: str) -> None:
+        launched.setdefault(kernel, (kernel, device) in compiling._named)
+        load(kernel, device)
+
+    monkeypatch.setattr(launching, "load", note)
+    Reconstruction(load_scene(BALL, overrides=change)).step()
+    named = {kernel.key for kernel, was_named in launched.items() if was_named}
+    assert {kernel for kernel, _ in compiling._named} <= launched.keys()
+    assert {"return_rows", "transpose", "flow_cotangents"} < named
+    adjoints = ("back", "cotangents", "adjoint", "transpose", "return_rows")
+    later = {one.key for one in launched if one.key.endswith(adjoints)}
+    assert named == later | {"multigrid", "prepare"}
 
 
 def fill_kernels() -> list[TextKernel]:
     return [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(3)]
 
 
-def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise AssertionError("launched")
+Load = Callable[[Any], None]
 
-    monkeypatch.setattr(launching, "_call", fail)
-    monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: loads.append(module))
-    kernels = fill_kernels()
-    found = []
 
-    def computation() -> None:
-        for kernel in kernels:
-            found.append(torch.ones(4, dtype=torch.float64))
-            kernel.launch(4, {}, {"out": found[-1]})
-        raise ValueError("zeros may lead astray")
+def replace_compiler(monkeypatch: pytest.MonkeyPatch, load: Load) -> None:
+    monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: load(module))
 
-    compiling.compile_rehearsed(computation)
-    assert not torch.stack(found).any()
-    for kernel in kernels:
-        with pytest.raises(AssertionError, match="launched"):
-            kernel.launch(4, {}, {"out": found[0]})
-    assert sorted(map(id, loads)) == sorted(id(kernel.module) for kernel in kernels)
-    # Where a process has kernels, nothing is rehearsed.
-    compiling.compile_rehearsed(lambda: found.append("again"))
-    assert "again" not in found
+
+def test_who_needs_a_kernel_first_compiles_it(
+    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What nobody has begun, whoever was asked for it; for what was begun it waits."""
+    first, second, third = (kernel.kernel for kernel in fill_kernels())
+    may_end, threads = threading.Event(), dict[Any, list[str]]()
+
+    def compile(module: Any) -> None:
+        threads.setdefault(module, []).append(threading.current_thread().name)
+        if module is first.module:
+            has_begun.set()
+            may_end.wait(60)
+
+    has_begun = threading.Event()
+    replace_compiler(monkeypatch, compile)
+    for kernel in (first, second, first):
+        compiling.name_kernel(kernel, "cpu")
+    has_begun.wait(60)
+    own = threading.current_thread().name
+    for kernel in (second, third):
+        compiling.load(kernel, "cpu")
+        assert threads[kernel.module] == [own]
+    may_end.set()
+    for kernel in (first, second, third):
+        compiling.load(kernel, "cpu")
+    assert threads[first.module] != [own] and [len(each) for each in threads.values()] == [1] * 3
+
+
+def test_what_another_thread_cannot_compile_is_an_error_here(
+    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(module: Any) -> None:
+        raise OSError("no compiler")
+
+    replace_compiler(monkeypatch, fail)
+    kernel = fill_kernels()[0].kernel
+    compiling.name_kernel(kernel, "cpu")
+    for _ in range(2):
+        with pytest.raises(OSError, match="no compiler"):
+            compiling.load(kernel, "cpu")
 
 
 def test_while_kernels_are_compiled_lines_say_how_far_that_is(
-    loads: Loads, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    nothing_loaded: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Before the first is done, at a level that Python shows unasked, and not of what is cached."""
     use_engine("warp")
-    kernels = fill_kernels()
+    first, _, third = (kernel.kernel for kernel in fill_kernels())
     is_told = threading.Semaphore(0)
     monkeypatch.setattr(compiling, "COMPILED", 0.0)
     monkeypatch.setattr(compiling, "PAUSE", 0.0)
     monkeypatch.setattr(compiling, "_last_line", -1.0)
-    monkeypatch.setattr(compiling, "_compiled", [])
     monkeypatch.setattr(compiling.wp, "load_module", lambda *_, **__: is_told.acquire(timeout=60))
     real = compiling._tell
     monkeypatch.setattr(compiling, "_tell", lambda *of: (real(*of), is_told.release()))
     with caplog.at_level(logging.WARNING, LOG):
-        for kernel in kernels:
-            compiling.load(kernel.kernel, "cpu", len(kernels))
+        compiling.load(first, "cpu")
+        compiling.name_kernel(third, "cpu")
+        compiling._named[third, "cpu"].result()
         lines = [record.getMessage() for record in caplog.records]
-        assert len(lines) == 3 and "once" in lines[0] and "fill_2" in lines[2]
-        assert "2 of at most 3 done" in lines[2]
-        for kernel in kernels:
-            compiling.load(kernel.kernel, "cpu")
-    assert len(caplog.records) == 3
+        assert len(lines) == 2 and "once" in lines[0] and "fill_2" in lines[1]
+        assert "1 done, 1 or more to do" in lines[1]
+        for kernel in (first, third):
+            compiling.load(kernel, "cpu")
+    assert len(caplog.records) == 2

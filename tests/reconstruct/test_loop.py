@@ -110,16 +110,3 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
         Reconstruction(replace(ball_scene, views=tests))
     with pytest.raises(SceneError, match="missing section"):
         Reconstruction(replace(ball_scene, optimize=None))
-
-
-def test_a_rehearsal_needs_no_second_pictures(ball_scene: Scene) -> None:
-    """But tensors of its own wherever kernels leave zeros, or something is remembered of them."""
-    run = Reconstruction(ball_scene)
-    copy = run.copy_for_rehearsal()
-    for name in ("train", "test"):
-        scene, other = (getattr(each.level, name) for each in (run, copy))
-        assert scene.volume.density is not other.volume.density and scene.views
-        for view, same in zip(scene.views, other.views, strict=True):
-            assert view.image is same.image and view.camera.pose is not same.camera.pose
-    assert {**run.level.targets} == {**copy.level.targets}
-    assert run.parameters[0].value is not copy.parameters[0].value

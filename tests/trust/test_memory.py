@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -12,7 +11,7 @@ from click.testing import Result
 from ddrecon import memory
 from ddrecon.cli.check import memory_estimate
 from ddrecon.io.volumes.table import write_field
-from ddrecon.memory import Needs, is_shortage, memory_of, usable_cores
+from ddrecon.memory import Needs, explain_shortage, usable_cores
 from ddrecon.run import render_folder
 from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
@@ -39,41 +38,48 @@ def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) 
     assert not Path("out").exists()
 
 
+def require_fit(run: Run, line: str, *command: str) -> None:
+    """Each of the proposals of a `line` about cells, made alone, takes no more than is free."""
+    proposals = line.strip().partition("this would fit: ")[2].split(", or ")
+    assert proposals
+    for proposal in proposals:
+        key, _, value = proposal.partition(": ")
+        words = ["-D", f"{key}={value}"] if value else proposal.split()
+        assert run(*command, *words).exit_code == 0
+
+
 @pytest.mark.parametrize(
     "change",
     [
         [],
         ["--dtype", "float64", "-D", "diffusion.transport_rounds=1"],
         ["-D", "diffusion.model=flux_limited"],
+        ["-D", "diffusion.refine=3"],
     ],
     ids=str,
 )
 def test_what_is_said_to_fit_fits(
     run: Run, monkeypatch: pytest.MonkeyPatch, change: list[str]
 ) -> None:
-    """Each of the proposals, made one after another, is taken."""
     large = ["check", "scene.yaml", "-D", "volume.resolution=[96, 64, 64]", *change]
-    free = 110 * 2**20
-    monkeypatch.setattr(memory, "free_memory", lambda _: free)
+    monkeypatch.setattr(memory, "free_memory", lambda _: 60 * 2**20)
     result = run(*large)
     assert result.exit_code == 2
-    proposals = result.stderr.strip().partition("this would fit: ")[2].split(", or ")
-    for proposal in proposals:
-        key, _, value = proposal.removeprefix("-D ").partition(": " if ": " in proposal else "=")
-        words = proposal.split() if proposal.startswith("--") else ["-D", f"{key}={value}"]
-        assert run(*large, *words).exit_code == 0
+    require_fit(run, result.stderr, *large)
 
 
-def test_what_barely_fits_gives_freed_memory_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs, cpu = Needs((96, 96, 96), 3, 4, 0, varied=7), torch.device("cpu")
-    free, calls = memory_of(needs), list[str]()
-    monkeypatch.setattr(memory, "free_memory", lambda _: free)
-    monkeypatch.setattr(memory, "give_freed_memory", lambda: calls.append("given"))
-    assert memory.make_room(needs, cpu) is None and not calls
-    free = memory_of(needs, is_short=True)
-    assert memory.make_room(needs, cpu) is None and calls == ["given"]
-    free -= 1
-    assert "this would fit" in (memory.make_room(needs, cpu) or "") and calls == ["given"]
+@pytest.mark.parametrize("part", [0.9, 0.3])
+def test_smaller_images_are_said_to_fit_where_cells_do(
+    monkeypatch: pytest.MonkeyPatch, part: float
+) -> None:
+    needs = Needs((20, 20, 20), 40, 10**6, 4)
+    monkeypatch.setattr(memory, "free_memory", lambda _: int(part * needs.total))
+    line = memory.refuse_excess(needs, torch.device("cpu")) or ""
+    width = int(re.findall(r"images of (\d+)%", line)[0]) / 100
+    fits = [
+        Needs((20, 20, 20), 40, int(10**6 * share**2), 4).total for share in (width, 1.05 * width)
+    ]
+    assert fits[0] <= part * needs.total < fits[1]
 
 
 @pytest.mark.parametrize(
@@ -96,69 +102,100 @@ def test_the_prediction_is_the_estimate(
     bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
     write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
     predicted: list[Needs] = []
-    monkeypatch.setattr(build, "make_room", lambda needs, _: predicted.append(needs))
+    monkeypatch.setattr(build, "refuse_excess", lambda needs, _: predicted.append(needs))
     scene = load_scene("scene.yaml", overrides=overrides)
-    assert memory_of(predicted[0]) == memory_estimate(scene) > 0
+    assert predicted[0].total == memory_estimate(scene) > 0
 
 
 def write_group(folder: Path, files: dict[str, str]) -> None:
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         (folder / name).write_text(content + "\n")
 
 
-def test_limits_of_control_groups(tmp_path: Path) -> None:
-    write_group(
-        tmp_path / "v2/a/b",
-        {"memory.max": "1000", "memory.current": "700", "memory.stat": "anon 1\ninactive_file 50"},
-    )
-    (tmp_path / "v2/a/memory.max").write_text("max\n")
-    write_group(
-        tmp_path / "v1/memory/c",
-        {
-            "memory.limit_in_bytes": "900",
-            "memory.usage_in_bytes": "100",
-            "memory.stat": "total_inactive_file 25\ninactive_file 1",
-        },
-    )
-    own = tmp_path / "own"
-    own.write_text("0::/a/b\n")
-    assert list(memory._group_limits(tmp_path / "v2", own)) == [350]
-    own.write_text("3:cpu,memory:/c\n1:cpu:/\n")
-    assert list(memory._group_limits(tmp_path / "v1", own)) == [825]
-    assert list(memory._group_limits(tmp_path / "none", own)) == []
-
-
-def test_cores_are_those_that_may_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By affinity, and by the smallest quota of a group or of one that it is in."""
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Has this process be in other control groups, as /proc/self/cgroup says it."""
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)))
-    own = tmp_path / "own"
-    own.write_text("0::/a/b\n3:cpu,cpuacct:/c\n")
-    files = {"v2/a/b/cpu.max": "max 100000", "v1/cpu/c/cpu.cfs_quota_us": "-1"}
-    files["v1/cpu/c/cpu.cfs_period_us"] = "100000"
-    assert usable_cores(tmp_path / "none", own) == 8
-    for cores, quota in ((8, files), (3, {"v2/a/cpu.max": "250000 100000"})):
-        for name, text in quota.items():
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name).write_text(text + "\n")
-        assert usable_cores(tmp_path / "v2", own) == cores
-    assert usable_cores(tmp_path / "v1", own) == 8
-    (tmp_path / "v1/cpu/c/cpu.cfs_quota_us").write_text("100000")
-    assert usable_cores(tmp_path / "v1", own) == 1
+    return lambda text: (tmp_path / "own").write_text(text) and None
 
 
-def test_a_shortage_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def solve_light(*_: Any) -> torch.Tensor:
-        return torch.empty(2**52)
+@pytest.mark.parametrize(
+    ("own", "limit", "used"),
+    [
+        ("0::/a/b\n", "memory.max", "anon 650\nfile 90"),
+        ("3:memory:/a/b\n1:cpu:/\n", "memory.limit_in_bytes", "rss 9\ntotal_rss 650"),
+    ],
+)
+def test_limits_of_control_groups(
+    tmp_path: Path, groups: Callable[[str], None], own: str, limit: str, used: str
+) -> None:
+    """The least that a group, or one that it is in, has left; "max" is none."""
+    cpu, top = torch.device("cpu"), tmp_path / ("memory" if "memory" in own else "")
+    machine = memory.free_memory(cpu)
+    groups(own)
+    assert machine is None or memory.free_memory(cpu) > 1000
+    write_group(top / "a/b", {limit: "1000", "memory.stat": used})
+    write_group(top / "a", {limit: "max", "memory.stat": used})
+    assert memory.free_memory(cpu) == 350
+    (top / "a" / limit).write_text("700")
+    assert memory.free_memory(cpu) == 50
 
-    monkeypatch.setattr(render_folder, "solve_light", solve_light)
-    result = run("render", "scene.yaml", "-q", "-o", "out")
+
+def test_cores_are_those_that_may_be_used(tmp_path: Path, groups: Callable[[str], None]) -> None:
+    """By affinity, and by the smallest quota of a group or of one that it is in."""
+    groups("0::/a/b\n")
+    assert usable_cores() == 8
+    write_group(tmp_path / "a/b", {"cpu.max": "max 100000"})
+    assert usable_cores() == 8
+    (tmp_path / "a/cpu.max").write_text("250000 100000\n")
+    assert usable_cores() == 3
+    groups("3:cpu,cpuacct:/c\n")
+    files = {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"}
+    write_group(tmp_path / "cpu,cpuacct/c", files)
+    assert usable_cores() == 8
+    (tmp_path / "cpu,cpuacct/c/cpu.cfs_quota_us").write_text("100000\n")
+    assert usable_cores() == 1
+
+
+CUDA = (
+    "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 139.81 GiB of "
+    "which 1.20 GiB is free. If reserved but unallocated memory is large try setting "
+    "PYTORCH_CUDA_ALLOC_CONF=expandable_segments:True to avoid fragmentation.  See documentation"
+)
+
+
+def ask_for_too_much() -> None:
+    torch.empty(2**52)
+
+
+def fail_on_a_gpu() -> None:
+    raise torch.cuda.OutOfMemoryError(CUDA)
+
+
+@pytest.mark.parametrize(
+    ("shortage", "amount"),
+    [(ask_for_too_much, "18014398509481984 bytes"), (fail_on_a_gpu, "2.00 GiB")],
+)
+def test_a_shortage_is_one_line_that_says_what_would_fit(
+    run: Run, monkeypatch: pytest.MonkeyPatch, shortage: Callable[[], None], amount: str
+) -> None:
+    """That takes at most half of what was predicted, since more was needed."""
+    monkeypatch.setattr(render_folder, "solve_light", lambda *_: shortage())
+    result = run("render", "scene.yaml", "-q", "-o", "out", "--dtype", "float64")
     assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.startswith("out of memory: ") and result.stderr.count("\n") == 1
+    begin, _, fits = result.stderr.partition("this would fit: ")
+    assert begin == f"out of memory: {amount} is not free; " and result.stderr.count("\n") == 1
+    assert "--dtype float32" in fits and "volume.resolution: [" in fits
+    half = memory_estimate(load_scene("scene.yaml", dtype=torch.float64)) // 2
+    monkeypatch.setattr(memory, "free_memory", lambda _: half)
+    require_fit(run, result.stderr.partition(", or images")[0], "check", "scene.yaml")
 
 
 def test_other_errors_are_no_shortage() -> None:
     with pytest.raises(RuntimeError) as caught:
         torch.ones(2) @ torch.ones(3)
-    assert not is_shortage(caught.value)
-    assert is_shortage(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"))
+    assert explain_shortage(caught.value) is None
+    assert "out of memory" in (explain_shortage(MemoryError()) or "")

@@ -183,7 +183,7 @@ class Coarsest:
                 low, high = below.flatten(), above.flatten()
                 matrix[:, low, high] -= part.flatten(1).double()
                 matrix[:, high, low] -= part.flatten(1).double()
-        # Of no medium, as in a rehearsal, it is not finite; no error.
+        # Of no medium it is not finite; no error.
         return Coarsest(torch.linalg.inv_ex(matrix).inverse.to(operator.loss.dtype))
 
     def correction(self, residual: Tensor) -> Tensor:

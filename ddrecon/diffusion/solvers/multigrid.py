@@ -22,10 +22,8 @@ def solve_by_multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
     """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
-    # Fused, a thread does slices. On a GPU, where one does a cell, and where cells at both ends are
-    # neighbors, it is all torch's.
-    is_fused = current_engine() == "warp" and has_kernels("diffusion", source.is_cuda)
-    if is_fused and not operator.is_periodic:
+    # Where cells at both ends are neighbors, it is all torch's.
+    if _is_fused(source) and not operator.is_periodic:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
@@ -39,6 +37,19 @@ def solve_by_multigrid(
             "raise diffusion.tolerance or use --dtype float64",
         )
     return solution
+
+
+def name_kernels(like: Tensor) -> None:
+    """Has the kernels of a solve on tensors `like` this compiled beside what is done before it."""
+    if _is_fused(like):
+        from ddrecon.diffusion.solvers.fused import multigrid as fused  # imports Warp
+
+        fused.name_kernels(like)
+
+
+def _is_fused(like: Tensor) -> bool:
+    """Whether kernels solve: not on a GPU, where a thread is to do a cell, and not slices."""
+    return current_engine() == "warp" and has_kernels("diffusion", like.is_cuda)
 
 
 def _iterate(

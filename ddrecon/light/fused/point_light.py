@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -46,6 +45,8 @@ class _Integral(torch.autograd.Function):
     def forward(
         field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
     ) -> Tensor:
+        if field.requires_grad:
+            launch_later(way_kernel(True, 8 * field.itemsize).kernel, field)
         return _integrate(field, first, last, length, fraction)
 
     @staticmethod

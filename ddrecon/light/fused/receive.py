@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -37,6 +38,8 @@ class _Received(torch.autograd.Function):
 
     @staticmethod
     def forward(*tensors: Tensor) -> Tensor:
+        if any(one.requires_grad for one in tensors):
+            launch_later(receive_kernel("receive_back", 8 * tensors[0].itemsize).kernel, tensors[0])
         return _receive("receive", tensors)
 
     @staticmethod

@@ -16,12 +16,15 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 from ddrecon.light import shear as plain
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 
+BACK = "carry_back", "sum_back", "look_back"
+"""The kernels of the adjoint, in their order."""
 BLOCK = 256
 """Neighbors in a row that one item does on a processor; on a GPU it is one."""
 
@@ -107,6 +110,8 @@ class _Masses(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         entered, laid = field.new_empty(len(shears), *field.shape), _lay(shears, field)
         kept, numbers = [], torch.cat([numbers, bounds], 1)
+        for name in BACK if has_adjoint else ():
+            launch_later(getattr(shear_kernels(8 * field.itemsize), name).kernel, field)
         for light, shear in enumerate(shears):
             given = {"light": light, "numbers": numbers, "field": laid[shear.is_across_x]}
             windows = field.new_empty(1 + has_adjoint, len(field) * shear.window)
@@ -139,7 +144,7 @@ class _Masses(torch.autograd.Function):
             given |= {"masses": windows[0], "corrections": windows[1]}
             made = {"slices_bar": on_rays[0], "midways_bar": on_rays[1], "field_bar": bars[key]}
             made["corrections_bar"] = torch.empty_like(bar)
-            for name in ("carry_back", "sum_back", "look_back"):
+            for name in BACK:
                 shear.launch(name, given, made)
         field_bar = functools.reduce(
             torch.add, (bar.transpose(2, 3) if key else bar for key, bar in bars.items())

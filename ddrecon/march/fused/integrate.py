@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
@@ -92,6 +91,10 @@ class Integrate(torch.autograd.Function):
         out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         packets, given = _packets(cells, tensors, thread_count(rays))
+        if any(needs := [one.requires_grad for one in tensors]):
+            launch_later(
+                adjoint_kernel(layout, _case(layout, cells, needs[: len(NAMES)])).kernel, rays
+            )
         kernel = integral_kernel(layout, cells.is_sliced)
         kernel.launch(packets, given, {"out": out, "masses": masses})
         return out, masses.to(rays.dtype, copy=True), masses

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
 from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.kernels.spare import count_shares
+from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, declarations
 
 _ROOM = "diffusion/rounds/fused"
@@ -59,18 +59,23 @@ class Rows:
         self.ranges, self.densest = find_ranges(self.fields)
         self.channels = [len(field) for field in swept.fields]
 
-    def follow(self, is_saved: bool = False) -> tuple[Tensor, Tensor | None]:
+    def follow(
+        self, is_saved: bool = False, varies_numbers: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
         """Moments of radiance less the first two of light, and what `transpose` is given.
 
         Moments are [K, C, z, y, x]. If it `is_saved`, that is I before slabs of slices,
         [C, directions, slabs, y, x].
         """
+        if is_saved:
+            launch_later(self._kernel("return_rows<", varies_numbers).kernel, self.like)
         shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
         saved = self.like.new_empty(shape) if is_saved else None
         kinds = 2 if self.changes is None else 4
         lines = self.like.new_zeros(self._line_count(kinds, self.height + 2))
         kind = "F" if self.changes is None else "Dual<F>"
-        return self._run(f"follow_rows<{kind}, ", "", {}, {"saved": saved, "lines": lines}), saved
+        kernel = self._kernel(f"follow_rows<{kind}, ")
+        return self._run(kernel, {}, {"saved": saved, "lines": lines}), saved
 
     def transpose(
         self, saved: Tensor, bars: Sequence[Tensor | None], varies_numbers: bool
@@ -91,8 +96,7 @@ class Rows:
             "lines": self.like.new_empty(self._line_count(2, (self.slab + 1) * self.height)),
             "returning": self.like.new_zeros(self._line_count(2, self.height + 2)),
         }  # fmt: skip
-        flag = f", {str(varies_numbers).lower()}"
-        found = self._run("return_rows<", flag, {"bars": bars}, made)
+        found = self._run(self._kernel("return_rows<", varies_numbers), {"bars": bars}, made)
         of_fields = [
             (bar[0] if len(bar) == 1 else bar.sum(0)).sum_to_size(each, *shape)
             for bar, each in zip(fields, self.channels, strict=True)
@@ -103,9 +107,12 @@ class Rows:
     def _line_count(self, kinds: int, places: int) -> int:
         return self.lanes * (kinds * self.tables["most"] * self.pitch * places + MARGIN)
 
-    def _run(
-        self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]
-    ) -> Tensor:
+    def _kernel(self, function: str, *flags: bool) -> TextKernel:
+        shares_field, degree = self.swept.scattering is None, round(self.count**0.5) - 1
+        numbers = ", ".join(str(int(number)) for number in (degree, shares_field, *flags))
+        return _kernel(f"{function}{numbers}>", 8 * self.like.itemsize)
+
+    def _run(self, kernel: TextKernel, given: dict[str, Any], made: dict[str, Any]) -> Tensor:
         """Launches chunks, until the ways meet and from there on; the sums of moments."""
         swept = self.swept
         # Of each piece; zero where no direction of a piece goes.
@@ -132,11 +139,7 @@ class Rows:
                 "d_factors": changes.factors, "d_scales": changes.scales,
                 "d_gradient": changes.gradient,
             }  # fmt: skip
-        degree, shares_field = round(self.count**0.5) - 1, str(swept.scattering is None).lower()
-        whole = f"{function}{degree}, {shares_field}{flags}>"
-        bound = _kernel(whole, torch.finfo(self.like.dtype).bits).bind(
-            given, made | {"found": sums, "scratch": scratch}
-        )
+        bound = kernel.bind(given, made | {"found": sums, "scratch": scratch})
         halves = (1, 0) if "bars" in given else (0, 1)
         firsts = range(0, self.colors, self.together)
         for first, chunk, half in product(firsts, range(numbers), halves):

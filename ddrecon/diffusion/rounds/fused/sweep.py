@@ -87,7 +87,8 @@ class _Sweep(torch.autograd.Function):
     def forward(may_save: bool, *given: Any) -> tuple[Any, ...]:
         tensors = (each for each in given if isinstance(each, Tensor))
         is_saved = may_save and any(each.requires_grad for each in tensors)
-        moments, saved = Rows(Swept.of(*given)).follow(is_saved)
+        scales = given[2]
+        moments, saved = Rows(Swept.of(*given)).follow(is_saved, scales.requires_grad)
         return *split(moments), saved
 
     @staticmethod

@@ -18,13 +18,14 @@ from ddrecon.diffusion.solvers.fused.hierarchy import (
     ROOM,
     Hierarchy,
     margin,
+    prepare_kernel,
     read_names,
     room,
     shares_of,
 )
 from ddrecon.diffusion.solvers.hierarchy import STEPS
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import trim_freed_memory
+from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel
 
 SUMS, VECTORS = read_names("levels.h", "Sum"), read_names("levels.h", "Vector")
@@ -37,8 +38,12 @@ SHARED = "DOWN", "COARSER", "UP", "DIRECT", "ADVANCE"
 """Launches of an iteration where they do."""
 ALONE = 1 << 19
 """Colors of so many cells are solved one after another: as fast, in a third of the memory."""
-TRIMMED = 1 << 26
-"""Before solves of so many bytes, at a peak, the system gets unused memory back."""
+
+
+def name_kernels(like: Tensor) -> None:
+    """Has the kernels of a solve on tensors `like` this compiled meanwhile."""
+    for kernel in (solve_kernel, prepare_kernel):
+        launch_later(kernel(8 * like.itemsize).kernel, like)
 
 
 def solve(
@@ -59,8 +64,6 @@ def solve(
 
     if source[0].numel() < ALONE:
         return Solution(made, *solve_part(operator, slice(None)))
-    if source.nbytes >= TRIMMED:
-        trim_freed_memory()
     counts, residuals = zip(
         *(solve_part(operator.of_color(c), slice(c, c + 1)) for c in range(len(source))),
         strict=True,
