@@ -326,6 +326,7 @@ RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"lens": "opencv", "distortion": torch.zeros(2, **DOUBLE)}, "takes [6], found [2]"),
     ({"background": torch.ones(2)}, {}, "background: expected a tensor [C, 1, 1] or [C, "),
     ({"background": 0.5}, {}, "[C, 1, 1] or [C, 4, 5], found float"),
+    ({"weight": math.nan}, {}, "views.view.weight: must be above 0 and finite, found nan"),
 ]
 
 

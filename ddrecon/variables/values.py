@@ -180,6 +180,8 @@ def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
         raise UsageError(f"{owner}camera: {what}")
     if camera.lens is not None or camera.distortion is not None:
         _require_lens(f"{owner}distortion", camera)
+    if not 0 < view.weight < math.inf:
+        raise UsageError(f"{owner}weight: must be above 0 and finite, found {view.weight:g}")
     if behind is not None:
         _require_background(f"{owner}background", behind, camera.size, waits)
     middle = camera.principal_point

@@ -211,6 +211,9 @@ def _read_encoded(path: Path) -> np.ndarray:
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
         if mode not in MODES:
             raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
+        # Of JPEG others are previews and maps beside the picture.
+        if picture.format in ("PNG", "WEBP") and (count := getattr(picture, "n_frames", 1)) > 1:
+            raise FormatError(path, f"is an animation of {count} pictures; save a single one")
         if "16B" in str(picture.tile) and mode in COLORS:  # which Pillow reads as 8 bits
             picture.verify()  # of its checksums libpng would tell stderr as well
             with opened(path, "PNG") as (file, _):

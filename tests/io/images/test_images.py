@@ -256,3 +256,11 @@ def test_a_movie_keeps_its_frames_in_order_and_what_is_white(tmp_path: Path) -> 
     assert frames[0, 10, 10, 0] == 0 and frames[-2, 10, 10, 0] < frames[-1, 10, 10, 0] == 255
     about = iio.immeta(tmp_path / "ring.png", plugin="pillow")
     assert about["loop"] == 0 and about["duration"] == pytest.approx(1000 * SECONDS / 7, abs=1)
+
+
+@pytest.mark.parametrize("suffix", ["png", "webp"])
+def test_an_animation_is_refused(tmp_path: Path, suffix: str) -> None:
+    first, second = (Pillow.new("RGB", (4, 3), color) for color in ("red", "blue"))
+    first.save(tmp_path / f"a.{suffix}", save_all=True, append_images=[second])
+    with pytest.raises(FormatError, match="is an animation of 2 pictures; save a single one"):
+        read_image(tmp_path / f"a.{suffix}")
