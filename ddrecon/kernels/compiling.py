@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Timer
 from time import perf_counter
@@ -79,3 +80,8 @@ def _tell(name: str) -> None:
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "compiling")
+
+
+# Threads do not live on in a process forked from this one, and what they had begun never ends.
+os.register_at_fork(after_in_child=_pool.cache_clear)
+os.register_at_fork(after_in_child=_named.clear)
