@@ -17,7 +17,6 @@ from ddrecon.medium.remaining import remaining_moments, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember
-from ddrecon.numerics.slicing import outermost, outward
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
@@ -65,14 +64,16 @@ def scatter_towards(
 
 
 def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
-    """The part of even light from outside that `outermost` cells across each axis scatter into
-    `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the rays (E2.17).
+    """The part [C, rows, columns] of even light from outside of each face of the box that its
+    outermost cells scatter into `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the
+    rays (E2.17).
     """
     towards = -torch.nn.functional.normalize(rays.direction.sum(0), dim=0)
     p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
     return [
-        (0.5 - 0.75 * towards[axis] * outward(axis, p_1) * outermost(p_1, axis)).clamp(min=0)
+        (0.5 - 0.75 * normal * towards[axis] * p_1.select(1 + axis, last)).clamp(min=0)
         for axis in range(3)
+        for normal, last in ((-1, 0), (1, -1))
     ]
 
 

@@ -24,8 +24,8 @@ class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
     `outside` [C, 1, 1, 1] is that; `received` are the mean and the flux of what cells receive of
-    beams, `kept` times which counts as `diffuse` light does. `backward` are, by axis, the parts of
-    light through both faces across it that `outermost` cells scatter into the camera's rays.
+    beams, `kept` times which counts as `diffuse` light does. `backward` are, by face, the parts
+    [C, rows, columns] of light from there that are scattered into the camera's rays.
     """
 
     outside: Tensor

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 NEARLY = 1e-9
@@ -20,18 +19,6 @@ def across(axis: int) -> tuple[int, int]:
     """The axes along which rows and columns of the slices across `axis` are counted."""
     row, column = (other for other in range(3) if other != axis)
     return row, column
-
-
-def outermost(cells: Tensor, axis: int) -> Tensor:
-    """The first and the last slice of `cells` [K, z, y, x] across `axis`; the one that there is."""
-    every = slice(None)
-    return cells[(every,) * (1 + axis) + (slice(None, None, max(cells.shape[1 + axis] - 1, 1)),)]
-
-
-def outward(axis: int, like: Tensor) -> Tensor:
-    """-1 and 1, as of the first and of the last slice across `axis`."""
-    signs = torch.linspace(-1, 1, 2, dtype=like.dtype, device=like.device)
-    return signs.view(-1, *[1] * (2 - axis))
 
 
 @dataclass(frozen=True)
