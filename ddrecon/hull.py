@@ -246,8 +246,12 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     else:
         return None
     # Where up does not tell of a turn, the longest side may.
-    longest = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
-    reason = _explain(shown, box, *(upright if upright[0] != upright[1] else longest))
+    before, after = upright
+    if before == after:
+        before, after = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
+    # A box that is cut off is of the right unit.
+    powers = () if held >= HELD and filled >= FILLED else (3, -3, 2, -2, 1, -1)
+    reason = _explain(shown, box, before, after, [1.0, *(10.0**power for power in powers)])
     up = f" and up: {'xyz'[upright[0]]}" if upright[0] != upright[1] else ""
     return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
 
@@ -259,9 +263,8 @@ def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
     return float(held), float(filled)
 
 
-def _explain(shown: Tensor, box: Tensor, before: int, after: int) -> str:
-    """Which unit, and turn of the axis `before` to that `after`, have `shown` fill the `box`."""
-    units = [1.0, *(10.0**power for power in (3, -3, 2, -2, 1, -1))]
+def _explain(shown: Tensor, box: Tensor, before: int, after: int, units: Sequence[float]) -> str:
+    """Which of `units`, and turn of the axis `before` to that `after`, have `shown` fill `box`."""
     for times, (order, signs) in product(units, _turns(before, after)):
         ends = times * shown[:, list(order)] * shown.new_tensor(signs)
         held, filled = _share(ends.sort(0).values, box)

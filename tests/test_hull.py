@@ -26,6 +26,11 @@ FAULTS: dict[str, tuple[Callable[[torch.Tensor], torch.Tensor], int, list[str]]]
         ["hardly any overlap", "3.6 %"],
     ),
     "cut": (lambda box: box - torch.tensor([0.0, 0.4, 0.0]), Y, ["cut off", "below 0 along y"]),
+    "cut on all sides": (
+        lambda _: torch.tensor([[0.05, 0.0, 0.05], [1.2, 1.6, 1.2]]),
+        Y,
+        ["cut off"],
+    ),
     "long": (lambda box: 1000 * box, Y, ["no overlap", "lengths of the cameras times 0.001,"]),
     "short": (lambda box: box / 100, Y, ["far too large", "lengths of the cameras times 100,"]),
     "small": (lambda box: 10 * (box - 0.25), Y, ["far too small"]),

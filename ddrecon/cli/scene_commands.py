@@ -21,6 +21,7 @@ from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.film.folder import Film
     from ddrecon.scene import Scene, View
     from ddrecon.scene_file.load import SceneFile
 
@@ -288,25 +289,14 @@ def optimize(
         typed = f"--iterations {iterations}"
         session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
-    from ddrecon.ranks import alone, from_first, is_first
+    from ddrecon.ranks import is_first
 
     if scene_file.tree.frames is not None:
-        from ddrecon.film.drive import drive_film, share_out
-        from ddrecon.film.folder import Film, choose_frames, open_film
-        from ddrecon.film.report import film_lines
+        from ddrecon.film.folder import Film
 
         film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
-        own = share_out(choose_frames(film.frames.numbers, part))
-        film.environment = session.environment()
-        if not is_first():
-            from_first(None)  # others find the folder as it is to be
-            overwrite, resume, shared = False, True, None
-        with open_film(film, part, own, overwrite=overwrite, resume=resume, shared=shared):
-            if is_first():
-                from_first(None)
-            with alone():
-                record = drive_film(film, own, exported)
-        session.show(record, film_lines(record, output))
+        choice = {"overwrite": overwrite, "resume": resume, "shared": shared}
+        _optimize_film(session, film, part, exported, choice)
         return
     given = {"--frames": part, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in given.items() if value is not None]:
@@ -325,6 +315,28 @@ def optimize(
             run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
         summary = drive_run(run, folder, preview_every, session.is_quiet)
     session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
+
+
+def _optimize_film(
+    session: Session, film: Film, part: str | None, exported: str | None, choice: dict[str, Any]
+) -> None:
+    """Reconstructs the frames of `film` that are this rank's; `choice` is how its folder opens."""
+    from ddrecon.film.drive import drive_film, share_out
+    from ddrecon.film.folder import choose_frames, open_film
+    from ddrecon.film.report import film_lines
+    from ddrecon.ranks import alone, from_first, is_first
+
+    own = share_out(choose_frames(film.frames.numbers, part))
+    film.environment = session.environment()
+    if not is_first():
+        from_first(None)  # others find the folder as it is to be
+        choice = {"overwrite": False, "resume": True, "shared": None}
+    with open_film(film, part, own, **choice):
+        if is_first():
+            from_first(None)
+        with alone():
+            record = drive_film(film, own, exported)
+    session.show(record, film_lines(record, film.path))
 
 
 @click.command()

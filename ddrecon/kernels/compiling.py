@@ -71,7 +71,7 @@ def _tell(name: str) -> None:
         where = f"they stay in {wp.config.kernel_cache_dir}"
         LOG.warning("compiling kernels, which takes a minute or two, once: %s", where)
     else:
-        more = len(_named.keys() - _loaded)
+        more = max(1, len(_named.keys() - _loaded))  # that one, if no other is known
         LOG.warning(
             "compiling kernels: %d done, %d or more to do, now %s", len(_loaded), more, name
         )

@@ -73,8 +73,7 @@ def march_periods(
     copy = repeats * ((begin - lower) / extent).floor()
     while len(number):
         own = Rays(rays.origin - copy * extent, rays.direction, None)
-        is_along = own.direction.abs() < 1e-30
-        direction = torch.where(is_along, 1e-30, own.direction)
+        direction = torch.where(own.direction.abs() < 1e-30, 1e-30, own.direction)
         faces = torch.where(direction > 0, upper, lower)
         ends = torch.where(repeats > 0, (faces - own.origin) / direction, torch.inf)
         leave, axis = ends.min(1)
