@@ -19,10 +19,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.rounds.bounced import TURNS, follow_inside
-from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
-from ddrecon.diffusion.rounds.transport import face_mirror
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
@@ -42,6 +38,10 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
+from ddrecon.transport.bounced import TURNS, follow_inside
+from ddrecon.transport.characteristics import Course, radiance_along
+from ddrecon.transport.rounds import face_mirror
+from ddrecon.transport.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """Of the box, in array order."""

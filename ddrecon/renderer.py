@@ -22,9 +22,6 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
-from ddrecon.diffusion.rounds.bounced import reflected_light
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS
-from ddrecon.diffusion.rounds.transport import face_mirror, run_rounds, sweep_emission
 from ddrecon.diffusion.solvers.multigrid import name_kernels, solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
@@ -63,6 +60,9 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 from ddrecon.supported import require_supported
+from ddrecon.transport.bounced import reflected_light
+from ddrecon.transport.rounds import face_mirror, run_rounds, sweep_emission
+from ddrecon.transport.sweep import DIRECTIONS
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.sweep import count_directions
 from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
@@ -26,6 +25,7 @@ from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remai
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import exchange_grid, multiply_scatters
 from ddrecon.scene import Scene
+from ddrecon.transport.sweep import count_directions
 
 
 def needed_terms(scene: Scene) -> list[str]:

@@ -138,9 +138,9 @@ def near_kernels() -> Iterator[None]:
     """Fused kernels launched there run on the processor; solves and sweeps take a GPU's ways."""
     import warp as wp
 
-    from ddrecon.diffusion.rounds import sweep
     from ddrecon.diffusion.solvers import multigrid
     from ddrecon.kernels import launch
+    from ddrecon.transport import sweep
 
     own_array, own_device = wp.from_torch, launch._device
 

@@ -6,10 +6,10 @@ from dataclasses import fields
 import pytest
 
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.losses import LOSSES
 from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
 from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
+from ddrecon.transport.sweep import DIRECTIONS
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def average_cells(medium: Medium) -> Medium:
 def average(field: Tensor) -> Tensor:
     """The mean in each cell of `field`, linear between centers and even beyond the outermost."""
     if is_fused():
-        from ddrecon.diffusion.rounds.fused.around import means_fused
+        from ddrecon.diffusion.fused.around import means_fused
 
         return means_fused(field)
     for axis in AXES:
@@ -65,7 +65,7 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
 def bend(means: Tensor) -> Tensor:
     """The sum of second differences along all axes; at the ends of one it counts as 0."""
     if is_fused():
-        from ddrecon.diffusion.rounds.fused.around import bends_fused
+        from ddrecon.diffusion.fused.around import bends_fused
 
         return bends_fused(means)
     bends = torch.zeros_like(means)

@@ -1,6 +1,6 @@
 """Functions of the numbers in a cell: a header has the function, all else follows from it.
 
-    source, *gain = apply_cell("diffusion/rounds/fused/gain.h", "Gain<true, false, true>", 8,
+    source, *gain = apply_cell("transport/fused/gain.h", "Gain<true, false, true>", 8,
                                numbers, extinction, scattering, *change, *off)
 
 Values, tangents and cotangents are the same code, of plain numbers and of dual ones (`dual.h`);

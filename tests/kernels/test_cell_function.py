@@ -12,11 +12,11 @@ pytest.importorskip("warp", reason="Warp is not installed (extra `warp`)")
 
 from ddrecon.kernels.cell_function import RowFunction, apply_cell
 
-GAIN = "diffusion/rounds/fused/gain.h"
+GAIN = "transport/fused/gain.h"
 CELLS = [
     (GAIN, "Gain<1, 0, 1>", 10, 8, 6),
     (GAIN, "Gain<0, 1, 0>", 2, 2, 6),
-    ("diffusion/rounds/fused/steep.h", "Steep", 4, 3, 6),
+    ("transport/fused/steep.h", "Steep", 4, 3, 6),
     ("diffusion/fused/closure.h", "Geometric<2>", 3, 1, 2),
 ]
 """Header, function, fields, outs, numbers."""

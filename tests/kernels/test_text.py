@@ -138,7 +138,7 @@ def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
 
 def test_where_the_package_lies_is_no_part_of_a_kernel():
     """So other checkouts find it compiled."""
-    given = vars(include("diffusion/rounds/fused/gain.h"))
+    given = vars(include("transport/fused/gain.h"))
     assert str(Path(__file__).parents[2]) not in repr(given)
     assert given["extra_cpu_preamble"].count("struct Dual {") == 1
 

@@ -8,11 +8,11 @@ import torch
 from media import half_empty, random_values
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.sweep import sweep_change
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.transport.sweep import sweep_change
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 

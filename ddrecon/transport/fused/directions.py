@@ -17,11 +17,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.characteristics import Course, Direction
-from ddrecon.diffusion.rounds.fused.swept import units_of_parts
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.transport.characteristics import Course, Direction
+from ddrecon.transport.fused.swept import units_of_parts
 
 POINTS = 4
 """Cells at most that light comes from."""

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/diffusion/rounds/fused/step.h"
+#include "ddrecon/transport/fused/step.h"
 // Numbers of a row of cells.
 
 namespace ddrecon {

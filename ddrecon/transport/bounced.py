@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.characteristics import Course, Ends, follow
-from ddrecon.diffusion.rounds.mirror import lay_face
 from ddrecon.grid import array_order
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
@@ -21,6 +19,8 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import reflectance
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
+from ddrecon.transport.characteristics import Course, Ends, follow
+from ddrecon.transport.mirror import lay_face
 
 TURNS = 4
 """So often light is reflected, at most; what is left then leaves."""

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.diffusion.rounds.characteristics import Direction, Ends, radiance_along
-from ddrecon.diffusion.rounds.mirror import Mirror
 from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -26,6 +24,8 @@ from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.slicing import NEARLY
+from ddrecon.transport.characteristics import Direction, Ends, radiance_along
+from ddrecon.transport.mirror import Mirror
 
 DIRECTIONS = {1: 44, 3: 44, 5: 44, 7: 86}
 """By the degree to which angles are kept. The rule of 44 is exact for fluxes through faces."""
@@ -92,7 +92,7 @@ def sweep_change(
     gradient = steep_gradient(medium, light.mean + source.mean, directions)
     is_apart = mirror is None and not medium.grid.periodic
     if is_apart and is_fused() and has_kernels("transport rounds", light.mean.is_cuda):
-        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
+        from ddrecon.transport.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
             # the kernels' factors are the same everywhere: what scatters is summed before
@@ -129,7 +129,7 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         scale = extinction.scale.view(1, -1)
         depths = scale.new_tensor(steps)[:, None] * scale
         numbers = torch.cat([depths, (2 * scale.new_tensor(shares)[:, None]).expand_as(depths)])
-        name = "diffusion/rounds/fused/steep.h", "Steep", 3
+        name = "transport/fused/steep.h", "Steep", 3
         return torch.stack(apply_cell(*name, numbers, extinction.field, *gradient))
 
     def steepen() -> Tensor:
@@ -163,7 +163,7 @@ def cell_gradient(q: Tensor) -> Tensor:
     Half the difference of both neighbors; at the faces of the box, that to the one.
     """
     if is_fused():
-        from ddrecon.diffusion.rounds.fused.around import rises_fused
+        from ddrecon.diffusion.fused.around import rises_fused
 
         return rises_fused(q)
     return torch.stack(

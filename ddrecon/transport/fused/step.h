@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/diffusion/rounds/fused/given.h"
+#include "ddrecon/transport/fused/given.h"
 #include "ddrecon/kernels/dual.h"
 // The way of light along a direction through one cell (E2.9).
 

@@ -7,8 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import (
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once, is_forward, keep, run_plainly
+from ddrecon.numerics.harmonics import degrees_on
+from ddrecon.numerics.remember import remember
+from ddrecon.transport.fused.rows import Rows
+from ddrecon.transport.fused.swept import (
     PARTS,
     Parts,
     Swept,
@@ -16,11 +21,6 @@ from ddrecon.diffusion.rounds.fused.swept import (
     split,
     units_of_parts,
 )
-from ddrecon.light.moments import Moments
-from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once, is_forward, keep, run_plainly
-from ddrecon.numerics.harmonics import degrees_on
-from ddrecon.numerics.remember import remember
 
 
 def sweep_fused(

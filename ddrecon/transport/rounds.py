@@ -18,9 +18,6 @@ from torch import Tensor
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
-from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.mirror import Mirror
-from ddrecon.diffusion.rounds.sweep import count_directions, sweep_change, sweep_rule
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
@@ -30,6 +27,9 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.transport.characteristics import Course
+from ddrecon.transport.mirror import Mirror
+from ddrecon.transport.sweep import count_directions, sweep_change, sweep_rule
 
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
@@ -173,7 +173,7 @@ def _gain(
     """
     step = _mean_step(medium.grid, directions)
     if is_fused() and not medium.is_cellwise:
-        from ddrecon.diffusion.rounds.fused.gain import gain_fused
+        from ddrecon.transport.fused.gain import gain_fused
 
         return gain_fused(medium, change, off, cosine, DAMPING, step)
     share = recompute(_transport_share, medium, step)

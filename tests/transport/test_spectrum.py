@@ -8,10 +8,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, _spread
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.transport.sweep import DIRECTIONS, _spread
 
 Array = NDArray[Any]
 AXES = np.eye(3)

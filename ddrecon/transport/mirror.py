@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.characteristics import Course, Direction, Ends
 from ddrecon.grid import Grid
 from ddrecon.medium.fresnel import quadrature_reflectances
+from ddrecon.transport.characteristics import Course, Direction, Ends
 
 SIDES = tuple((axis, end) for axis in range(3) for end in (0, -1))
 """Of each face, the array axis across which it lies and the index of cells there."""

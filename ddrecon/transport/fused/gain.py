@@ -34,7 +34,7 @@ def gain_fused(
     numbers = depth, lag, damping * depth, damping * turned, strength, cosine
     colors = max(map(Tensor.numel, numbers))
     source, mean, *flux = apply_cell(
-        "diffusion/rounds/fused/gain.h",
+        "transport/fused/gain.h",
         f"Gain<{', '.join(str(int(flag)) for flag in is_so)}>",
         2 if change.flux is None else 8,
         torch.stack([one.reshape(-1).expand(colors) for one in numbers]),

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.directions import LARGE, SLABS, make_tables, piece_numbers
-from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.transport.fused.directions import LARGE, SLABS, make_tables, piece_numbers
+from ddrecon.transport.fused.swept import Swept
 
-_ROOM = "diffusion/rounds/fused"
+_ROOM = "transport/fused"
 MARGIN = 16
 """Cells before an array of rows, which begin where vectors do."""
 NUMBERS = 7

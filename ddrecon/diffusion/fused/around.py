@@ -28,6 +28,6 @@ def bends_fused(field: Tensor) -> Tensor:
 
 def _find(name: str, shape: Sequence[int], field: Tensor) -> Tensor:
     z, y, x = field.shape[1:]
-    header, sizes = "diffusion/rounds/fused/around.h", {"nz": z, "ny": y, "nx": x}
+    header, sizes = "diffusion/fused/around.h", {"nz": z, "ny": y, "nx": x}
     function = RowFunction(header, name, (tuple(shape),), x, _PLACE, _GIVEN, sizes)
     return function.apply(field.new_zeros(1, len(field)), field)[0]

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/diffusion/rounds/fused/moments.h"
+#include "ddrecon/transport/fused/moments.h"
 // Rows of cells along which radiance is followed (E2.9, E2.10).
 //
 // A lane goes through the slices across z in the way that its light takes, s counting them, and in

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/diffusion/rounds/fused/rows.h"
+#include "ddrecon/transport/fused/rows.h"
 // Rows of cells along which radiance is followed backward: the adjoint of `Rows`.
 //
 // `Rows` kept what scatters and I of all slices of a slab. Of a row and a direction there are two

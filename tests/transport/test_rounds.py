@@ -15,8 +15,6 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.rounds.sweep import steep_gradient, sweep
-from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid, Triple
@@ -25,6 +23,8 @@ from ddrecon.light.reduced import receive_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
+from ddrecon.transport.rounds import run_rounds
+from ddrecon.transport.sweep import steep_gradient, sweep
 from ddrecon.validate.hard import ball as hard_ball
 from ddrecon.validate.hard import layer
 

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/diffusion/rounds/fused/lines.h"
+#include "ddrecon/transport/fused/lines.h"
 // Rows of moments from rows of radiance along directions, and the other way around (E2.8): products
 // of small matrices with rows. A direction and its mirror images in x, in y and in both, a unit,
 // share the sums over moments of each parity: these are sums of the four with different signs.

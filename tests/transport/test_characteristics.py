@@ -7,10 +7,10 @@ from media import box_grid, half_empty, random_values
 from plain_rays import by_cells
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.characteristics import Course, radiance_along
-from ddrecon.diffusion.rounds.sweep import cell_gradient
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.transport.characteristics import Course, radiance_along
+from ddrecon.transport.sweep import cell_gradient
 
 DIRECTIONS = (
     (0.0, 0.0, 1.0),
