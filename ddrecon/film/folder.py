@@ -195,22 +195,22 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
-def choose_frames(numbers: Sequence[int], range_text: str | None) -> list[int]:
-    """Those of the frames `numbers` within `range_text`, `A:B`, both included; None is all.
+def choose_frames(numbers: Sequence[int], frame_range: str | None) -> list[int]:
+    """Those of the frames `numbers` within `frame_range`, `A:B`, both included; None is all.
 
     Raises UsageError where there are none.
     """
-    ends = re.fullmatch(r"([0-9]*):([0-9]*)", range_text or ":")
+    ends = re.fullmatch(r"([0-9]*):([0-9]*)", frame_range or ":")
     first, last = (ends[1] or 0, ends[2] or numbers[-1]) if ends else (1, 0)
     chosen = [number for number in numbers if int(first) <= number <= int(last)]
     if not chosen:
         whole = f"{numbers[0]}:{numbers[-1]}"
-        raise UsageError(f"--frames {range_text}: names no frame; expected a part of {whole}")
+        raise UsageError(f"--frames {frame_range}: names no frame; expected a part of {whole}")
     return chosen
 
 
-def finished_frames(path: Path, range_text: str | None) -> list[Path]:
-    """The runs of finished frames of the film in the folder `path`, within `range_text`.
+def finished_frames(path: Path, frame_range: str | None) -> list[Path]:
+    """The runs of finished frames of the film in the folder `path`, within `frame_range`.
 
     Raises UsageError where there are none.
     """
@@ -218,20 +218,20 @@ def finished_frames(path: Path, range_text: str | None) -> list[Path]:
     runs = {int(run.name): run for run in finished if run.name.isdecimal()}
     if not runs:
         raise UsageError(f"{path}: no frame is done")
-    return [runs[number] for number in choose_frames(sorted(runs), range_text)]
+    return [runs[number] for number in choose_frames(sorted(runs), frame_range)]
 
 
 @contextmanager
 def open_film(
     film: Film,
-    range_text: str | None,
+    frame_range: str | None,
     numbers: Sequence[int],
     *,
     overwrite: bool,
     resume: bool,
     shared: Path | None = None,
 ) -> Iterator[None]:
-    """Prepares the folder of `film` for its frames within `range_text`.
+    """Prepares the folder of `film` for its frames within `frame_range`.
 
     Its calibration may be `shared` from a file. Until the block ends no other process does any of
     the frames `numbers`. An earlier film's files of these frames are removed, unless this one is to
@@ -247,12 +247,12 @@ def open_film(
     calibration = None if shared is None else read_shared(shared)
     with ExitStack() as stack:
         with film.claim(overwrite=overwrite, resume=resume) as folder:
-            chosen = choose_frames(film.frames.numbers, range_text)
+            chosen = choose_frames(film.frames.numbers, frame_range)
             _require_free(path, numbers if resume else chosen)
             if numbers:
                 lock = path / f"{PART}.{numbers[0]:04d}-{numbers[-1]:04d}.lock"
                 stack.enter_context(hold(lock))
-            is_same = (resume or range_text is not None) and old_scene.is_file()
+            is_same = (resume or frame_range is not None) and old_scene.is_file()
             if is_same:
                 _require_same_film(path, describe(read_scene(old_scene)), describe(scene_file))
             write_scene(scene_file, path)
