@@ -18,8 +18,9 @@ from tempfile import TemporaryFile
 from ddrecon.errors import MissingExtraError, UsageError
 from ddrecon.extras import advice
 
-CHOICES = ("auto", "torch", "warp")
-"""The engines that can be asked for; `auto` is warp where it is installed, else torch."""
+ENGINES = ("torch", "warp")
+CHOICES = ("auto", *ENGINES)
+"""What can be asked for; `auto` is warp where it is installed, else torch."""
 TORCH_ALONE: dict[str, frozenset[str]] = {
     "view rays": frozenset(),
     "light": frozenset(),
