@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from ddrecon.errors import RanksError, UsageError, one_line
 
@@ -28,7 +29,8 @@ EXCHANGE_SECONDS = 1800.0
 T = TypeVar("T")
 
 
-class _Group(NamedTuple):
+@dataclass(frozen=True)
+class _Group:
     """This process is number `rank` of `count`."""
 
     rank: int = 0
