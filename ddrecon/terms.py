@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.engine import engine_of_parts, has_kernels
+from ddrecon.engine import engine_of_parts
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import (
@@ -50,33 +50,14 @@ def needed_terms(scene: Scene) -> list[str]:
 
 def engine_of_scene(scene: Scene) -> dict[str, str]:
     """The engine that runs each part of rendering `scene`."""
-    return engine_of_parts(parts_in_torch(scene, scene.volume.density.is_cuda))
-
-
-def parts_in_torch(scene: Scene, is_on_gpu: bool) -> tuple[str, ...]:
-    """The parts that are torch's with every engine, for what `scene` asks of them.
-
-    Of diffusion in a volume that repeats that is the solve. Of point lights that is all but the
-    mass on the way to them; of phase functions by cell, what light and rounds are at cells: view
-    rays look them up.
-    """
-    settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
-    is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    is_fused = is_fused and has_kernels("diffusion", is_on_gpu)
-    has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
-    is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
-    repeats = bool(scene.volume.grid.periodic)
-    parts = {
-        "diffusion": not is_fused or (repeats and is_diffuse),
-        "transport rounds": has_rounds
-        and (repeats or scene.volume.index != 1 or not has_kernels("transport rounds", is_on_gpu)),
-        "point lights": any(isinstance(light, PointLight) for light in scene.lights),
-        "pairs of beams": is_diffuse and _has_pairs(medium, scene),
-        "phases by cell": medium.is_cellwise,
-        "faces that refract": scene.volume.index != 1,
-        "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
-    }
-    return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
+    volume, settings = scene.volume, scene.diffusion
+    return engine_of_parts(
+        gpu=volume.density.is_cuda,
+        periodic=bool(volume.grid.periodic),
+        refracting=volume.index != 1,
+        printed=settings.scheme == "printed",
+        flux_limited=settings.model == "flux_limited",
+    )
 
 
 def _color_term(scene: Scene) -> str:

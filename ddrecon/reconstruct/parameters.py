@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.losses import KNEE, compress, total_variation
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.levels import resample
-from ddrecon.reconstruct.roughness import stiffness_diagonal
+from ddrecon.reconstruct.roughness import KNEE, stiffness_diagonal, total_variation
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -60,9 +59,7 @@ class Parameter:
         """
         if not self.tv:
             return self.value.new_zeros(())
-        value = self.value / self.unit
-        seen = value if self.knee is None else compress(value, self.knee)
-        return (power * self.tv) * total_variation(seen, self.grid)
+        return (power * self.tv) * total_variation(self.value / self.unit, self.grid, self.knee)
 
     @property
     def largest_rate(self) -> float:

@@ -129,8 +129,6 @@ def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
 
 def _check_choice(node: Node, choices: Sequence[Any], rule: Rule) -> None:
     if choices and node.value not in choices:
-        if what := rule.limits.get("retired", {}).get(str(node.value)):
-            raise node.refused(f"{node.value} went: {what}")
         words = list(map(str, choices))
         near = suggestion(str(node.value), words) if len(words) > 1 else ""
         raise node.refused(
@@ -227,18 +225,15 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
     entries, hints = node.entries(), type_hints(kind)
     declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
-    retired = getattr(kind, "RETIRED", {})
     problems, values = Problems(), {}
     for what in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
             if name not in known:
-                raise child.key_refused(
-                    retired.get(name) or f"unknown key{suggestion(name, known)}"
-                )
+                raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
-                limits = {**declared[name].metadata, "retired": retired}
+                limits = declared[name].metadata
                 hint = reduce(or_, limits.get("also", ()), hints[name])
                 values[name] = read_value(child, rule._replace(hint=hint, limits=limits))
         if problems.are_many:
