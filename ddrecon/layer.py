@@ -18,15 +18,11 @@ from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
-from ddrecon.supported import require_above, require_settings
+from ddrecon.supported import require_above
+from ddrecon.variables.forms import is_real
 from ddrecon.variables.kinds import PAIRS
-from ddrecon.variables.values import (
-    is_real,
-    require_legal,
-    require_scene,
-    shapes_of,
-    with_values,
-)
+from ddrecon.variables.legal import require_legal, require_scene
+from ddrecon.variables.values import shapes_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""
@@ -50,11 +46,9 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 def _look_at(scene: Scene, view: str | None) -> None:
     """Raises where a `view` of `scene` cannot be rendered, and notices what changed in it."""
     require_plain_autograd()
-    require_scene(scene)
     require_legal(scene, view)
     if scene.volume.density.is_cpu:
         require_above(scene)
-    require_settings(scene)
     scene.settle()
     forget_changed()
 
