@@ -64,7 +64,7 @@ def _color_term(scene: Scene) -> str:
     """How many color channels there are, and what has as many."""
     volume, ground = scene.volume, scene.ground
     views = [v for each in scene.views for v in (each.exposure, each.offset, each.background)]
-    values = {
+    values: dict[str, list[Tensor | None]] = {
         "the medium": [volume.sigma_a, volume.sigma_s],
         "what glows": [volume.emission, volume.black_body],
         "lights": [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS],
