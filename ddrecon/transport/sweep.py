@@ -53,6 +53,11 @@ def sweep(
     `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
+    traits = {"periodic": bool(grid.periodic), "refracting": mirror is not None}
+    if has_kernels("transport rounds", gpu=source.is_cuda, **traits):
+        from ddrecon.transport.fused.sweep import sweep_fused
+
+        return sweep_fused(medium, source, gradient, inflow, directions)
     courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
     moments = source.new_zeros(count, colors * grid.cells)
@@ -90,15 +95,6 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light.mean + source.mean, directions)
-    traits = {"periodic": bool(medium.grid.periodic), "refracting": mirror is not None}
-    if has_kernels("transport rounds", gpu=light.mean.is_cuda, **traits):
-        from ddrecon.transport.fused.sweep import sweep_fused
-
-        if medium.is_cellwise:
-            # the kernels' factors are the same everywhere: what scatters is summed before
-            source = light.weighted(factors).plus(source)
-            factors = torch.zeros_like(factors[..., :1, :1, :1])
-        return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
     if mirror is not None:
         mirror.begin(_without(light.harmonics(medium.degree), inflow))

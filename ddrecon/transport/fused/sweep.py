@@ -7,129 +7,115 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.light.moments import Moments
+from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once, is_forward, keep, run_plainly
-from ddrecon.numerics.harmonics import degrees_on
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
-from ddrecon.transport.fused.rows import Rows
-from ddrecon.transport.fused.swept import (
-    PARTS,
-    Parts,
-    Swept,
-    parts_of,
-    split,
-    units_of_parts,
-)
+from ddrecon.transport.fused.launches import Sweep, Swept
 
 
 def sweep_fused(
-    medium: Medium,
-    light: Moments,
-    factors: Tensor,
-    source: Moments,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    directions: int,
-) -> Moments:
-    """The moments of the radiance that `light`, by `factors`, and `source` scatter (E2.8).
-
-    The first two less those of `light`. `gradient`: of what scatters alike everywhere, as of
-    `gradient_within`; `directions`: how many the quadrature has.
-    """
-    colors, beam_factors = len(light.mean), None
-    if is_forward():  # where a beam and its factors may both change
-        source = source.spelled()
-    if source.beam is not None:
-        beam, each = source.beam
-        # The parts of light are so many times its moments.
-        units = units_of_parts(len(factors) - 1)[:, None].to(factors)
-        source, beam_factors = Moments(beam), (units * each).expand(-1, colors)
-    shares_field = medium.remaining.field is medium.extinction.field
-    fields = medium.extinction.field, None if shares_field else medium.remaining.field
-    mean, z, y, x, higher, _ = _Sweep.apply(
+    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, directions: int
+) -> Tensor:
+    """As `sweep` in `transport/sweep.py`, without mirrors and periods."""
+    extinction, remaining = medium.extinction, medium.remaining
+    shares_field = remaining.field is extinction.field
+    scales = _stack_scales(extinction.scale, remaining.scale, inflow, source.shape[1])
+    moments, _ = _Sweep.apply(
         torch.is_grad_enabled(),
         medium.grid,
         directions,
-        _scales(medium.extinction.scale, medium.remaining.scale, inflow, colors),
-        *fields,
-        gradient.expand(3, colors, *light.mean.shape[1:]),
-        _spread_factors(factors, colors),
-        beam_factors,
-        *parts_of(light, colors),
-        *parts_of(source, colors),
+        scales,
+        extinction.field,
+        None if shares_field else remaining.field,
+        gradient.expand(3, *source.shape[1:]),
+        source,
     )
-    return Moments(mean, None if z is None else (z, y, x), higher)
+    return moments
 
 
 @remember
-def _scales(extinction: Tensor, scattering: Tensor, inflow: Tensor | None, colors: int) -> Tensor:
-    """Of extinction, of scattering that remains, and the inflow of each of `colors`, [3, C]."""
+def _stack_scales(
+    extinction: Tensor, scattering: Tensor, inflow: Tensor | None, colors: int
+) -> Tensor:
+    """Factors of extinction and of scattering that remains, and inflow, [3, C]."""
     entering = torch.zeros_like(extinction) if inflow is None else inflow
-    each = extinction, scattering, entering
-    return torch.stack([one.reshape(-1).expand(colors) for one in each])
+    scales = extinction, scattering, entering
+    return torch.stack([scale.reshape(-1).expand(colors) for scale in scales])
 
 
-@remember
-def _spread_factors(factors: Tensor, colors: int) -> Tensor:
-    """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
-    degrees = degrees_on(factors.device, len(factors) - 1)
-    return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
+def _swept(tensors: Any) -> Swept:
+    """From tensors as autograd must be given them: one by one, None for a field that is shared."""
+    scales, extinction, scattering, gradient, source = (
+        one if one is None else one.contiguous() for one in tensors
+    )
+    scattering = extinction if scattering is None else scattering
+    return Swept(scales, extinction, scattering, gradient, source)
 
 
 class _Sweep(torch.autograd.Function):
-    """The parts of light, and their derivatives by all tensors of `Swept`.
+    """The moments of radiance, with derivatives by all tensors of `Swept`.
 
-    The last is what `Rows` saves for the backward pass, where gradients may be asked for.
+    The second is what `Sweep.follow` saves for the backward pass, where gradients may be asked for.
     """
 
     @staticmethod
-    def forward(may_save: bool, *given: Any) -> tuple[Any, ...]:
-        tensors = (each for each in given if isinstance(each, Tensor))
-        is_saved = may_save and any(each.requires_grad for each in tensors)
-        scales = given[2]
-        moments, saved = Rows(Swept.of(*given)).follow(is_saved, scales.requires_grad)
-        return *split(moments), saved
+    def forward(
+        may_save: bool, grid: Grid, directions: int, *tensors: Any
+    ) -> tuple[Tensor, Tensor | None]:
+        saves = may_save and any(one is not None and one.requires_grad for one in tensors)
+        return Sweep(grid, directions, _swept(tensors)).follow(saves)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
         _, grid, directions, *tensors = inputs
-        ctx.of, ctx.saved = (grid, directions), output[-1]
-        ctx.set_materialize_grads(False)
+        ctx.of, ctx.saved = (grid, directions), output[1]
         ctx.mark_non_differentiable(*([] if ctx.saved is None else [ctx.saved]))
+        ctx.set_materialize_grads(False)
         keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
-        swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, needs_scales, _, _, _, needs_factors, *needs_more = ctx.needs_input_grad
-        needs_beam_factors, *needs_parts = needs_more
-        parts = bars[:-1]
-        scales_bar, moments_bar, gradient_bar, fields = Rows(swept).transpose(
-            ctx.saved, parts, needs_scales
+    def backward(ctx: Any, bars: Tensor | None, _: None) -> tuple[Any, ...]:
+        if bars is None:
+            return (None,) * 8
+        scales, extinction, scattering, *_ = ctx.saved_tensors
+        swept, needs_scales = _swept(ctx.saved_tensors), ctx.needs_input_grad[3]
+        inflow, mass, scattered, gradient, source = Sweep(*ctx.of, swept).go_back(
+            bars.contiguous(), ctx.saved
         )
-        extinction_bar, *scattering_bar = fields
-        return (
-            None,
-            None,
-            None,
-            scales_bar if needs_scales else None,
-            extinction_bar,
-            scattering_bar[0] if scattering_bar else None,
-            gradient_bar,
-            swept.factor_bar(moments_bar) if needs_factors else None,
-            swept.beam_factor_bar(moments_bar) if needs_beam_factors else None,
-            *swept.light_bars(moments_bar, parts, needs_parts[:PARTS]),
-            *swept.source_bars(moments_bar, needs_parts[PARTS:]),
+        scales_bar = None
+        if needs_scales:
+            pairs = (mass, extinction), (scattered, swept.scattering)
+            sums = [(bar * field).sum((1, 2, 3), dtype=torch.float64) for bar, field in pairs]
+            scales_bar = torch.stack([*(one.to(inflow) for one in sums), inflow])
+        mass, scattered = (
+            bar * scale.view(-1, 1, 1, 1)
+            for bar, scale in zip((mass, scattered), scales[:2], strict=True)
         )
+        if scattering is None:
+            return (
+                None,
+                None,
+                None,
+                scales_bar,
+                (mass + scattered).sum_to_size(extinction.shape),
+                None,
+                gradient,
+                source,
+            )
+        of_fields = mass.sum_to_size(extinction.shape), scattered.sum_to_size(scattering.shape)
+        return None, None, None, scales_bar, *of_fields, gradient, source
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor | None, ...]:
-        def change(*tensors: Any) -> Parts:
+    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, None]:
+        def change(*tensors: Any) -> Tensor:
             half = len(tensors) // 2
-            swept = Swept.of(*ctx.of, *tensors[:half])
-            d_swept = swept.changes(*tensors[half:])
-            return split(Rows(swept, d_swept).follow()[0])
+            values, d_values = tensors[:half], tensors[half:]
+            d_values = tuple(
+                value if value is None else torch.zeros_like(value) if d is None else d
+                for value, d in zip(values, d_values, strict=True)
+            )
+            return Sweep(*ctx.of, _swept(values), _swept(d_values)).follow()[0]
 
-        return *run_plainly(change, *ctx.saved_tensors, *changes[3:]), None
+        return run_plainly(change, *ctx.saved_tensors, *changes[3:]), None
