@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -53,11 +52,8 @@ def sweep(
     `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
-    traits = {"periodic": bool(grid.periodic), "refracting": mirror is not None}
-    if has_kernels("transport rounds", gpu=source.is_cuda, **traits):
-        from ddrecon.transport.fused.sweep import sweep_fused
-
-        return sweep_fused(medium, source, gradient, inflow, directions)
+    if is_fused():
+        return _sweep_fused(medium, source, gradient, inflow, directions, mirror)
     courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
     moments = source.new_zeros(count, colors * grid.cells)
@@ -76,6 +72,28 @@ def sweep(
             mirror.left.append(gone)
         moments.addr_(weight * row, radiance.flatten())
     return moments.view(count, colors, *grid.shape)
+
+
+def _sweep_fused(
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    directions: int,
+    mirror: Mirror | None,
+) -> Tensor:
+    """The same by fused kernels."""
+    from ddrecon.transport.fused.faces import sweep_faces
+    from ddrecon.transport.fused.sweep import sweep_fused
+
+    given = medium, source, gradient, inflow, directions
+    if mirror is None:
+        if not medium.grid.periodic:
+            return sweep_fused(*given)
+        return sweep_faces(*given, None)[0]
+    moments, gone = sweep_faces(*given, [mirror.entering(n) for n in range(directions)])
+    mirror.left.extend(gone)
+    return moments
 
 
 def sweep_change(

@@ -13,7 +13,8 @@
 // formed row by row.
 //
 // By cells, for a GPU: an item is a cell of a slice, for one ordinate and color. A launch does one
-// slice of every ordinate; what ordinates give is summed later.
+// slice of every ordinate; what ordinates give is summed later. With faces, also on a processor:
+// light enters there, and what leaves by a face of a periodic grid enters by the opposite one.
 
 #if IS_GPU
 #define APART INLINE
@@ -53,9 +54,11 @@ template <class F> struct Sweep {
     const F *paths, *values, *weighted, *ones, *scales, *extinction, *densest;
     const F *scattering, *gradient;
     const F *source, *bars, *d_scales, *d_extinction, *d_scattering, *d_gradient, *d_source;
+    const F* entering;
     F *light, *returning, *scratch, *outputs, *moments, *gradient_bar, *e_bar, *sc_bar;
     double* inflow_bar;
-    int depth, height, width, count, colors, extinctions, scatterings, planes, back_planes;
+    int depth, height, width, periodic, count, colors, extinctions, scatterings, planes,
+        back_planes;
     int pitch, most, first, launched, team, color, together, lanes, begin, end;
 };
 
@@ -126,15 +129,21 @@ template <class F> APART void multiply_rows(
     }
 }
 
+enum Kind { BY_ROWS, CELLS, FACES };
+
 // Numbers N, dual ones for tangents.
-template <class N, class F, bool BY_CELLS> struct Ordinates {
+template <class N, class F, Kind KIND> struct Ordinates {
+    static constexpr bool BY_CELLS = KIND != BY_ROWS, HAS_FACES = KIND == FACES;
     static constexpr int KINDS = 1 + IS_DUAL<N>;
     // What an ordinate gives in a cell: the mean of I, or cotangents of what scatters, of its rise,
     // of the depth and of scattering, the last two for coefficients of 1.
     enum { MEAN, OWN = 0, RISE, MASS, SCATTERED, OUTPUTS };
     enum { PHI, PSI, ETA, ETA_SLOPE, PASSED, DECAYS };
-    // A row of cells, or one cell: counted from where the team begins along z, and the first cell.
+    // A row of cells, or one cell: the place of its first cell along z, counted from where the team
+    // begins, y and x, among cells, and among numbers in rings: in its plane and in that upwind, or
+    // downwind.
     struct Row {
+        int place[3];
         long long at, light[2], returning[2];
     };
 
@@ -185,6 +194,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         const long long at = (y + 1) * row_size + x + 1, size = KINDS * plane_size;
         const int before = z > 0 ? (z - 1) % of.planes : of.planes - 1;
         return {
+            {z, y, x},
             (plane * of.height + y) * of.width + x,
             {z % of.planes * size + at, before * size + at},
             {z % of.back_planes * size + at, (z + 1) % of.back_planes * size + at}};
@@ -227,6 +237,29 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
             found.from[k] = readable<N>(at, at + plane_size);
         }
         return found;
+    }
+
+    // Copies a number in a ring to beyond the opposite faces along which the grid is periodic, but
+    // for those across which slices lie.
+    INLINE void repeat(F* ring, int planes, int j, const Row& row) const {
+        const int sizes[3] = {of.depth, of.height, of.width};
+        int places[3][3], counts[3];
+        for (int a = 0; a < 3; ++a) {
+            const int place = row.place[a], last = sizes[a] - 1;
+            const bool is_around = of.periodic >> a & 1 && a != ordinate(j).axis;
+            counts[a] = 1, places[a][0] = place;
+            if (is_around && place == 0) places[a][counts[a]++] = sizes[a];
+            if (is_around && place == last) places[a][counts[a]++] = -1;
+        }
+        const F* const from = ring + row.light[0];
+        for (int z = 0; z < counts[0]; ++z)
+            for (int y = 0; y < counts[1]; ++y)
+                for (int x = 0; x < counts[2]; ++x) {
+                    const int plane = (places[0][z] + planes) % planes;
+                    F* const to = ring + plane * KINDS * plane_size +
+                                  (places[1][y] + 1) * row_size + places[2][x] + 1;
+                    for (int k = 0; k < KINDS; ++k) to[k * plane_size] = from[k * plane_size];
+                }
     }
 
     // Sums of moments times `by` [ordinates, count] for a team's ordinates from `begin` to `end`.
@@ -274,22 +307,21 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         }
     }
 
-    // Does `each` row of planes and ordinates, or the cell of this item.
-    template <bool IS_BACK, bool HAS_SLOPES, class Before, class Each, class After>
-    INLINE void go(Before before, Each each, After after) const {
+    // Does `each` row of planes and ordinates, or the cell of this item; or what lies `beyond` the
+    // last slice.
+    template <bool IS_BACK, bool HAS_SLOPES, class Before, class Each, class After, class Beyond>
+    INLINE void go(Before before, Each each, After after, Beyond beyond) const {
         if constexpr (BY_CELLS) {
             const Ordinate& ordinate = this->ordinate(team.begin);
             const int axis = ordinate.axis, sizes[3] = {of.depth, of.height, of.width};
             const int columns = axis == 2 ? of.height : of.width, s = of.begin;
             const int r = lane / columns, c = lane % columns;
-            if (s >= sizes[axis] || r >= sizes[axis == 0]) return;
+            if (s >= sizes[axis] + HAS_FACES || r >= sizes[axis == 0]) return;
             const int t = axis && ordinate.senses[axis] < 0 ? sizes[axis] - 1 - s : s;
-            const Row row = this->row(
-                axis ? r : t,
-                axis == 0   ? r
-                : axis == 1 ? t
-                            : c,
-                axis == 2 ? t : c);
+            const Row row = axis == 0   ? this->row(t, r, c)
+                            : axis == 1 ? this->row(r, t, c)
+                                        : this->row(r, c, t);
+            if (s == sizes[axis]) return beyond(row, team.begin);
             find_decays<HAS_SLOPES>(row, path(team.begin).step);
             before(row, team.begin, team.end);
             each(row, team.begin);
@@ -343,11 +375,23 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                 } else {
                     follow_row<KEEPS ? AFTER : BOTH, 4>(row, j);
                 }
+                if constexpr (HAS_FACES) repeat(ring(of.light, of.planes, j), of.planes, j, row);
             },
             [&](const Row& row, int begin, int end) HERE {
                 if constexpr (!KEEPS)
                     collect(MEAN, of.weighted, of.count, of.count, of.moments, row, begin, end);
+            },
+            [&](const Row& row, int j) HERE {
+                F* const light = ring(of.light, of.planes, j);
+                const N arriving = neighbors<4>(light, row.light, -1, j)(0) + entering(row, j)[0];
+                light[row.light[0]] = value_of(arriving);
+                if constexpr (IS_DUAL<N>) light[row.light[0] + plane_size] = change_of(arriving);
             });
+    }
+    // Light that enters the cells of a row from outside, besides the inflow.
+    INLINE auto entering(const Row& row, int j) const {
+        const F* const at = of.entering + place(j) * of.planes * KINDS * plane_size + row.light[0];
+        return readable<N>(at, at + plane_size);
     }
     // What is found of a row: I where it leaves cells and its mean, or one of them. ALONG: I where
     // it leaves cells, but for what comes from cells of the same row, and which part of that does.
@@ -371,7 +415,9 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         const F* const decays = this->decays;
         INDEPENDENT
         for (int c = 0; c < width; ++c) {
-            const N arriving = upwind(c), depth = scale * e[c], scatters = strength * sc[c];
+            N arriving = upwind(c);
+            if constexpr (HAS_FACES) arriving += entering(row, j)[c];
+            const N depth = scale * e[c], scatters = strength * sc[c];
             const N rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
             const Emitted<N> emitted = {scatters * own[c], scatters * rise};
@@ -420,6 +466,8 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                     sum += ordinate(j).count == 1 ? return_row<true, 1>(row, j)
                                                   : return_row<true, 4>(row, j);
                 }
+                if constexpr (HAS_FACES)
+                    repeat(ring(of.returning, of.planes, j), of.planes, j, row);
             },
             [&](const Row& row, int begin, int end) HERE {
                 const int apart = sizeof(Path<F>) / sizeof(F);
@@ -427,6 +475,9 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                 collect(RISE, of.paths + 1, apart, 3, of.gradient_bar, row, begin, end);
                 collect(MASS, of.ones, 1, 1, of.e_bar, row, begin, end);
                 collect(SCATTERED, of.ones, 1, 1, of.sc_bar, row, begin, end);
+            },
+            [&](const Row& row, int j) HERE {
+                repeat(ring(of.returning, of.planes, j), of.planes, j, row);
             });
         of.inflow_bar[item] += sum;
     }
@@ -470,7 +521,10 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F sum = 0;
         INDEPENDENT
         for (int c = 0; c < width; ++c) {
-            const F arriving = upwind(c), within_bar = bar[c], after_bar = downwind(c);
+            const F within_bar = bar[c];
+            F arriving = upwind(c), after_bar = downwind(c);
+            // Where light leaves the box its cotangent was written before.
+            if constexpr (HAS_FACES) arriving += entering(row, j)[c], after_bar += to[c];
             const F depth = scale * e[c], scatters = strength * sc[c], o = own[c];
             const F rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];

@@ -20,6 +20,11 @@ POINTS = 4
 MOST = 24
 """Ordinates in a team at most: more read moments less often, fewer leave more of a cache."""
 
+FILL_GPU, FILL_CACHE = 2**18, 2**14
+"""Cells of slices at least that a launch by cells does: on a GPU about as many threads as it holds,
+on a processor few, since arrays of a chunk have all its slices.
+"""
+
 
 @dataclass(frozen=True)
 class Chunk:
@@ -129,33 +134,46 @@ def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[list[list[lis
     return [teams[k : k + 2 * pieces] for k in range(0, len(teams), 2 * pieces)]
 
 
-@functools.cache
-@torch.inference_mode(False)
-def make_tables(
-    grid: Grid,
-    directions: int,
-    moments: int,
-    by_rows: bool,
-    size: int,
-    dtype: torch.dtype,
-    device: torch.device,
+def ordinate_tables(
+    grid: Grid, directions: int, like: Tensor, moments: int, pieces: int | None = None
 ) -> Tables:
     """Tables of a quadrature set of `directions` through `grid`, for so many `moments`.
 
-    `size`: by rows, the pieces that share directions; by cells, the ordinates in a chunk.
+    They are for kernels by rows, whose teams are `pieces` of the directions, or by cells (None);
+    of the type and on the device of `like` [..., C, z, y, x].
     """
+    most = 0
+    if pieces is None:
+        _, second, largest = sorted(grid.shape)
+        items = FILL_GPU if like.is_cuda else FILL_CACHE
+        most = math.ceil(items / (like.shape[-4] * second * largest))
+    return _make_tables(grid, directions, moments, pieces, most, like.dtype, like.device)
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _make_tables(
+    grid: Grid,
+    directions: int,
+    moments: int,
+    pieces: int | None,
+    most: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tables:
+    """The same; chunks by cells have so many ordinates at `most`."""
     points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
-    if by_rows:
-        chunks_of_teams = _team_rows(ordinates, size)
+    if pieces is not None:
+        chunks_of_teams = _team_rows(ordinates, pieces)
     else:
         single = [[[o], []] for o in ordinates]
-        chunks_of_teams = [single[k : k + size] for k in range(0, len(single), size)]
+        chunks_of_teams = [single[k : k + most] for k in range(0, len(single), most)]
     order, teams, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
     for chunk in chunks_of_teams:
         first, team = len(order), len(teams)
         for number, (ups, downs) in enumerate(chunk):
-            sense = (1 - 2 * (number % 2)) if by_rows else ups[0].senses[0]
+            sense = ups[0].senses[0] if pieces is None else 1 - 2 * (number % 2)
             begin, middle = len(order), len(order) + len(ups)
             order += ups + downs
             teams.append([begin, middle, len(order), sense])
@@ -168,11 +186,12 @@ def make_tables(
         "values": values,
         "weighted": values * values.new_tensor(weights)[numbers, None],
         "ones": values.new_ones(len(order), 1),
+        "one": values.new_ones(len(order), 1),
     }
     integers = {"teams": teams, "ordinates": [o.integers(grid.shape[2]) for o in order]}
     arrays = {
         name: torch.tensor(rows, dtype=torch.int32, device=device)
         for name, rows in integers.items()
     } | {name: numbers.to(device, dtype) for name, numbers in of_numbers.items()}
-    most = max(end - begin for begin, _, end, _ in teams)
-    return Tables(numbers, chunks, arrays, most)
+    team_size = max(end - begin for begin, _, end, _ in teams)
+    return Tables(numbers, chunks, arrays, team_size)

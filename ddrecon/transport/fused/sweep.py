@@ -17,21 +17,41 @@ from ddrecon.transport.fused.launches import Sweep, Swept
 def sweep_fused(
     medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, directions: int
 ) -> Tensor:
-    """As `sweep` in `transport/sweep.py`, without mirrors and periods."""
+    """As `sweep` in `transport/sweep.py`, where light enters by no face but as `inflow`."""
+    return _apply(medium, source, gradient, inflow, (medium.grid, directions, None), None)[0]
+
+
+def sweep_chunk(
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    directions: int,
+    chunk: int,
+    entering: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The moments of a `chunk` of ordinates, and light where it leaves cells, less `inflow`.
+
+    That, and what is `entering` cells from outside, are rings (`ordinates.h`)
+    [ordinates, C, planes, y + 2, x + 2].
+    """
+    return _apply(medium, source, gradient, inflow, (medium.grid, directions, chunk), entering)
+
+
+def _apply(
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    of: tuple[Grid, int, int | None],
+    entering: Tensor | None,
+) -> Any:
     extinction, remaining = medium.extinction, medium.remaining
-    shares_field = remaining.field is extinction.field
     scales = _stack_scales(extinction.scale, remaining.scale, inflow, source.shape[1])
-    moments, _ = _Sweep.apply(
-        torch.is_grad_enabled(),
-        medium.grid,
-        directions,
-        scales,
-        extinction.field,
-        None if shares_field else remaining.field,
-        gradient.expand(3, *source.shape[1:]),
-        source,
-    )
-    return moments
+    scattering = None if remaining.field is extinction.field else remaining.field
+    gradient = gradient.expand(3, *source.shape[1:])
+    tensors = scales, extinction.field, scattering, gradient, source, entering
+    return _Sweep.apply(torch.is_grad_enabled(), of, *tensors)
 
 
 @remember
@@ -46,76 +66,80 @@ def _stack_scales(
 
 def _swept(tensors: Any) -> Swept:
     """From tensors as autograd must be given them: one by one, None for a field that is shared."""
-    scales, extinction, scattering, gradient, source = (
-        one if one is None else one.contiguous() for one in tensors
-    )
+    scales, extinction, scattering, gradient, source = tensors
     scattering = extinction if scattering is None else scattering
-    return Swept(scales, extinction, scattering, gradient, source)
+    fields = scales, extinction, scattering, gradient, source
+    return Swept(*(field.contiguous() for field in fields))
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of radiance, with derivatives by all tensors of `Swept`.
+    """The moments of radiance, with derivatives by all tensors of `Swept` and what is entering.
 
-    The second is what `Sweep.follow` saves for the backward pass, where gradients may be asked for.
+    The second result is light as of `sweep_chunk`, or of no use but to the backward pass.
     """
 
     @staticmethod
     def forward(
-        may_save: bool, grid: Grid, directions: int, *tensors: Any
+        may_save: bool, of: tuple[Grid, int, int | None], *tensors: Any
     ) -> tuple[Tensor, Tensor | None]:
+        *fields, entering = tensors
         saves = may_save and any(one is not None and one.requires_grad for one in tensors)
-        return Sweep(grid, directions, _swept(tensors)).follow(saves)
+        return Sweep(*of, _swept(fields)).follow(saves, entering)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-        _, grid, directions, *tensors = inputs
-        ctx.of, ctx.saved = (grid, directions), output[1]
+        _, ctx.of, *tensors = inputs
+        ctx.saved = output[1] if tensors[-1] is None else None
         ctx.mark_non_differentiable(*([] if ctx.saved is None else [ctx.saved]))
         ctx.set_materialize_grads(False)
         keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, bars: Tensor | None, _: None) -> tuple[Any, ...]:
-        if bars is None:
-            return (None,) * 8
-        scales, extinction, scattering, *_ = ctx.saved_tensors
-        swept, needs_scales = _swept(ctx.saved_tensors), ctx.needs_input_grad[3]
+    def backward(ctx: Any, bars: Tensor | None, light_bar: Tensor | None) -> tuple[Any, ...]:
+        *fields, entering = ctx.saved_tensors
+        swept = _swept(fields)
+        bars = torch.zeros_like(swept.source) if bars is None else bars.contiguous()
+        returning = None
+        if entering is not None:
+            # The cotangent of what enters takes the place of that of light.
+            returning = torch.zeros_like(entering) if light_bar is None else light_bar.clone()
         inflow, mass, scattered, gradient, source = Sweep(*ctx.of, swept).go_back(
-            bars.contiguous(), ctx.saved
+            bars, ctx.saved, entering, returning
         )
         scales_bar = None
-        if needs_scales:
-            pairs = (mass, extinction), (scattered, swept.scattering)
+        if ctx.needs_input_grad[2]:
+            pairs = (mass, swept.extinction), (scattered, swept.scattering)
             sums = [(bar * field).sum((1, 2, 3), dtype=torch.float64) for bar, field in pairs]
             scales_bar = torch.stack([*(one.to(inflow) for one in sums), inflow])
         mass, scattered = (
             bar * scale.view(-1, 1, 1, 1)
-            for bar, scale in zip((mass, scattered), scales[:2], strict=True)
+            for bar, scale in zip((mass, scattered), swept.scales, strict=False)
         )
-        if scattering is None:
-            return (
-                None,
-                None,
-                None,
-                scales_bar,
-                (mass + scattered).sum_to_size(extinction.shape),
-                None,
-                gradient,
-                source,
-            )
-        of_fields = mass.sum_to_size(extinction.shape), scattered.sum_to_size(scattering.shape)
-        return None, None, None, scales_bar, *of_fields, gradient, source
+        scattering_bar = None
+        if fields[2] is None:
+            mass = mass + scattered
+        else:
+            scattering_bar = scattered.sum_to_size(swept.scattering.shape)
+        extinction_bar = mass.sum_to_size(swept.extinction.shape)
+        of_fields = scales_bar, extinction_bar, scattering_bar, gradient, source
+        return None, None, *of_fields, returning
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, None]:
-        def change(*tensors: Any) -> Tensor:
+    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, Tensor | None]:
+        def change(*tensors: Any) -> Any:
             half = len(tensors) // 2
-            values, d_values = tensors[:half], tensors[half:]
-            d_values = tuple(
+            values, entering = tensors[: half - 1], tensors[half - 1]
+            d_values = [
                 value if value is None else torch.zeros_like(value) if d is None else d
-                for value, d in zip(values, d_values, strict=True)
-            )
-            return Sweep(*ctx.of, _swept(values), _swept(d_values)).follow()[0]
+                for value, d in zip(tensors[:half], tensors[half:], strict=True)
+            ]
+            *d_fields, d_entering = d_values
+            if entering is not None:
+                entering = torch.stack([entering, d_entering], 3)
+            sweep = Sweep(*ctx.of, _swept(values), _swept(d_fields))
+            moments, light = sweep.follow(entering=entering)
+            return moments if light is None else (moments, light[:, :, :, 1].contiguous())
 
-        return run_plainly(change, *ctx.saved_tensors, *changes[3:]), None
+        found = run_plainly(change, *ctx.saved_tensors, *changes[2:])
+        return found if isinstance(found, tuple) else (found, None)
