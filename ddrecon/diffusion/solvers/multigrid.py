@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
 from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution
-from ddrecon.engine import current_engine, has_kernels
+from ddrecon.engine import has_kernels
 from ddrecon.errors import SolveError
 
 MAX_ITERATIONS = 2_000
@@ -22,8 +22,7 @@ def solve_by_multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
     """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
-    # Where cells at both ends are neighbors, it is all torch's.
-    if _is_fused(source) and not operator.is_periodic:
+    if has_kernels("diffusion", gpu=source.is_cuda, periodic=operator.is_periodic):
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
@@ -41,15 +40,10 @@ def solve_by_multigrid(
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled beside what is done before it."""
-    if _is_fused(like):
+    if has_kernels("diffusion", gpu=like.is_cuda):
         from ddrecon.diffusion.solvers.fused import multigrid as fused  # imports Warp
 
         fused.name_kernels(like)
-
-
-def _is_fused(like: Tensor) -> bool:
-    """Whether kernels solve: not on a GPU, where a thread is to do a cell, and not slices."""
-    return current_engine() == "warp" and has_kernels("diffusion", like.is_cuda)
 
 
 def _iterate(
