@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn.functional import conv3d, pad
 
 from ddrecon.diffusion.implicit import AutodiffOperator, ImplicitSolve, SolverWithMemory
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector

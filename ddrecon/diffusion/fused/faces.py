@@ -12,8 +12,8 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
 
 HEADER = "diffusion/fused/faces.h"
-PLACE = "Mesh<F>(row, nz, ny, nx, hz, hy, hx), own, F(sign), "
-GIVEN = "int nz, ny, nx, own, sign; F hz, hy, hx"
+PLACE = "Mesh<F>(row, nz, ny, nx, periodic, hz, hy, hx), own, F(sign), "
+GIVEN = "int nz, ny, nx, periodic, own, sign; F hz, hy, hx"
 
 
 def assemble_system(medium: Medium, diffusion: Tensor, source: Moments, outside: Tensor) -> Tensors:
@@ -75,9 +75,10 @@ def _find(
     colors = max(colors, *map(len, fields))
     shapes = [(colors, z, y, x)] * (outs or 1)
     if not outs:
-        shapes += (own, z, y, x), (own, z - 1, y, x), (own, z, y - 1, x), (own, z, y, x - 1)
+        shapes += [(own, z, y, x)] * 4
     sizes = dict(zip(("hz", "hy", "hx"), medium.grid.spacing, strict=True))
-    more = {"nz": z, "ny": y, "nx": x, "own": own, "sign": sign, **sizes}
+    periodic = sum(1 << axis for axis in medium.grid.periodic)
+    more = {"nz": z, "ny": y, "nx": x, "periodic": periodic, "own": own, "sign": sign, **sizes}
     function = RowFunction(HEADER, flow, tuple(shapes), x, PLACE, GIVEN, more, added, alike)
     numbers = torch.stack([number.reshape(-1).expand(colors) for number in each])
     return function.apply(numbers, fields[0], scattering.field, *fields[1:])
