@@ -16,6 +16,8 @@ from torch import Tensor
 
 from ddrecon.grid import Grid, Triple, array_order
 from ddrecon.lenses import distort, ray_through
+from ddrecon.records import bounded, one_of
+from ddrecon.settings import LENSES
 
 NEWTON_STEPS = 12
 """By which a view ray through a pane is found to rounding."""
@@ -35,12 +37,12 @@ class Camera:
     """
 
     pose: Tensor
-    size: tuple[int, int]
-    half_width: float | Tensor
+    size: tuple[int, int] = bounded(minimum=1)
+    half_width: float | Tensor  # type: ignore[misc]  # it has no default, as `size` has none
     is_perspective: bool = True
     principal_point: tuple[float, float] | Tensor = (0.5, 0.5)
-    pixel_aspect: float = 1.0
-    lens: str | None = None
+    pixel_aspect: float = bounded(1.0, above=0)
+    lens: str | None = one_of(None, LENSES)
     distortion: Tensor | None = None
 
     def __setattr__(self, name: str, value: Any) -> None:

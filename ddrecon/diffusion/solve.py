@@ -8,7 +8,7 @@ norms are over the diagonal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.hierarchy import Hierarchy, Passes
 from ddrecon.diffusion.operator import Operator
-from ddrecon.engine import current_engine
+from ddrecon.engine import has_kernels
 from ddrecon.errors import SolveError
 
 MAX_ITERATIONS = 2_000
@@ -51,7 +51,7 @@ def solve_by_multigrid(
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled beside what is done before it."""
-    if current_engine() == "warp":
+    if has_kernels("diffusion", gpu=like.is_cuda):
         from ddrecon.diffusion.fused import passes  # imports Warp
 
         passes.name_kernels(like)
@@ -75,12 +75,13 @@ class TensorCycle:
 
 def prepare(operator: Operator) -> Hierarchy:
     """The grids of `operator`, by torch's operations."""
-    return Hierarchy.of(operator, Passes())
+    # Of a copy: what is prepared for an operator does not hold that operator.
+    return Hierarchy.of(replace(operator, prepared={}), Passes())
 
 
 def _cycle_of(operator: Operator, source: Tensor) -> Any:
     """What multiplies and preconditions, on the engine at hand."""
-    if current_engine() == "torch":
+    if not has_kernels("diffusion", gpu=source.is_cuda):
         return TensorCycle(operator, source)
     from ddrecon.diffusion.fused.passes import KernelCycle  # imports Warp
 

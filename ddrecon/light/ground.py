@@ -24,6 +24,7 @@ from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.records import bounded
 
 UPWARDS = 24
 """Directions of the ground's light."""
@@ -34,7 +35,7 @@ class Plane:
     """The plane at `height` [u] along the array's `axis` that points up."""
 
     height: float
-    axis: int
+    axis: int = bounded(minimum=0, maximum=2)
 
     @property
     def across(self) -> tuple[int, int]:

@@ -90,8 +90,8 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light.mean + source.mean, directions)
-    is_apart = mirror is None and not medium.grid.periodic
-    if is_apart and is_fused() and has_kernels("transport rounds", light.mean.is_cuda):
+    traits = {"periodic": bool(medium.grid.periodic), "refracting": mirror is not None}
+    if has_kernels("transport rounds", gpu=light.mean.is_cuda, **traits):
         from ddrecon.transport.fused.sweep import sweep_fused
 
         if medium.is_cellwise:

@@ -56,7 +56,7 @@ def layer(shape: Shape) -> Tensor:
 
 @dataclass(frozen=True)
 class HardCase:
-    """A scene in words: a medium in a box about the origin, a beam, and a camera of 16 x 16 pixels.
+    """A scene in words: a medium in a box about the origin, a sun, and a camera.
 
     The box has `shape` cells and `sides` [u].
 
@@ -76,6 +76,7 @@ class HardCase:
     target: Triple = (0.0, 0.0, 0.0)
     half_width: float = 0.35
     is_perspective: bool = True
+    pixels: int = 16
 
     def scene(self, dtype: torch.dtype, device: torch.device) -> Scene:
         """The scene in `dtype` on `device`, to be solved as closely as `TOLERANCE` says."""
@@ -97,7 +98,8 @@ class HardCase:
         if self.ambient:
             lights.append(AmbientLight(tensor([self.ambient])))
         pose = look_at(tensor(self.eye), tensor(self.target), tensor((0.0, 1.0, 0.0)))
-        views = [View("view", Camera(pose, (16, 16), self.half_width, self.is_perspective))]
+        size = self.pixels, self.pixels
+        views = [View("view", Camera(pose, size, self.half_width, self.is_perspective))]
         diffusion = DiffusionSettings(
             tolerance=TOLERANCE[dtype], transport_rounds=1, degree=3, refine=1
         )
