@@ -138,9 +138,9 @@ def place() -> str:
 def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, float, str]:
     """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
     import numpy as np
+    from ddrecon.diffusion.solvers.fused import multigrid
 
     from ddrecon.diffusion.implicit import SolveMemory
-    from ddrecon.diffusion.solvers.fused import multigrid
     from ddrecon.reconstruct.loop import Reconstruction
     from ddrecon.renderer import render_each
     from ddrecon.scene_file.build import load_scene

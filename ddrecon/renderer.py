@@ -22,7 +22,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
-from ddrecon.diffusion.solvers.multigrid import name_kernels, solve_by_multigrid
+from ddrecon.diffusion.solve import name_kernels, solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
