@@ -152,7 +152,7 @@ def advance(
     total = None if run.schedule.is_auto else run.schedule.most
     form, settings = SHORT if total else None, bar_settings(is_quiet)
     bar = tqdm(total=total, initial=run.iteration, desc=title, bar_format=form, **settings)
-    # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
+    # Deferred: torchrun kills all ranks when one ends, and must not tear a checkpoint.
     with defer_interrupt() as asked:
         try:
             with bar:
