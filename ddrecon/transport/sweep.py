@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Cut, add, cut, fill, weigh
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -98,29 +97,31 @@ def _sweep_fused(
 
 def sweep_change(
     medium: Medium,
-    light: Moments,
-    source: Moments,
+    light: Cut,
+    source: Cut,
     inflow: Tensor | None,
     directions: int,
     mirror: Mirror | None = None,
-) -> Moments:
-    """By how much the first two moments of light change in a sweep, and those of higher degree.
+) -> Cut:
+    """By how much moments of degree 0 and 1 change in a sweep, and all those of higher degree.
 
-    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). What follows is as of `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8), of which moments that are missing are
+    zero. What follows is as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = steep_gradient(medium, light.mean + source.mean, directions)
-    scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
+    gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
+    phi = torch.cat(light)
+    scatters = fill(add(weigh(phi, factors), torch.cat(source)), medium.degree)
     if mirror is not None:
-        mirror.begin(_without(light.harmonics(medium.degree), inflow))
+        mirror.begin(_without(fill(phi, medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
     if mirror is not None:
         mirror.end(_without(swept, inflow))
-    change = Moments.of_harmonics(swept)
-    return change.plus(replace(light, higher=None).scaled(-1.0, -1.0))
+    low, high = cut(swept)
+    return add(low, -light[0]), high
 
 
 def _without(light: Tensor, inflow: Tensor | None) -> Tensor:

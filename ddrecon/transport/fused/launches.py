@@ -42,6 +42,8 @@ CELL = ROWS + 2
 TABLES = "teams", "ordinates", "paths", "values", "weighted", "ones"
 SLAB = 4
 """Planes of which I is kept for the adjoint at most; before each slab it is saved."""
+Ordinates = tuple[Grid, int, int | None]
+"""A grid, how many directions cross it, and which chunk of them; None for all."""
 
 
 @dataclass(frozen=True)
@@ -60,19 +62,13 @@ class Swept:
 
 
 class Sweep:
-    """A sweep of `directions` through `grid` of what is `swept`, or its change by `d_swept`.
+    """A sweep of what is `swept`, or its change by `d_swept`.
 
-    With a `chunk` it is of those ordinates alone, and light enters and leaves by faces: by cells.
+    With a chunk it is of those ordinates alone, and light enters and leaves by faces: by cells.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        directions: int,
-        chunk: int | None,
-        swept: Swept,
-        d_swept: Swept | None = None,
-    ):
+    def __init__(self, of: Ordinates, swept: Swept, d_swept: Swept | None = None):
+        grid, directions, chunk = of
         self.swept, self.d_swept, self.like, self.grid = swept, d_swept, swept.source, grid
         self.has_faces = chunk is not None
         self.by_rows = not (self.like.is_cuda or self.has_faces)

@@ -7,11 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
-from ddrecon.transport.fused.launches import Sweep, Swept
+from ddrecon.transport.fused.launches import Ordinates, Sweep, Swept
 
 
 def sweep_fused(
@@ -43,7 +42,7 @@ def _apply(
     source: Tensor,
     gradient: Tensor,
     inflow: Tensor | None,
-    of: tuple[Grid, int, int | None],
+    of: Ordinates,
     entering: Tensor | None,
 ) -> Any:
     extinction, remaining = medium.extinction, medium.remaining
@@ -79,12 +78,10 @@ class _Sweep(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        may_save: bool, of: tuple[Grid, int, int | None], *tensors: Any
-    ) -> tuple[Tensor, Tensor | None]:
+    def forward(may_save: bool, of: Ordinates, *tensors: Any) -> tuple[Tensor, Tensor | None]:
         *fields, entering = tensors
         saves = may_save and any(one is not None and one.requires_grad for one in tensors)
-        return Sweep(*of, _swept(fields)).follow(saves, entering)
+        return Sweep(of, _swept(fields)).follow(saves, entering)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
@@ -104,7 +101,7 @@ class _Sweep(torch.autograd.Function):
         if entering is not None:
             # The cotangent of what enters takes the place of that of light.
             returning = torch.zeros_like(entering) if light_bar is None else light_bar.clone()
-        inflow, mass, scattered, gradient, source = Sweep(*ctx.of, swept).go_back(
+        inflow, mass, scattered, gradient, source = Sweep(ctx.of, swept).go_back(
             bars, ctx.saved, entering, returning
         )
         scales_bar = None
@@ -130,14 +127,13 @@ class _Sweep(torch.autograd.Function):
         def change(*tensors: Any) -> Any:
             half = len(tensors) // 2
             values, entering = tensors[: half - 1], tensors[half - 1]
-            d_values = [
+            *d_fields, d_entering = (
                 value if value is None else torch.zeros_like(value) if d is None else d
                 for value, d in zip(tensors[:half], tensors[half:], strict=True)
-            ]
-            *d_fields, d_entering = d_values
-            if entering is not None:
+            )
+            if d_entering is not None:
                 entering = torch.stack([entering, d_entering], 3)
-            sweep = Sweep(*ctx.of, _swept(values), _swept(d_fields))
+            sweep = Sweep(ctx.of, _swept(values), _swept(d_fields))
             moments, light = sweep.follow(entering=entering)
             return moments if light is None else (moments, light[:, :, :, 1].contiguous())
 
