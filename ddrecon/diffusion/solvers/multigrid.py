@@ -19,17 +19,24 @@ MAX_ITERATIONS = 2_000
 
 
 def solve_by_multigrid(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
+    operator: Operator,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    count: int | None = None,
 ) -> Solution:
-    """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
+    """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached.
+
+    With a `count` of iterations it makes so many, whatever it reaches, and reads nothing.
+    """
     # Where cells at both ends are neighbors, it is all torch's.
-    if _is_fused(source) and not operator.is_periodic:
+    if count is None and _is_fused(source) and not operator.is_periodic:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
     else:
-        solution = _iterate(operator, source, guess, tolerance)
-    if not solution.residual <= tolerance:
+        solution = _iterate(operator, source, guess, tolerance, count)
+    if count is None and not solution.residual <= tolerance:
         raise SolveError(
             "multigrid did not reach its tolerance",
             solution.iterations,
@@ -53,16 +60,25 @@ def _is_fused(like: Tensor) -> bool:
 
 
 def _iterate(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
+    operator: Operator,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    count: int | None,
 ) -> Solution:
-    """The solution after at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
+    """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     system, tiny = ScaledSystem.of(operator, source), torch.finfo(source.dtype).tiny
     matrix = system.matrix
     y, residual = system.start(guess)
     relative = system.relative(residual)
     direction, square = torch.zeros_like(y), torch.ones_like(relative)
     iteration = 0
-    while (worst := float(relative.max())) > tolerance and iteration < MAX_ITERATIONS:
+    worst: float | Tensor = relative.max()
+    while (
+        iteration < count
+        if count is not None
+        else (worst := float(worst)) > tolerance and iteration < MAX_ITERATIONS
+    ):
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative.double() > tolerance
         preconditioned = operator.once(Level.of).cycle(residual)
@@ -73,5 +89,6 @@ def _iterate(
         y.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         relative = system.relative(residual)
+        worst = relative.max()
         iteration += 1
     return system.solution(y, iteration, worst)

@@ -19,7 +19,7 @@ class Solution:
 
     value: Tensor
     iterations: int
-    residual: float
+    residual: float | Tensor
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,6 @@ class ScaledSystem:
         tiny = torch.finfo(residual.dtype).tiny
         return self.matrix.norm(residual) / self.source_norm.clamp(min=tiny)
 
-    def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
+    def solution(self, y: Tensor, iterations: int, residual: float | Tensor) -> Solution:
         """The solution that y is."""
         return Solution(self.matrix.scale * y, iterations, residual)
