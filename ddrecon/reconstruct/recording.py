@@ -152,15 +152,13 @@ class Replays:
     What cannot be recorded is computed plainly, and a line says why.
     """
 
-    record: Record | None = staticmethod(record_graph)
-
-    def __init__(self, scene: Scene):
-        self.scene = scene
+    def __init__(self, scene: Scene, record: Record | None = None):
+        self.scene, self.record = scene, record
         self.recording: Recording | None = None
         settings = scene.diffusion
-        is_fixed = (settings.model, settings.scheme) in _FIXED
-        if rank_count() > 1 or not is_fixed or not scene.volume.density.is_cuda:
-            self.record = None
+        if rank_count() == 1 and (settings.model, settings.scheme) in _FIXED:
+            if scene.volume.density.is_cuda:
+                self.record = record_graph
 
     def differentiate(
         self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
