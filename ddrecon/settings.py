@@ -1,75 +1,24 @@
 """The sections `render`, `diffusion` and `optimize` of a scene: defaults and legal values.
 
-The metadata of each field hold what the scene loader checks: limits of numbers or `choices`, the
-names of a table of implementations. No table is loaded here: a scene file is read without torch.
-`violations` yields what is wrong with several values together.
+The `choices` of a field are the names of a table of implementations. No table is loaded here: a
+scene file is read without torch. `violations` yields what is wrong with several values together.
 """
 
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from numbers import Real
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Literal
+
+from ddrecon.records import Violation, bounded, one_of
 
 FLOOR = 3.3
 """Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
-
-LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
-    "minimum": ("at least", operator.ge),
-    "above": ("above", operator.gt),
-    "maximum": ("at most", operator.le),
-    "below": ("below", operator.lt),
-}
-"""What a bound in a field's metadata means."""
-Violation = tuple[str, str]
-"""The key of a record that breaks a rule, and what is wrong with its value."""
-
-
-class Limits(TypedDict, total=False):
-    """Limits of each number of a field; `minimum` and `maximum` are legal, the others are not.
-
-    The manual has `expert` fields on a page of their own: no scene needs these.
-    """
-
-    minimum: float
-    above: float
-    maximum: float
-    below: float
-    expert: bool
-
-
-def bounded(default: Any = MISSING, **limits: Unpack[Limits]) -> Any:
-    """A number, or numbers, within `limits`; the scene must give it where it has no `default`."""
-    return field(default=default, metadata=dict(limits))
-
-
-def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
-    """One of `choices`, `default` where the scene gives none."""
-    return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
-
-
-def faults_of(record: Any) -> Iterator[Violation]:
-    """The keys of `record`, made in Python, whose values a scene file could not have, and why."""
-    for key in fields(record):
-        value, allowed = getattr(record, key.name), key.metadata
-        if value is None and key.default is None:
-            continue
-        if value not in allowed.get("choices", [value]):
-            words = ", ".join(map(str, allowed["choices"]))
-            yield key.name, f"expected one of {words}, found {value!r}"
-        for name in (name for name in LIMITS if name in allowed):
-            words, is_within = LIMITS[name]
-            if not isinstance(value, Real):
-                yield key.name, f"expected a number, found {value!r}"
-            elif not is_within(float(value), allowed[name]):
-                yield key.name, f"must be {words} {allowed[name]:g}, found {float(value):g}"
 
 
 @dataclass(frozen=True)

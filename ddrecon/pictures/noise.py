@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
 from ddrecon.pictures.srgb import display_slope
+from ddrecon.records import bounded
 
 LEAST = 1e-3
 """A picture errs by at least this part of its root mean square: nothing is known better."""
@@ -26,9 +27,9 @@ class Noise:
     0 that between neighboring sRGB-encoded values: 1/255 in a picture of 8 bits, 0 in a linear one.
     """
 
-    read: float
-    shot: float
-    step: float = 0.0
+    read: float = bounded(minimum=0)
+    shot: float = bounded(minimum=0)
+    step: float = bounded(0.0, minimum=0)
 
     def deviation(self, values: Tensor) -> Tensor:
         """The standard deviation of `values` of linear radiance; what is below black is as black.

@@ -30,7 +30,8 @@ from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.values import require_scene, with_values
+from ddrecon.variables.legal import require_legal
+from ddrecon.variables.values import with_values
 
 
 def optimize(
@@ -60,7 +61,7 @@ class Reconstruction:
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
-        require_scene(scene)
+        require_legal(scene)
         forget_changed()
         self.problem = Problem.of(scene, iterations)
         settings, train = self.problem.settings, self.problem.train

@@ -9,18 +9,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from functools import cache, reduce
+from functools import reduce
 from operator import or_
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from ddrecon.errors import Problems, suggestion
+from ddrecon.records import LIMITS, alternatives, type_hints
 from ddrecon.scene_file.nodes import Node, describe_found
-from ddrecon.settings import LIMITS, FieldFile
+from ddrecon.settings import FieldFile
 
 R = TypeVar("R")
-type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 
 LARGEST = 3e38
 """The largest magnitude that single precision holds, roughly."""
@@ -50,12 +50,6 @@ class Rule(NamedTuple):
 def read_as(node: Node, hint: Any, folder: Path, **limits: float) -> Any:
     """The value of `node`, of the type `hint` within `limits`."""
     return read_value(node, Rule(hint, folder, limits, {}))
-
-
-@cache
-def alternatives(hint: Any) -> tuple[Any, ...]:
-    """The types that `hint` allows."""
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def describe_type(hint: Any) -> str:

@@ -19,15 +19,13 @@ from typing import Any, ClassVar, Literal
 
 from ddrecon.grid import Triple
 from ddrecon.io.images.films import FILMS
+from ddrecon.records import Violation, bounded, one_of
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
     NoiseSettings,
     OptimizeSettings,
     RenderSettings,
-    Violation,
-    bounded,
-    one_of,
 )
 from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
