@@ -53,7 +53,7 @@ from ddrecon.renderer import solve_light
 from ddrecon.scene_file.build import load_scene
 scene = load_scene(Path(sys.argv[1]))
 density = scene.volume.density.requires_grad_()
-torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse.mean.sum(), density)
+torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse[0].sum(), density)
 """
 
 

@@ -64,9 +64,9 @@ def export(
         require_no_film(source, f"; `ddrecon {sequence}` writes the volumes of all")
     from ddrecon.io.volumes.table import WRITTEN, read_together, turn_up, write_fields
 
-    kind, known = output.suffix.lower(), (".xml", ".json", *WRITTEN)
-    if kind not in known:
-        raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
+    kind, suffixes = output.suffix.lower(), (".xml", ".json", *WRITTEN)
+    if kind not in suffixes:
+        raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(suffixes)}")
     from ddrecon.reference.export import export_scene
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in

@@ -60,8 +60,8 @@ def estimate_noise(image: Tensor, step: float) -> Noise:
     level = avg_pool2d(colors, 3, 1).flatten()
     order = level.argsort()
     count = min(BINS, max(1, len(order) // 64))
-    levels = torch.stack([level[part].mean() for part in order.tensor_split(count)])
-    medians = torch.stack([uneven[part].median() for part in order.tensor_split(count)])
+    levels = torch.stack([level[pixels].mean() for pixels in order.tensor_split(count)])
+    medians = torch.stack([uneven[pixels].median() for pixels in order.tensor_split(count)])
     variances = (medians / NORMAL) ** 2
     if step:  # which the differences have in them
         variances = (variances - (step / display_slope(levels)) ** 2 / 12).clamp(min=0)

@@ -58,11 +58,11 @@ class Support:
         if doubt is not None and doubt.startswith(OUTSIDE):
             raise SceneError(f"volume.bounds: {doubt}")
         if not bool((hull & seen.any(0)).any()):
-            parts = hulls.float().mean((1, 2, 3)).tolist()
-            part, view = min(zip(parts, (view.name for view in self.views), strict=True))
+            shares = hulls.float().mean((1, 2, 3)).tolist()
+            share, view = min(zip(shares, (view.name for view in self.views), strict=True))
             raise SceneError(
                 f"{KEY}: no cell is left: of each that is seen, some training view shows nothing"
-                f" (view {view!r} alone leaves {100 * part:.2g} %); check the cameras and masks,"
+                f" (view {view!r} alone leaves {100 * share:.2g} %); check the cameras and masks,"
                 " or raise support_margin"
             )
         return hull
@@ -175,7 +175,7 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
         raise SceneError(f"{KEY}: {error}") from None
     empty = [view.name for view, pixels in zip(train.views, shown, strict=True) if not pixels.any()]
     if empty:
-        known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
-        by = known[density.support]
+        criteria = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
+        by = criteria[density.support]
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
     return Support(train.views, shown, density.margin)

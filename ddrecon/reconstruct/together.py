@@ -39,7 +39,7 @@ class Together:
         for run in self.runs:
             run.parameters = [names.get(parameter.name, parameter) for parameter in run.parameters]
             run.numbers = NumberSteps(run.problem.train, run.parameters, len(scenes))
-            run.numbers.heard = first.numbers.heard
+            run.numbers.pending = first.numbers.pending
 
     @property
     def is_done(self) -> bool:
@@ -56,13 +56,13 @@ class Together:
 
         Raises DivergenceError when one fails. The state of all is then that before the last step.
         """
-        before = self.state()
+        old = self.state()
         try:
             rows = [run.step() for run in self.runs]
         except DivergenceError:
-            self.restore(self.before_step or before)
+            self.restore(self.before_step or old)
             raise
-        self.before_step = before
+        self.before_step = old
         return rows
 
     def spread(self) -> dict[str, Tensor]:
@@ -70,7 +70,7 @@ class Together:
 
         That is the standard deviation, from one to another, of the step that each would make alone.
         """
-        alone = [run.changes_alone() for run in self.runs]
+        alone = [run.undamped_changes() for run in self.runs]
         if len(alone) < 2:
             return {}
         return {
@@ -87,4 +87,4 @@ class Together:
         """Takes up where those that made `state` stopped."""
         for run, of_run in zip(self.runs, state["runs"], strict=True):
             run.restore(of_run)
-        self.runs[0].numbers.heard.clear()
+        self.runs[0].numbers.pending.clear()

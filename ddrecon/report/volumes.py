@@ -60,7 +60,7 @@ def volume_viewer(
     `up` is the axis (0, 1, 2) that points up; `towards_eye` (x, y, z) is where the first camera
     stands.
     """
-    eye = " ".join(f"{part:.4g}" for part in towards_eye)
+    eye = " ".join(f"{component:.4g}" for component in towards_eye)
     sliders = "".join(
         f'<label>{label} <input type="range" id="{name}" min="{low}" max="{high}" step="{step}">'
         "</label>"

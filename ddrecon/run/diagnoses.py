@@ -67,7 +67,7 @@ def diagnose(
     least = 1.0
     if share is not None and abs(math.log(usual)) <= math.log(GAIN):
         least = max(EXPLAINED, share)
-    found = {
+    texts = {
         "overfit": overfit,
         "support": doubt,
         "exposure": find_exposure(trained, images, usual, least),
@@ -75,7 +75,7 @@ def diagnose(
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
     }
-    return [{"kind": kind, "text": text} for kind, text in found.items() if text is not None]
+    return [{"kind": kind, "text": text} for kind, text in texts.items() if text is not None]
 
 
 def find_overfit(

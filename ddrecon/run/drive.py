@@ -117,23 +117,23 @@ def drive_run(
         cells = row.cells
         if preview_every and row.iteration % preview_every == 0:
             folder.preview(run)
-        known = run.total.test_psnr
-        test = "" if known is None else f"/{known:.1f}"
+        test_psnr = run.total.test_psnr
+        test = "" if test_psnr is None else f"/{test_psnr:.1f}"
         return f"PSNR {row.psnr:.1f}{test} dB"
 
     advance(run, make_iteration, folder, is_quiet, title)
     # What is left the first rank does by itself.
     leave_ranks()
 
-    def show(views: Sequence[Any], what: str) -> Iterable[Any]:
-        return tqdm(views, desc=what, leave=False, **bar_settings(is_quiet))
+    def show(views: Sequence[Any], label: str) -> Iterable[Any]:
+        return tqdm(views, desc=label, leave=False, **bar_settings(is_quiet))
 
     try:
         with tell("rendering what was found, and writing it with its report", is_silent):
             return folder.finish(run, show)
     except KeyboardInterrupt:
-        made = f"after {run.iteration} iterations"
-        raise KeyboardInterrupt(f"{made}; write its results with --resume") from None
+        count_text = f"after {run.iteration} iterations"
+        raise KeyboardInterrupt(f"{count_text}; write its results with --resume") from None
 
 
 def advance(
@@ -162,8 +162,8 @@ def advance(
                     bar.update()
                     if is_any(bool(asked)):
                         folder.save(run)
-                        made = f"after {run.iteration} iterations"
-                        raise KeyboardInterrupt(f"{made}; go on with --resume")
+                        count_text = f"after {run.iteration} iterations"
+                        raise KeyboardInterrupt(f"{count_text}; go on with --resume")
         except (DivergenceError, RanksError) as error:
             folder.save(run)
             raise error.with_advice(

@@ -27,8 +27,8 @@ def require_no_film(folder: Path, more: str = "") -> None:
 
     frames = sorted(folder.glob(f"frames/*/{RESULT}"))
     if frames and kind_of_folder(folder) == FILM:
-        what = f"is the folder of a film; name that of a frame, such as {frames[0].parent}"
-        raise UsageError(f"{folder}: {what}{more}")
+        text = f"is the folder of a film; name that of a frame, such as {frames[0].parent}"
+        raise UsageError(f"{folder}: {text}{more}")
 
 
 def result_names(parameters: list[str]) -> list[str]:
@@ -117,20 +117,22 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
         described["ground"]["albedo"] = {"file": albedo} if isinstance(albedo, str) else albedo
     for section in described["views"]:
         camera, owner = section["camera"], f"views.{section['name']}."
-        found = {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
-        if "camera" in found:
+        of_view = {
+            n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)
+        }
+        if "camera" in of_view:
             for key in ("origin", "target", "up"):
                 camera.pop(key, None)
-            camera |= found["camera"]
-        if "focal" in found:
-            camera["fov"] = 2 * math.degrees(math.atan(0.5 / found["focal"]))
-        if "principal_point" in found:
-            camera["principal_point"] = found["principal_point"]
-        if "distortion" in found:
+            camera |= of_view["camera"]
+        if "focal" in of_view:
+            camera["fov"] = 2 * math.degrees(math.atan(0.5 / of_view["focal"]))
+        if "principal_point" in of_view:
+            camera["principal_point"] = of_view["principal_point"]
+        if "distortion" in of_view:
             model = camera["distortion"]["type"]
-            coefficients = zip(LENSES[model], found["distortion"], strict=True)
+            coefficients = zip(LENSES[model], of_view["distortion"], strict=True)
             camera["distortion"] = {"type": model} | dict(coefficients)
-        section.update({key: found[key] for key in RESPONSE if key in found})
+        section.update({key: of_view[key] for key in RESPONSE if key in of_view})
 
 
 def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:

@@ -157,17 +157,17 @@ class RunFolder(Checkpoints):
         if isinstance(run, Reconstruction) and run.iteration:
             start = monotonic()
             if start >= self.next_page:
-                found = find_results(run)
+                findings = find_results(run)
                 summary = _summary(run) | {"ended": GOES_ON}
-                self._report(run, found, summary | {"views": found.quality, "diagnoses": []})
+                self._report(run, findings, summary | {"views": findings.quality, "diagnoses": []})
                 seconds = monotonic() - start
                 self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
 
-    def _report(self, run: Reconstruction, found: Findings, summary: Mapping[str, Any]) -> None:
+    def _report(self, run: Reconstruction, findings: Findings, summary: Mapping[str, Any]) -> None:
         rows = self.log.rows(run.iteration)
-        numbers = list_numbers(run.parameters, run.problem.scene, found.scene)
+        numbers = list_numbers(run.parameters, run.problem.scene, findings.scene)
         path = self.path / REPORT
-        write_run_report(path, found, rows, summary, self.environment, numbers)
+        write_run_report(path, findings, rows, summary, self.environment, numbers)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -176,22 +176,22 @@ class RunFolder(Checkpoints):
     def finish(self, run: Reconstruction, progress: Progress) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        found = find_results(run, progress)
-        scene = found.scene
+        findings = find_results(run, progress)
+        scene = findings.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
         values = {name: self._store(scene, name) for name in stored}
         dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
-        self._pictures(found, "")
+        self._pictures(findings, "")
         rows = self.log.rows(run.iteration)
-        summary, support = _summary(run) | {"views": found.quality}, run.problem.support
-        results = scene, found.images, found.quality, rows
+        summary, support = _summary(run) | {"views": findings.quality}, run.problem.support
+        results = scene, findings.images, findings.quality, rows
         summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
-        seen = [one["registered"] for one in found.quality.values() if "registered" in one]
+        seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
-            summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
-        self._report(run, found, summary)
+            summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
+        self._report(run, findings, summary)
         write_json(self.path / SUMMARY, summary)
         return summary
 
@@ -227,13 +227,13 @@ class RunFolder(Checkpoints):
                     parameters[f"views.{view.name}.{key}"] = value.tolist()
         return parameters
 
-    def _pictures(self, found: Findings, mark: str) -> None:
+    def _pictures(self, findings: Findings, mark: str) -> None:
         folder = self.path / "previews"
-        for name, value in fields_of(found.scene).items():
+        for name, value in fields_of(findings.scene).items():
             write_preview(folder / f"{name}.slices{mark}.png", slices(value))
-        for view in found.scene.views:
+        for view in findings.scene.views:
             if view.image is not None:
-                shown = comparison(view.image, found.images[view.name])
+                shown = comparison(view.image, findings.images[view.name])
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 

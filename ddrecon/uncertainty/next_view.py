@@ -35,9 +35,9 @@ def rank_views(scene: Scene) -> list[dict[str, Any]]:
         angle = _nearest(_way_to(view.camera, scene), taken)
         matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
         ranked.append({"name": view.name, "angle": angle, "matrix": matrix})
-    ranked.sort(key=lambda each: -each["angle"])
-    for each in ranked:
-        each["is_tied"] = each["angle"] >= TIED * ranked[0]["angle"]
+    ranked.sort(key=lambda candidate: -candidate["angle"])
+    for candidate in ranked:
+        candidate["is_tied"] = candidate["angle"] >= TIED * ranked[0]["angle"]
     return ranked
 
 
@@ -48,7 +48,9 @@ def _way_to(camera: Camera, scene: Scene) -> Tensor:
     return camera.pose[:, 3] - camera.pose.new_tensor(scene.volume.grid.center_xyz)
 
 
-def _nearest(way: Tensor, others: Sequence[Tensor]) -> float:
-    """The angle [degrees] between `way` and the nearest of the `others`."""
-    cosines = torch.stack([torch.cosine_similarity(way, other, 0) for other in others])
+def _nearest(direction: Tensor, directions: Sequence[Tensor]) -> float:
+    """The angle [degrees] between `direction` and the nearest of `directions`."""
+    cosines = torch.stack(
+        [torch.cosine_similarity(direction, other_direction, 0) for other_direction in directions]
+    )
     return math.degrees(math.acos(min(float(cosines.max()), 1.0)))

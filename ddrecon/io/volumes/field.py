@@ -77,7 +77,7 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
         legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
         raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")
     values = as_float32(values)
-    for is_legal, what in (
+    for is_legal, flaw in (
         (np.isfinite(values), "NaN or infinite"),
         ((values >= 0) | (name in SIGNED), "negative"),
     ):
@@ -85,7 +85,7 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
             z, y, x = np.argwhere(~is_legal)[0, :3]
             count = np.count_nonzero(~is_legal)
             where = f"cell (x, y, z) = ({x}, {y}, {z}) ({count} such values)"
-            raise FormatError(path, f"{name} is {what} at {where}; clean it first")
+            raise FormatError(path, f"{name} is {flaw} at {where}; clean it first")
     if bounds is not None and not (
         bounds.shape == (2, 3) and np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()
     ):

@@ -286,7 +286,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
         const F* const* fields = given.fields + PART * L::CHANNELS;
         const long long offset = slice(n);
-#if !defined(__CUDA_ARCH__)
+#if !IS_GPU
         if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
             if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
                 for (int r = 0; r < node.runs.count; ++r) {
