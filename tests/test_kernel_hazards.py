@@ -18,7 +18,7 @@ from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
