@@ -24,7 +24,7 @@ CHOICES = ("auto", *ENGINES)
 TORCH_ALONE: dict[str, frozenset[str]] = {
     "view rays": frozenset(),
     "light": frozenset(),
-    "diffusion": frozenset({"gpu", "periodic", "printed", "flux_limited"}),
+    "diffusion": frozenset({"printed", "flux_limited"}),
     "transport rounds": frozenset({"gpu", "periodic", "refracting"}),
 }
 """Each part of the renderer, and the traits of a scene with any of which torch runs it."""

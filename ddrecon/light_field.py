@@ -21,7 +21,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
-from ddrecon.diffusion.solvers.multigrid import name_kernels, solve_by_multigrid
+from ddrecon.diffusion.solve import name_kernels, solve_by_multigrid
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import AmbientLight
 from ddrecon.light.moments import Cut, add, cut, weigh
@@ -167,8 +167,7 @@ def _scatter_light(
 
     `unscattered` are phi [K, C, z, y, x] of light besides that of `lights`.
     """
-    if not medium.grid.periodic:
-        name_kernels(medium.extinction.field)
+    name_kernels(medium.extinction.field)
     # Q0 and Q1 are of light not yet scattered; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)

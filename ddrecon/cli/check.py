@@ -59,7 +59,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
             with nullcontext() if density.support else suppress(SceneError):
                 support = find_support(train, replace(settings, parameters={"density": auto}))
                 if support is not None and supports:
-                    # Of a film the first pictures alone: all take more memory than there is.
+                    # A film keeps the pictures of its first frame: all take too much memory.
                     views = [View(view.name, view.camera) for view in support.views]
                     support = replace(support, views=views)
                 supports += [] if support is None else [support]

@@ -40,7 +40,7 @@ from ddrecon.variables.kinds import kind_of
 SHARE = 6
 """A frame that begins with another makes so many times fewer iterations: the last of its run."""
 FINAL_RATE = 0.05
-"""To what part of their value its learning rates fall; with larger ones films flicker more."""
+"""The part of their value to which learning rates fall; with a larger one films flicker more."""
 KEPT = 0.2
 """It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
 FARTHEST = 3
@@ -159,7 +159,7 @@ class Film:
         for frame in (number, other):
             fields = _fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
-            # Of what has colors their mean.
+            # Colors are averaged.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
             sums.append(torch.stack(values).sum(0))
         return find_flow(*sums) / (other - number)

@@ -152,7 +152,7 @@ def advance(
     total = None if run.schedule.is_auto else run.schedule.most
     form, settings = SHORT if total else None, bar_settings(is_quiet)
     bar = tqdm(total=total, initial=run.iteration, desc=title, bar_format=form, **settings)
-    # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
+    # Deferred: torchrun kills all ranks when one ends, and must not tear a checkpoint.
     with defer_interrupt() as asked:
         try:
             with bar:
@@ -173,9 +173,9 @@ def advance(
 
 
 def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list[str]:
-    """The `summary` of a run that is done, in `folder`, as lines; all of it took so many `seconds`.
+    """The `summary` of a finished run in `folder`, as lines; this process took `seconds`.
 
-    Those of its iterations count what was done before it was resumed, too.
+    The seconds of iterations include those before a resume.
     """
     line = (
         f"{summary['iterations']} iterations in {summary['seconds']:.1f} s, and {seconds:.1f} s "

@@ -36,7 +36,7 @@ GRADIENT = ".gradient"
 AT_REST = 0.01
 """Light that a transport round changes by a smaller part has come to rest."""
 FEW = 12
-"""Of more views only the first and the last are printed."""
+"""Where there are more views, only the first and the last are printed."""
 PARTS = (".reduced", ".single", ".multiple")
 
 
@@ -150,7 +150,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
 def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[str]:
     """What `render` prints of its `report`: files, quality and time of each view.
 
-    Of more than a few views, and of several if it `is_quiet`, only the first and the last.
+    More than `FEW` views, or two if it `is_quiet`, are cut to the first and the last.
     """
     lines = []
     for name, files in report["files"].items():
@@ -174,7 +174,7 @@ def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[s
 def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
     """How many transport rounds there were, and whether light has come to rest in them (E7.3).
 
-    That is where the last one changed it by less than the `tolerance`, or `AT_REST`.
+    It has where the last round changed light by less than the `tolerance`, or `AT_REST`.
     """
     if residual < (tolerance or AT_REST):
         verdict = "at rest"

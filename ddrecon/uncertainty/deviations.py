@@ -21,10 +21,10 @@ from ddrecon.variables.kinds import split_name
 from ddrecon.variables.values import component_names
 
 WITHIN = 0.68
-"""The part of cells that is to be within one deviation."""
+"""The share of cells within one deviation."""
 SHORT = 1.55
-"""How many times as large errors are as in experiments, whose volumes lack what no reconstruction
-shows: as measured where the truth was known (docs/uncertainty.md)."""
+"""The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
+lack what no reconstruction shows (docs/uncertainty.md)."""
 EMPTY = 0.02
 """Cells of less than this part of the largest are empty."""
 WIDTH = 3
@@ -70,7 +70,7 @@ class Field:
 
     @cached_property
     def factors(self) -> dict[str, float]:
-        """Of each class how large, in spreads, two thirds of the experiments' errors are."""
+        """The size, in spreads, that two thirds of the experiments' errors keep, by class."""
         sizes = torch.stack(self.errors).abs() / self.spread()
         smoke = self.is_smoke
         return {n: _find_within(sizes[:, cells & smoke]) for n, cells in self.classes.items()}
@@ -81,7 +81,7 @@ class Field:
         return self.deviation_but(None) if self.errors else self.left.sqrt()
 
     def deviation_but(self, but: int | None) -> Tensor:
-        """It by all experiments `but` one. Where pictures tell nothing, it is what they leave."""
+        """The deviation by all experiments `but` one; unseen cells have at least that of noise."""
         spread, deviation = self.spread(but), self.left.sqrt()
         for name, cells in self.classes.items():
             by_errors = SHORT * self.factors[name] * spread
@@ -157,7 +157,7 @@ class Deviations:
                 value = cell * float(field.value.sum())
                 numbers[f"mass of {name}"] = _with_deviation(value, cell * sums)
         for p in self.tabled:
-            # Of one kind, all views' numbers err alike, and so do all entries of any other.
+            # All views' numbers of one kind err alike, and so do all entries of other numbers.
             alike = [q for q in self.tabled if q.view is not None and q.key == p.key]
             stacked = [torch.stack([e[q.name].flatten() for q in alike or [p]]) for e in errors]
             for at, name in enumerate(_entry_names(p)):

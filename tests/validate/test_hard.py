@@ -9,8 +9,8 @@ import torch
 from media import make_camera, make_scene, random_values
 from torch import Tensor
 
+from ddrecon.diffusion import solve
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solvers import multigrid
 from ddrecon.lighting import solve_light
 from ddrecon.picture import render
 from ddrecon.validate import hard
@@ -53,7 +53,7 @@ def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPat
 
 def test_a_solve_that_gives_up_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(TOLERANCE, torch.float32, 1e-30)
-    monkeypatch.setattr(multigrid, "MAX_ITERATIONS", 8)
+    monkeypatch.setattr(solve, "MAX_ITERATIONS", 8)
     result = run_case("small", SMALL, CPU)
     assert "did not reach its tolerance" in result.failures()[0]
     assert hard.describe([result])["passed"] is False and "did not reach" in hard.table([result])[2]
