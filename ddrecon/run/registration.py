@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, project
+from ddrecon.light_field import LightField
 from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import fit_held_out
-from ddrecon.renderer import LightField, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import pose_rate
 from ddrecon.variables.values import extinction_of, with_values

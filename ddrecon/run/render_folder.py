@@ -16,11 +16,13 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
 from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
+from ddrecon.light_field import LightField, fluence_of
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.levels import resample
+from ddrecon.picture import view_components, view_picture
 from ddrecon.progress import Progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
-from ddrecon.renderer import LightField, fluence_of, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene, View

@@ -7,13 +7,14 @@ import torch
 from media import make_scene, random_values
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import angle_of
-from ddrecon.renderer import render, solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 

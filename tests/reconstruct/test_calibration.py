@@ -11,10 +11,10 @@ from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.picture import render
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.renderer import render
 from ddrecon.scene import View
 from ddrecon.settings import OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty.deviations import RATIO, Deviations, Field
