@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light_field import LightField
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.reconstruct.shares import agree_on, own_views, sum_present
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
@@ -58,14 +60,17 @@ def differentiate(
     outside = {name: value for name, value in values.items() if not is_of_volume(name)}
     inputs = [*values.values(), *cut.leaves]
     sums: list[Tensor | None] = [None] * len(inputs)
-    images, loss = list[Tensor](), cut.light_field.diffuse.mean.new_zeros(())
+    images, loss = list[Tensor](), cut.light_field.diffuse.new_zeros(())
+    added = set[int]()
     for name in own_views(scene, names):
         # Views share what is made of values: so that each has a graph of its own, it is made anew.
         world = with_values(scene, outside)
         image, view_loss, bars = differentiate_view(cut.light_field, world, name, loss_of, inputs)
         images.append(image)
-        loss, sums = loss + view_loss, _add(sums, bars)
-    total, *sums = sum_found([loss, *sums], [loss, *inputs])
+        loss = loss + view_loss
+        _accumulate(sums, bars, added)
+        del bars
+    total, *sums = sum_present([loss, *sums], [loss, *inputs])
     direct, leaf_bars, tensors = sums[: len(values)], sums[len(values) :], cut.tensors
     # Only `tensors` holds the light field on the way back: its memory is free once it was of use.
     del cut, inputs, sums
@@ -129,11 +134,30 @@ def follow_back(
     return torch.autograd.grad(product, values, allow_unused=True, retain_graph=not is_last)
 
 
+def _accumulate(
+    sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]
+) -> None:
+    """Adds `bars` to `sums`, entry by entry; None is zero.
+
+    In place where a sum is one of ours, as those numbered `added` are: autograd may hand out one
+    tensor for two inputs.
+    """
+    for i, bar in enumerate(bars):
+        known = sums[i]
+        if known is None or bar is None:
+            sums[i] = bar if known is None else known
+        elif i in added:
+            known += bar
+        else:
+            sums[i] = known + bar
+            added.add(i)
+
+
 def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
     """Entry by entry; None is zero."""
     return [
-        one if other is None else other if one is None else one + other
-        for one, other in zip(sums, more, strict=True)
+        total if addend is None else addend if total is None else total + addend
+        for total, addend in zip(sums, more, strict=True)
     ]
 
 
@@ -145,16 +169,16 @@ def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
     if isinstance(record, Tensor):
         if not record.requires_grad:
             return record
-        known = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
-        if not known:
+        existing = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
+        if not existing:
             tensors.append(record)
             leaves.append(record.detach().requires_grad_())
-        return known[0] if known else leaves[-1]
+        return existing[0] if existing else leaves[-1]
     if isinstance(record, tuple):
         return tuple(_cut(entry, tensors, leaves) for entry in record)
     if is_dataclass(record) and not isinstance(record, type):
-        parts = {part.name: getattr(record, part.name) for part in fields(record)}
-        return replace(record, **{n: _cut(part, tensors, leaves) for n, part in parts.items()})
+        values = {field.name: getattr(record, field.name) for field in fields(record)}
+        return replace(record, **{n: _cut(field, tensors, leaves) for n, field in values.items()})
     return record
 
 

@@ -218,7 +218,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     template <class Spot> void spread_to_cells(
         const Spot& spot, const Runs<F>& runs, long long offset, const V* v_bar,
         const V* bend_bar) const {
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
         for (int c = 0; c < L::CHANNELS; ++c)
             if (bars.fields[c])
                 spread_place(

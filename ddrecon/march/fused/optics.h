@@ -209,7 +209,7 @@ template <class F, int TERMS, bool IS_STEEP> struct Rungs {
         angle.weigh(STEP, weights[1]);
         if (HAS_SLOPES) rung.weigh_slopes(F(1), weights[2]);
         if (TURNS) angle.weigh_slopes(STEP, weights[3]);
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
         for (int k = 0; k < TERMS; ++k) {
             const auto found =
                 add<HAS_SLOPES, TURNS>(table + row(rung, angle, 0) * TERMS + k, weights, 0);

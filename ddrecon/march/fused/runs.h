@@ -10,7 +10,7 @@ namespace ddrecon {
 // Of more runs each lane finds its values itself.
 constexpr int MOST_RUNS = 5;
 
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
 template <class F> struct Runs {
     template <class N> INLINE void find(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
 };
@@ -110,7 +110,7 @@ template <class F> struct Window {
 //         row p    .  .  .  .  .  .  .
 //               first column
 
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
 template <class F> INLINE void spread_place(
     F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
     const F ya = y.a, xa = x.a;
