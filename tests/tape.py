@@ -65,10 +65,13 @@ def record(computation: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
     computation()
     tape, call = Tape(), launch._call
 
-    def call_again(*arguments: Any) -> None:
-        tape.alive.append(arguments)
-        tape.steps.append(lambda: call(*arguments))
-        call(*arguments)
+    def call_again(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
+        # What a kernel is given may be changed for its next launch.
+        first, *records = given
+        copies = [type(one).from_buffer_copy(one) for one in records]
+        tape.alive.append(given)
+        tape.steps.append(lambda: call(kernel, device, items, [first, *copies], stream))
+        call(kernel, device, items, given, stream)
 
     with tape, patch.object(launch, "_call", call_again):
         result = computation()

@@ -22,6 +22,7 @@ from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import for_channels, thinness
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.remember import remember
 
 GRAZING = 0.1
@@ -61,7 +62,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
                 outside = torch.lerp(outside, line, for_channels(share, len(field)))
             else:
                 lit = shine_through(emission.beams[int(name.split()[1])], grid)
-                shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
+                shade = _shade(grid, 1 - lit * constant(tuple(map(float, is_line)), lit))
                 outside = shade * _limit(outside, line, extinction.mass_bound)
         lines = is_line if is_light else NOWHERE
         lacks = _find_lacks(emission, is_line) if name == "diffuse" else [None] * len(FACES)

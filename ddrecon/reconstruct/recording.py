@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -28,13 +29,14 @@ from ddrecon.reconstruct.gradients import (
     follow_light,
 )
 from ddrecon.reconstruct.objective import Comparison
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
 
 LOG = logging.getLogger(engine.LOG)
 SPARE = 1
 """Iterations of a solve beyond those it took last: tolerances fall as images come closer."""
+LossOf = Callable[[View, Tensor], Tensor]
 Record = Callable[[Callable[[], Any]], tuple[Any, Callable[[], object]]]
 """Returns the result of a computation and a function that computes it again, in place."""
 
@@ -72,8 +74,9 @@ class Recording:
         self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
     ) -> Differentiated | None:
         """The derivative by `values`; None where a solve needs more iterations than it makes."""
+        # By `data`, whose changes nobody counts: the way back was recorded with other numbers.
         for name, value in self.values.items():
-            value.detach().copy_(values[name].detach())
+            value.data.copy_(values[name].detach())
         for key, guess in self.guesses.items():
             guess.copy_(memory.last[key])
         programs = []
@@ -82,7 +85,8 @@ class Recording:
             if key not in self.views:
                 # Views are recorded in light that there can be.
                 self.light.replay()
-                self.views[key] = Program(*self.record(lambda: self._view(*key, compared)))
+                look = partial(self._view, view.name, compared.loss_of)
+                self.views[key] = Program(*self.record(look))
             programs.append(self.views[key])
         if self.back is None:
             self.back = Program(*self.record(self._follow_back))
@@ -121,12 +125,12 @@ class Recording:
         self.inputs = [*self.values.values(), *self.cut.leaves]
         self.sums = [torch.zeros_like(tensor) for tensor in self.inputs]
 
-    def _view(self, name: str, _share: float, compared: Comparison) -> tuple[Tensor, Tensor]:
+    def _view(self, name: str, loss_of: LossOf) -> tuple[Tensor, Tensor]:
         # What is made of values is made anew, so that each view has a graph of its own.
         outside = {n: value for n, value in self.values.items() if not is_of_volume(n)}
         world = with_values(self.scene, outside)
         image, loss, bars = differentiate_view(
-            self.cut.light_field, world, name, compared.loss_of, self.inputs
+            self.cut.light_field, world, name, loss_of, self.inputs
         )
         for total, bar in zip(self.sums, bars, strict=True):
             if bar is not None:
@@ -156,9 +160,9 @@ class Replays:
         self.scene, self.record = scene, record
         self.recording: Recording | None = None
         settings = scene.diffusion
-        if rank_count() == 1 and (settings.model, settings.scheme) in _FIXED:
-            if scene.volume.density.is_cuda:
-                self.record = record_graph
+        is_fixed = (settings.model, settings.scheme) in _FIXED and rank_count() == 1
+        if is_fixed and scene.volume.density.is_cuda:
+            self.record = record_graph
 
     def differentiate(
         self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory

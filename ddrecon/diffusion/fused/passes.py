@@ -31,6 +31,8 @@ long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u
 F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
+TOGETHER = 400
+"""Numbers of a table that one launch writes: arguments of a kernel have at most 4 KB."""
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
@@ -53,8 +55,9 @@ class KernelPasses(Passes):
     points to.
     """
 
-    def __init__(self, like: Tensor, colors: int = 1):
+    def __init__(self, like: Tensor, colors: int = 1, is_fixed: bool = False):
         self.like, self.colors, self.is_by_cell = like, colors, like.is_cuda
+        self.is_fixed = is_fixed
         self.size, self.rows, self.kept = 0, list[dict[str, int]](), list[Tensor]()
 
     def new_vector(self, shape: Sequence[int], *, has_twin: bool = False) -> Vector:
@@ -91,7 +94,7 @@ class KernelPasses(Passes):
 
     def run(self) -> None:
         kernel = prepare_kernel(8 * self.like.itemsize)
-        program = Program(self, kernel, self.like.new_empty(1))
+        program = Program(self, kernel, self.like.new_empty(1), self.is_fixed)
         program.launch(program.cut(0, len(self.rows)))
         self.rows.clear()
 
@@ -226,15 +229,41 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
     return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
 
 
-class Program:
-    """Passes in a table where kernels see it, and launches that do them on vectors in `work`."""
+def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
+    """`numbers` where `like` lies, handed over as arguments of launches, which a graph keeps."""
+    table = like.new_empty(len(numbers), dtype=torch.int64)
+    kernel = table_kernel()
+    for start in range(0, len(numbers), TOGETHER):
+        some = [*numbers[start : start + TOGETHER]]
+        padded = some + [0] * (TOGETHER - len(some))
+        kernel.launch(1, {"start": start, "count": len(some), "n": padded}, {"table": table})
+    return table
 
-    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor):
+
+@functools.cache
+def table_kernel() -> TextKernel:
+    """Writes numbers that it is given to a table."""
+    text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
+    given = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, given, "table")
+
+
+class Program:
+    """Passes in a table where kernels see it, and launches that do them on vectors in `work`.
+
+    `is_fixed`: for a graph, which cannot copy a table from a processor's memory.
+    """
+
+    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor, is_fixed: bool):
         self.rows, self.kept = [*passes.rows], [*passes.kept]
         names = [*entries_of(PASS)]
-        table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
+        numbers = [row.get(name, 0) for row in self.rows for name in names]
         # Without waiting: the numbers have left the processor's memory when this returns.
-        table = table.to(work.device, non_blocking=True)
+        table = (
+            _write_table(numbers, work)
+            if is_fixed
+            else torch.tensor(numbers).to(work.device, non_blocking=True)
+        )
         self.bound = kernel.bind({"table": table}, {"work": work})
         self.is_alone = not work.is_cuda and thread_count(work) == 1
         self.is_shared = work.is_cuda
@@ -298,7 +327,7 @@ def prepare(operator: Operator, is_read: bool = True) -> tuple[Operator, Hierarc
     z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
     loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
     operator = Operator((z, y, x), loss, operator.periodic)
-    return operator, Hierarchy.of(operator, KernelPasses(loss), is_read)
+    return operator, Hierarchy.of(operator, KernelPasses(loss, is_fixed=not is_read), is_read)
 
 
 def prepare_unread(operator: Operator) -> tuple[Operator, Hierarchy]:
@@ -311,7 +340,7 @@ class KernelCycle:
 
     def __init__(self, operator: Operator, source: Tensor, is_fixed: bool):
         operator, self.hierarchy = operator.once(prepare_unread if is_fixed else prepare)
-        passes = KernelPasses(source, len(source))
+        passes = KernelPasses(source, len(source), is_fixed)
         direction, residual = (passes.new_vector(source.shape[1:]) for _ in range(2))
         product = passes.product(operator, direction)
         u = self.hierarchy.cycle(passes, residual)
@@ -320,7 +349,7 @@ class KernelCycle:
             work[vector.place :][: source.numel()].view_as(source)
             for vector in (direction, residual, product, u)
         )
-        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work)
+        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work, is_fixed)
         self._first, self._others = (
             self._program.cut(*ends) for ends in ((0, 1), (1, len(passes.rows)))
         )
