@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light_field import LightField
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_present
-from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
@@ -86,14 +88,24 @@ def _differentiate_views(
     once; None is zero.
     """
     sums: list[Tensor | None] = [None] * len(inputs)
-    images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
+    owned = set[int]()
+    images, loss = list[Tensor](), light_field.diffuse.new_zeros(())
     for scene, name in worlds:
         view = scene.view(name)
         derivatives = scene.optimize.derivatives if scene.optimize else "all"
         image = view_picture(light_field, scene, view, derivatives)
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
-            sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
+            for i, bar in enumerate(torch.autograd.grad(view_loss, inputs, allow_unused=True)):
+                known = sums[i]
+                if known is None or bar is None:
+                    sums[i] = bar if known is None else known
+                elif i in owned:
+                    known += bar
+                else:
+                    # autograd may hand out one tensor for two inputs: what is added to is a sum
+                    sums[i] = known + bar
+                    owned.add(i)
         images.append(image.detach())
         loss = loss + view_loss.detach()
     return images, loss, sums

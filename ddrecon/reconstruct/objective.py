@@ -1,4 +1,4 @@
-"""What a reconstruction makes small: the views' losses plus penalties; and its images' PSNR."""
+"""The objective of a reconstruction: the views' losses plus penalties; and its images' PSNR."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.picture import render_each
 from ddrecon.ranks import sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import own_views
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
 from ddrecon.variables.values import variable_names, with_values
@@ -162,14 +162,14 @@ def fit_held_out(
     for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
         if not sizes.keys() >= set(keys):
             continue
-        # By least squares, weighed as the target's loss weighs small errors.
+        # Least squares, weighed as the target's loss weighs small errors.
         ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
         columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
         fixed = sum(response[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
         matrix, right = (
             (image * weight).double().cpu().flatten(-3) for image in (columns, target.image - fixed)
         )
-        # What a picture does not show, such as the exposure of black, is 0.
+        # A response that a picture does not show, such as the exposure of black, is 0.
         solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
         values = solution.to(light).split([sizes[key] for key in keys])
         fit = response | dict(zip(keys, values, strict=True))

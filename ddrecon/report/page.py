@@ -86,17 +86,15 @@ def section(heading: str, *blocks: str) -> str:
 
 
 def paragraph(text: str) -> str:
-    """A paragraph."""
     return f"<p>{escape(text)}</p>"
 
 
 def items(lines: Sequence[str]) -> str:
-    """A list of `lines`."""
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
 def warnings(lines: Sequence[str]) -> str:
-    """A list of `lines` that is not overlooked."""
+    """A list of `lines` that stands out."""
     return f'<div class="doubts">{items(lines)}</div>'
 
 
@@ -114,7 +112,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def versions(environment: Mapping[str, Any]) -> str:
-    """A table of what took part."""
     lists = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     return table(["", ""], [(name, " ".join(map(str, values))) for name, values in lists])
 
@@ -154,7 +151,6 @@ def scrub(figures: Sequence[str]) -> str:
 
 
 def captioned(element: str, caption: str) -> str:
-    """The `element` above `caption`."""
     return f"<figure>{element}<figcaption>{escape(caption)}</figcaption></figure>"
 
 

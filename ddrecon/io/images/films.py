@@ -96,7 +96,7 @@ def frame_times(path: Path) -> tuple[float, ...]:
 
 @lru_cache(maxsize=256)
 def _frame_times(path: Path, *_: int) -> tuple[float, ...]:
-    """By the packets of the film, none of which is decoded."""
+    """Times of all frames [s], from the film's packets, without decoding."""
     program = load_for_file("imageio_ffmpeg", path).get_ffmpeg_exe()
     film = [program, "-nostdin", "-f", FILMS[path.suffix.lower()], "-i", str(path), *STREAM]
     process = subprocess.run([*film, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
