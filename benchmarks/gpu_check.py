@@ -34,10 +34,10 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names, with_values
@@ -182,7 +182,7 @@ def results(path: Path, device: torch.device) -> dict[str, Tensor]:
         values["density"] = (0.2 + 0.6 * drawn).to(values["density"])
     with torch.no_grad():
         light = solve_light(with_values(scene, values), SolveMemory())
-    tensors = {"light": light.diffuse.mean}
+    tensors = {"light": light.diffuse[0]}
     if light.medium.emission is not None:
         tensors["emission"] = light.medium.emission
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}

@@ -32,7 +32,7 @@ from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
-WIDE = 8.0
+TOO_WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
@@ -50,7 +50,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
 
     Where it has no support it is as by `support: auto`, if pictures tell.
     """
-    found = list[Support]()
+    supports = list[Support]()
     for scene in frames:
         train, settings = select_views(scene, is_test=False), scene.optimize
         density = settings.parameters.get("density") if settings is not None else None
@@ -58,12 +58,12 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
             auto = replace(density, support=density.support or AUTO)
             with nullcontext() if density.support else suppress(SceneError):
                 support = find_support(train, replace(settings, parameters={"density": auto}))
-                if support is not None and found:
-                    # Of a film the first pictures alone: all take more memory than there is.
+                if support is not None and supports:
+                    # A film keeps the pictures of its first frame: all take too much memory.
                     views = [View(view.name, view.camera) for view in support.views]
                     support = replace(support, views=views)
-                found += [] if support is None else [support]
-    return found
+                supports += [] if support is None else [support]
+    return supports
 
 
 def asks_support(scene: Scene) -> bool:
@@ -153,7 +153,7 @@ def lines(report: dict[str, Any]) -> list[str]:
 
 def _advise_on_cells(width: float) -> str:
     """What to change where all views see cells at least so many pixels wide."""
-    if width < WIDE:
+    if width < TOO_WIDE:
         return ""
     return (
         f", which show less than the pictures: {CELL:g} would do, by smaller cells "

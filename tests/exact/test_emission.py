@@ -11,8 +11,9 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
+from ddrecon.lighting import solve_light
 from ddrecon.medium.black_body import WHITE, black_body_radiance
-from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
 
 GRID = Grid((6, 5, 7), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
@@ -61,7 +62,7 @@ def test_what_is_as_hot_as_its_surroundings_looks_like_them(
     density = 0.2 + random_values(*GRID.shape)
     scene = glowing(density, None, sigma_s=(5.0,), ambient=COLORS.tolist(), **more)
     scene.volume.black_body = COLORS
-    found = solve_light(scene, SolveMemory()).diffuse.mean
+    found = solve_light(scene, SolveMemory()).diffuse[0]
     torch.testing.assert_close(found, COLORS.view(3, 1, 1, 1).expand_as(found), rtol=1e-9, atol=0)
     image = render(scene)[0]
     torch.testing.assert_close(image, COLORS.view(3, 1, 1).expand_as(image), rtol=1e-9, atol=0)

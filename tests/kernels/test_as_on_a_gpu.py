@@ -13,7 +13,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.medium.phase_blend import TwoLobe
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, variable_names, with_values
@@ -27,8 +27,7 @@ SHAPE = (5, 6, 7)
 PACKAGE = Path(__file__).parents[2] / "ddrecon"
 MOVES = "camera", "focal", "principal_point", "direction", "position"
 """Ends of names of variables that move rays, beams and lamps."""
-OF_ROWS = {"cycle.h", "gradients.h", "levels.h", "prepare.h"}
-OF_ROWS |= {"given.h", "lines.h", "moments.h", "returning.h", "rows.h", "step.h"}
+OF_ROWS = {"given.h", "lines.h", "moments.h", "returning.h", "rows.h", "step.h"}
 """Headers whose items are rows and slices, on a processor alone."""
 
 

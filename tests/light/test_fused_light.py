@@ -14,7 +14,6 @@ from torch.autograd import forward_ad
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.shear import sum_masses
 from ddrecon.light.sky import decompose_lights
@@ -120,12 +119,8 @@ def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int)
     sky = sum_unscattered_sky(medium, lights, degree)
     assert sky is not None
 
-    def parts(moments: Moments) -> list[Tensor]:
-        higher = moments.spelled().higher
-        return [moments.mean, *(moments.flux or ()), *(() if higher is None else (higher,))]
-
     beams = follow_lights(medium, lights)
-    return [*(beam.mass for beam in beams), *parts(source), *parts(sky)]
+    return [*(beam.mass for beam in beams), source, sky]
 
 
 def gradients(scene: Scene, names: list[str], engine: str, degree: int) -> list[Tensor]:

@@ -10,9 +10,9 @@ from media import make_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.pairs import follow_pair
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.remaining import backward_fraction
-from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 
@@ -62,7 +62,7 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     beams = 4 * math.pi * (pair.along + pair.against)
     volume = medium.grid.extent[0] / 9
     received = (medium.absorption.value * beams).sum() * volume
-    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium).mean).sum()
+    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium)[0]).sum()
     # what leaves, by the closed form of E8.11 for all the depth
     beta = float(backward_fraction(medium)) * 6.0 / 6.5
     rate, depth = math.sqrt(1 - beta**2), 6.5 * float(density.mean())
