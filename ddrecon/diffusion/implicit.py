@@ -23,6 +23,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import Solution
 from ddrecon.numerics.autodiff import keep, run_plainly
+from ddrecon.numerics.reads import may_read
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,8 @@ class SolveMemory:
     """What solves remember between renders: last solutions, to start from, and a record of each.
 
     `last` is by kind and transport round. With `is_warm` False every solve starts from zero.
-    `iterations` are those of the last solve, likewise; where they are fixed (`is_fixed`), a solve
-    makes so many, and reads nothing: its residual is a tensor.
+    `iterations` are those of the last solve, likewise; where nothing may be read, a solve makes so
+    many.
     `tolerance_floor`: by kind, the tolerance below which nothing is gained; no solve goes below it,
     whatever it is asked for.
     """
@@ -54,7 +55,6 @@ class SolveMemory:
     records: list[SolveRecord] = field(default_factory=list)
     tolerance_floor: dict[str, float] = field(default_factory=dict)
     iterations: dict[tuple[str, int], int] = field(default_factory=dict)
-    is_fixed: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class SolverWithMemory:
             next_one = self.last_solution(kind, later=1)
             guess = None if next_one is None else -next_one
         memory, key = self.memory, (kind, self.round_index)
-        count = [memory.iterations[key]] if memory.is_fixed else []
+        count = [] if may_read() else [memory.iterations[key]]
         solution = self.solver(operator, source, guess, self.tolerance_of(kind), *count)
         self.remember(kind, solution, began)
         return solution.value
@@ -105,7 +105,7 @@ class SolverWithMemory:
         seconds = perf_counter() - began
         record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
         self.memory.records.append(record)
-        if not self.memory.is_fixed:
+        if may_read():
             self.memory.iterations[kind, self.round_index] = solution.iterations
         if self.memory.is_warm:
             # Without the graph that the solution is about to get.
@@ -139,9 +139,12 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
-        # E3.2: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
-        # several solves may share it, and with the last of them its memory is free again.
-        prepared, ctx.prepared = ctx.prepared, {}
+        # E3.2: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time,
+        # unless this is recorded: several solves may share it, and with the last of them its memory
+        # is free again.
+        prepared = ctx.prepared
+        if may_read():
+            ctx.prepared = {}
         operator = ctx.assemble(prepared, *tensors).linearized(u)
         adjoint = ctx.solve("adjoint", operator.transposed(), u_bar)
         del prepared, operator

@@ -68,9 +68,8 @@ def name_kernels(like: Tensor) -> None:
 class TensorCycle:
     """Products and V-cycles of an operator, of vectors like `source`, by torch's operations."""
 
-    def __init__(self, operator: Operator, source: Tensor, is_fixed: bool):
-        self._operator = operator
-        self.hierarchy = operator.once(prepare_unread if is_fixed else prepare)
+    def __init__(self, operator: Operator, source: Tensor):
+        self._operator, self.hierarchy = operator, operator.once(prepare)
         self.direction, self.residual = (torch.empty_like(source) for _ in range(2))
 
     def product(self) -> Tensor:
@@ -82,24 +81,19 @@ class TensorCycle:
         return self.hierarchy.cycle(Passes(), self.residual)
 
 
-def prepare(operator: Operator, is_read: bool = True) -> Hierarchy:
+def prepare(operator: Operator) -> Hierarchy:
     """The grids of `operator`, by torch's operations."""
     # Of a copy: what is prepared for an operator does not hold that operator.
-    return Hierarchy.of(replace(operator, prepared={}), Passes(), is_read)
+    return Hierarchy.of(replace(operator, prepared={}), Passes())
 
 
-def prepare_unread(operator: Operator) -> Hierarchy:
-    """The same, coarsened as grids of its shape were last: without a read."""
-    return prepare(operator, is_read=False)
-
-
-def _cycle_of(operator: Operator, source: Tensor, is_fixed: bool) -> Any:
-    """What multiplies and preconditions, on the engine at hand; `is_fixed`: without a read."""
+def _cycle_of(operator: Operator, source: Tensor) -> Any:
+    """What multiplies and preconditions, on the engine at hand."""
     if not has_kernels("diffusion", gpu=source.is_cuda):
-        return TensorCycle(operator, source, is_fixed)
+        return TensorCycle(operator, source)
     from ddrecon.diffusion.fused.passes import KernelCycle  # imports Warp
 
-    return KernelCycle(operator, source, is_fixed)
+    return KernelCycle(operator, source)
 
 
 def _iterate(
@@ -110,36 +104,43 @@ def _iterate(
     count: int | None,
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
-    is_fixed, most = count is not None, MAX_ITERATIONS if count is None else count
-    cycle, tiny = _cycle_of(operator, source, is_fixed), torch.finfo(source.dtype).tiny
-    inverse = cycle.hierarchy.inverse_diagonal
-    source_norm = _inner(source * inverse, source).sqrt().clamp(min=tiny)
-    u, direction, residual = torch.zeros_like(source), cycle.direction.zero_(), cycle.residual
+    cycle, tiny = _cycle_of(operator, source), torch.finfo(source.dtype).tiny
+    inverse, scratch = cycle.hierarchy.inverse_diagonal, torch.empty_like(source)
+    u, direction, residual = torch.zeros_like(source), cycle.direction, cycle.residual
+
+    def inner(a: Tensor, b: Tensor) -> Tensor:
+        """The inner product of each color, [C, 1, 1, 1]."""
+        return torch.mul(a, b, out=scratch).sum((1, 2, 3), keepdim=True)
+
+    def norm(a: Tensor) -> Tensor:
+        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True).sqrt()
+
+    source_norm = norm(source).clamp(min=tiny)
     residual.copy_(source)
     if guess is not None and guess.shape == source.shape:
+        direction.copy_(guess)
+        left = source - cycle.product()
         # A guess that is worse than zero is not used.
-        left = source - operator.apply(guess)
-        helps = _inner(left * inverse, left).sqrt() <= source_norm
+        helps = norm(left) <= source_norm
         u = torch.where(helps, guess, u)
         residual.copy_(torch.where(helps, left, source))
+    direction.zero_()
     square, iteration = torch.ones_like(source_norm), 0
     while True:
-        relative = _inner(residual * inverse, residual).sqrt() / source_norm
-        worst = relative.max() if is_fixed else float(relative.max())
-        if iteration == most or not (is_fixed or worst > tolerance):
-            return Solution(u, iteration, worst)
+        relative = norm(residual) / source_norm
+        if iteration == count:
+            return Solution(u, iteration, relative.max())
+        if count is None:
+            worst = float(relative.max())
+            if not worst > tolerance or iteration == MAX_ITERATIONS:
+                return Solution(u, iteration, worst)
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative.double() > tolerance
         preconditioned = cycle.cycle()
-        previous, square = square, _inner(residual, preconditioned)
+        previous, square = square, inner(residual, preconditioned)
         direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
         product = cycle.product()
-        step = is_open * square / _inner(direction, product).clamp(min=tiny)
+        step = is_open * square / inner(direction, product).clamp(min=tiny)
         u.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1
-
-
-def _inner(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product per color, `[C, 1, 1, 1]`."""
-    return (a * b).sum((1, 2, 3), keepdim=True)

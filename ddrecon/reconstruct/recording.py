@@ -20,6 +20,7 @@ from torch import Tensor
 from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.kernels.graphs import record_graph
+from ddrecon.numerics.reads import without_reads
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct.gradients import (
     Differentiated,
@@ -58,15 +59,15 @@ class Recording:
     def __init__(
         self, scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory, record: Record
     ):
-        self.scene, self.record = scene, record
+        self.scene, self._record = scene, record
         self.values = {name: value.detach().clone() for name, value in values.items()}
         for name, value in values.items():
             self.values[name].requires_grad_(value.requires_grad)
         self.guesses = {key: solution.clone() for key, solution in memory.last.items()}
         counts = {key: count + SPARE for key, count in memory.iterations.items()}
-        self.memory = SolveMemory(memory.is_warm, iterations=counts, is_fixed=True)
+        self.memory = SolveMemory(memory.is_warm, iterations=counts)
         self.sums: list[Tensor] = []
-        self.light = Program(*record(self._follow_light))
+        self.light = self._recorded(self._follow_light)
         self.views: dict[tuple[str, float], Program] = {}
         self.back: Program | None = None
 
@@ -86,10 +87,10 @@ class Recording:
                 # Views are recorded in light that there can be.
                 self.light.replay()
                 look = partial(self._view, view.name, compared.loss_of)
-                self.views[key] = Program(*self.record(look))
+                self.views[key] = self._recorded(look)
             programs.append(self.views[key])
         if self.back is None:
-            self.back = Program(*self.record(self._follow_back))
+            self.back = self._recorded(self._follow_back)
         # The light's program sets the sums to zero, to which views add.
         self.light.replay()
         images, loss = list[Tensor](), self.sums[0].new_zeros(())
@@ -105,6 +106,10 @@ class Recording:
         gradients = {name: bar.clone() for name, bar in self.back.result.items()}
         memory.last |= {key: solution.clone() for key, solution in self.memory.last.items()}
         return Differentiated(images, loss, gradients)
+
+    def _recorded(self, computation: Callable[[], Any]) -> Program:
+        with without_reads():
+            return Program(*self._record(computation))
 
     def _is_solved(self, memory: SolveMemory) -> bool:
         """Whether solves are as exact as `memory` asks; one read. Their records are kept there."""

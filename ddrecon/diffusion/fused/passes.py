@@ -18,7 +18,8 @@ from torch import Tensor
 from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
-from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
@@ -32,7 +33,7 @@ F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
-"""Numbers of a table that one launch writes: arguments of a kernel have at most 4 KB."""
+"""Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
@@ -55,9 +56,8 @@ class KernelPasses(Passes):
     points to.
     """
 
-    def __init__(self, like: Tensor, colors: int = 1, is_fixed: bool = False):
+    def __init__(self, like: Tensor, colors: int = 1):
         self.like, self.colors, self.is_by_cell = like, colors, like.is_cuda
-        self.is_fixed = is_fixed
         self.size, self.rows, self.kept = 0, list[dict[str, int]](), list[Tensor]()
 
     def new_vector(self, shape: Sequence[int], *, has_twin: bool = False) -> Vector:
@@ -93,9 +93,8 @@ class KernelPasses(Passes):
         return matrix
 
     def run(self) -> None:
-        kernel = prepare_kernel(8 * self.like.itemsize)
-        program = Program(self, kernel, self.like.new_empty(1), self.is_fixed)
-        program.launch(program.cut(0, len(self.rows)))
+        program = Program(self, prepare_kernel(8 * self.like.itemsize))
+        launch(program.bind(self.like.new_empty(1)), program.cut(0, len(self.rows)))
         self.rows.clear()
 
     def product(self, operator: Operator, u: Vector) -> Vector:
@@ -230,13 +229,16 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
 
 
 def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
-    """`numbers` where `like` lies, handed over as arguments of launches, which a graph keeps."""
+    """`numbers` where `like` lies."""
+    if may_read():
+        # Without waiting: the numbers have left the processor's memory when this returns.
+        return torch.tensor(numbers).to(like.device, non_blocking=True)
+    # A graph copies nothing from there; it keeps what kernels are given by value.
     table = like.new_empty(len(numbers), dtype=torch.int64)
-    kernel = table_kernel()
     for start in range(0, len(numbers), TOGETHER):
-        some = [*numbers[start : start + TOGETHER]]
-        padded = some + [0] * (TOGETHER - len(some))
-        kernel.launch(1, {"start": start, "count": len(some), "n": padded}, {"table": table})
+        row = [*numbers[start : start + TOGETHER]]
+        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, given, {"table": table})
     return table
 
 
@@ -249,24 +251,23 @@ def table_kernel() -> TextKernel:
 
 
 class Program:
-    """Passes in a table where kernels see it, and launches that do them on vectors in `work`.
+    """A table of passes where kernels see it, with the launches that do them.
 
-    `is_fixed`: for a graph, which cannot copy a table from a processor's memory.
+    `kept`: what the table points to; `size`: how many numbers vectors take.
     """
 
-    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor, is_fixed: bool):
-        self.rows, self.kept = [*passes.rows], [*passes.kept]
+    def __init__(self, passes: KernelPasses, kernel: TextKernel):
+        self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
+        self.kernel, self.is_on_gpu = kernel, passes.like.is_cuda
         names = [*entries_of(PASS)]
-        numbers = [row.get(name, 0) for row in self.rows for name in names]
-        # Without waiting: the numbers have left the processor's memory when this returns.
-        table = (
-            _write_table(numbers, work)
-            if is_fixed
-            else torch.tensor(numbers).to(work.device, non_blocking=True)
+        self.table = _write_table(
+            [row.get(name, 0) for row in self.rows for name in names], passes.like
         )
-        self.bound = kernel.bind({"table": table}, {"work": work})
-        self.is_alone = not work.is_cuda and thread_count(work) == 1
-        self.is_shared = work.is_cuda
+        self.is_alone = not self.is_on_gpu and thread_count(passes.like) == 1
+
+    def bind(self, work: Tensor) -> Bound:
+        """The kernel, for vectors in `work`."""
+        return self.kernel.bind({"table": self.table}, {"work": work})
 
     def cut(self, first: int, last: int) -> list[tuple[int, int, int]]:
         """The launches that do passes `first` to `last`: items, the first pass, the one after it.
@@ -274,20 +275,20 @@ class Program:
         One item may be several passes: then a thread does them all.
         """
         launches = []
-        for number in range(first, last):
-            row = self.rows[number]
+        for number, row in enumerate(self.rows[first:last], first):
             is_large = row["items"] * row["width"] > SMALL and not self.is_alone
-            if self.is_shared or is_large:
+            if self.is_on_gpu or is_large:
                 if first < number:
                     launches.append((1, first, number))
                 launches.append((row["items"], number, number + 1))
                 first = number + 1
         return [*launches, *([(1, first, last)] if first < last else [])]
 
-    def launch(self, launches: Sequence[tuple[int, int, int]]) -> None:
-        """Does what was `cut`."""
-        for items, begin, end in launches:
-            self.bound.launch(items, begin=begin, end=end, is_whole=items == 1)
+
+def launch(bound: Bound, launches: Sequence[tuple[int, int, int]]) -> None:
+    """Does the passes of a `bound` program, as it was `cut`."""
+    for items, begin, end in launches:
+        bound.launch(items, begin=begin, end=end, is_whole=items == 1)
 
 
 def passes_kernel(name: str, bits: int) -> TextKernel:
@@ -321,45 +322,49 @@ def name_kernels(like: Tensor) -> None:
         launch_later(kernel(8 * like.itemsize).kernel, like)
 
 
-def prepare(operator: Operator, is_read: bool = True) -> tuple[Operator, Hierarchy]:
-    """`operator` as kernels take it, and its grids."""
-    faces = max(map(len, operator.conductances))
-    z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
-    loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
-    operator = Operator((z, y, x), loss, operator.periodic)
-    return operator, Hierarchy.of(operator, KernelPasses(loss, is_fixed=not is_read), is_read)
+class KernelGrids:
+    """The grids of an operator, and the program of products and cycles for each count of colors."""
 
+    def __init__(self, operator: Operator):
+        faces = max(map(len, operator.conductances))
+        z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
+        loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
+        self.operator = Operator((z, y, x), loss, operator.periodic)
+        self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss))
+        self.programs: dict[int, tuple[Program, list[Vector]]] = {}
 
-def prepare_unread(operator: Operator) -> tuple[Operator, Hierarchy]:
-    """The same, coarsened as grids of its shape were last: without a read."""
-    return prepare(operator, is_read=False)
+    def program(self, colors: int) -> tuple[Program, list[Vector]]:
+        """The program, a product before a cycle; direction and residual, product and solution."""
+        if colors not in self.programs:
+            loss = self.operator.loss
+            passes = KernelPasses(loss, colors)
+            given = [passes.new_vector(loss.shape[1:]) for _ in range(2)]
+            product = passes.product(self.operator, given[0])
+            solution = self.hierarchy.cycle(passes, given[1])
+            program = Program(passes, cycle_kernel(8 * loss.itemsize))
+            self.programs[colors] = program, [*given, product, solution]
+        return self.programs[colors]
 
 
 class KernelCycle:
     """Products and V-cycles of an operator, of vectors like `source`, by kernels."""
 
-    def __init__(self, operator: Operator, source: Tensor, is_fixed: bool):
-        operator, self.hierarchy = operator.once(prepare_unread if is_fixed else prepare)
-        passes = KernelPasses(source, len(source), is_fixed)
-        direction, residual = (passes.new_vector(source.shape[1:]) for _ in range(2))
-        product = passes.product(operator, direction)
-        u = self.hierarchy.cycle(passes, residual)
-        work = source.new_empty(passes.size)
-        self.direction, self.residual, self._product, self._u = (
-            work[vector.place :][: source.numel()].view_as(source)
-            for vector in (direction, residual, product, u)
-        )
-        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work, is_fixed)
-        self._first, self._others = (
-            self._program.cut(*ends) for ends in ((0, 1), (1, len(passes.rows)))
+    def __init__(self, operator: Operator, source: Tensor):
+        grids = operator.once(KernelGrids)
+        program, vectors = grids.program(len(source))
+        work = source.new_empty(program.size)
+        self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
+        self._first, self._others = program.cut(0, 1), program.cut(1, len(program.rows))
+        self.direction, self.residual, self._product, self._solution = (
+            work[vector.place :][: source.numel()].view_as(source) for vector in vectors
         )
 
     def product(self) -> Tensor:
         """A times the direction."""
-        self._program.launch(self._first)
+        launch(self._bound, self._first)
         return self._product
 
     def cycle(self) -> Tensor:
         """Roughly A^-1 times the residual."""
-        self._program.launch(self._others)
-        return self._u
+        launch(self._bound, self._others)
+        return self._solution
