@@ -134,9 +134,7 @@ def follow_back(
     return torch.autograd.grad(product, values, allow_unused=True, retain_graph=not is_last)
 
 
-def _accumulate(
-    sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]
-) -> None:
+def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]) -> None:
     """Adds `bars` to `sums`, entry by entry; None is zero.
 
     In place where a sum is one of ours, as those numbered `added` are: autograd may hand out one

@@ -34,9 +34,7 @@ def scene(request: pytest.FixtureRequest) -> Scene:
 
 
 def leaves_of(scene: Scene, factor: float = 1.0) -> dict[str, Tensor]:
-    return {
-        name: (factor * value_of(scene, name)).detach().requires_grad_() for name in NAMES
-    }
+    return {name: (factor * value_of(scene, name)).detach().requires_grad_() for name in NAMES}
 
 
 def compare(scene: Scene, *names: str) -> Comparison:
@@ -44,7 +42,9 @@ def compare(scene: Scene, *names: str) -> Comparison:
     return Comparison([scene.view(name) for name in names], targets)
 
 
-def differentiate_plainly(scene: Scene, values: Mapping[str, Tensor], *names: str) -> Differentiated:
+def differentiate_plainly(
+    scene: Scene, values: Mapping[str, Tensor], *names: str
+) -> Differentiated:
     return differentiate(scene, names, values, compare(scene, *names), SolveMemory())
 
 
