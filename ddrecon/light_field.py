@@ -247,5 +247,6 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     mean = mean if sky is None else mean + sky[0]
     if medium.emission is not None and not multiply_scatters(medium, settings):
         cells, directions = average_cells(medium), DIRECTIONS[settings.angles]
-        mean = mean + sweep_emission(cells, directions, face_mirror(cells, directions))[0]
+        emitted, _ = sweep_emission(cells, directions, face_mirror(cells, directions))
+        mean = mean + emitted[0]
     return 4 * math.pi * mean.clamp(min=0)

@@ -93,34 +93,39 @@ def _iterate(
 ) -> Solution:
     """The solution after at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     cycle, tiny = _cycle_of(operator, source), torch.finfo(source.dtype).tiny
-    inverse = cycle.hierarchy.inverse_diagonal
-    source_norm = _inner(source * inverse, source).sqrt().clamp(min=tiny)
-    u, direction, residual = torch.zeros_like(source), cycle.direction.zero_(), cycle.residual
+    inverse, scratch = cycle.hierarchy.inverse_diagonal, torch.empty_like(source)
+    u, direction, residual = torch.zeros_like(source), cycle.direction, cycle.residual
+
+    def inner(a: Tensor, b: Tensor) -> Tensor:
+        """The inner product of each color, [C, 1, 1, 1]."""
+        return torch.mul(a, b, out=scratch).sum((1, 2, 3), keepdim=True)
+
+    def norm(a: Tensor) -> Tensor:
+        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True).sqrt()
+
+    source_norm = norm(source).clamp(min=tiny)
     residual.copy_(source)
     if guess is not None and guess.shape == source.shape:
+        direction.copy_(guess)
+        left = source - cycle.product()
         # A guess that is worse than zero is not used.
-        left = source - operator.apply(guess)
-        helps = _inner(left * inverse, left).sqrt() <= source_norm
+        helps = norm(left) <= source_norm
         u = torch.where(helps, guess, u)
         residual.copy_(torch.where(helps, left, source))
+    direction.zero_()
     square, iteration = torch.ones_like(source_norm), 0
     while True:
-        relative = _inner(residual * inverse, residual).sqrt() / source_norm
+        relative = norm(residual) / source_norm
         worst = float(relative.max())
         if not worst > tolerance or iteration == MAX_ITERATIONS:
             return Solution(u, iteration, worst)
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative.double() > tolerance
         preconditioned = cycle.cycle()
-        previous, square = square, _inner(residual, preconditioned)
+        previous, square = square, inner(residual, preconditioned)
         direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
         product = cycle.product()
-        step = is_open * square / _inner(direction, product).clamp(min=tiny)
+        step = is_open * square / inner(direction, product).clamp(min=tiny)
         u.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1
-
-
-def _inner(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product per color, `[C, 1, 1, 1]`."""
-    return (a * b).sum((1, 2, 3), keepdim=True)

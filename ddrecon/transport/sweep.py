@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Cut, add, cut, fill, weigh
 from ddrecon.medium.coefficients import Medium
@@ -52,6 +51,8 @@ def sweep(
     `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
+    if is_fused():
+        return _sweep_fused(medium, source, gradient, inflow, directions, mirror)
     courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
     moments = source.new_zeros(count, colors * grid.cells)
@@ -72,6 +73,28 @@ def sweep(
     return moments.view(count, colors, *grid.shape)
 
 
+def _sweep_fused(
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    directions: int,
+    mirror: Mirror | None,
+) -> Tensor:
+    """The same by fused kernels."""
+    from ddrecon.transport.fused.faces import sweep_faces
+    from ddrecon.transport.fused.sweep import sweep_fused
+
+    given = medium, source, gradient, inflow, directions
+    if mirror is None:
+        if not medium.grid.periodic:
+            return sweep_fused(*given)
+        return sweep_faces(*given, None)[0]
+    moments, gone = sweep_faces(*given, [mirror.entering(n) for n in range(directions)])
+    mirror.left.extend(gone)
+    return moments
+
+
 def sweep_change(
     medium: Medium,
     light: Cut,
@@ -90,15 +113,6 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
-    traits = {"periodic": bool(medium.grid.periodic), "refracting": mirror is not None}
-    if has_kernels("transport rounds", gpu=light[0].is_cuda, **traits):
-        from ddrecon.transport.fused.sweep import sweep_fused
-
-        if medium.is_cellwise:
-            # the kernels' factors are the same everywhere: what scatters is summed before
-            source = cut(add(weigh(torch.cat(light), factors), torch.cat(source)))
-            factors = torch.zeros_like(factors[..., :1, :1, :1])
-        return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
     phi = torch.cat(light)
     scatters = fill(add(weigh(phi, factors), torch.cat(source)), medium.degree)
     if mirror is not None:

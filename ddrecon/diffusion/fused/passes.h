@@ -3,6 +3,13 @@
 // Passes of multigrid over the cells of a grid (`hierarchy.py` has the formulas). An item does some
 // cells of a row: a processor's all of them, a GPU's one. No item reads what another one writes.
 
+// Before a loop of a few turns: a processor's vectors need them one by one, a GPU's registers not.
+#if defined(__CUDA_ARCH__)
+#define COUNTED _Pragma("unroll 1")
+#else
+#define COUNTED UNROLLED
+#endif
+
 namespace ddrecon {
 
 typedef long long Size;
@@ -61,78 +68,79 @@ struct Cells {
         first = {{row / n[1], row % n[1], (int)(at - (Size)row * n[2])}};
     }
     INLINE Cell cell(int i) const { return first.moved<2>(first.at[2] + i); }
-    // Calls `act` for each cell of a row, with its neighbors along x, and whether it has cells on
-    // both sides.
+    // Calls `act` for each cell of a row, or for the one, with its neighbors along x, and whether
+    // it certainly has cells on both sides.
     template <class Act> INLINE void visit(const Act& act) const {
-        const int x = first.at[2], nx = n[2], last = x + width == nx ? width - 1 : width;
+        const int x = first.at[2], nx = n[2];
+        if (IS_GPU) return act(0, Beside::around(x, nx), false);
         INDEPENDENT
-        for (int i = x == 0; i < last; ++i) act(i, Beside(x + i - 1, x + i + 1), true);
-        if (x == 0) act(0, Beside::around(0, nx), false);
-        if (last < width && nx > 1) act(last, Beside::around(nx - 1, nx), false);
+        for (int i = 1; i < nx - 1; ++i) act(i, Beside(i - 1, i + 1), true);
+        act(0, Beside::around(0, nx), false);
+        if (nx > 1) act(nx - 1, Beside::around(nx - 1, nx), false);
     }
     template <int AXIS> INLINE Beside beside(const Cell& cell, const Beside& along_x) const {
         return AXIS == 2 ? along_x : Beside::around(cell.at[AXIS], n[AXIS]);
     }
 };
 
+// How far the neighbors of a cell lie, along each axis.
+struct Neighbors {
+    Size below[3], above[3];
+};
 // The 7-point functions of an item: a slice across z, or a cell.
 template <class F> struct Stencil {
     const F* c[3];
-    int width, nx, ny, y, x;
+    int color, width, nz, ny, nx, z, y, x;
     Size all, at;
-    int color;
-    bool is_inner, is_first, is_last;
-    Size below[2], above[2];
+    bool is_periodic;
 
     INLINE Stencil(const Pass<F>& p, Size item)
-        : width((int)p.width), nx((int)p.n[2]), ny((int)p.n[1]), all(p.n[0] * p.n[1] * p.n[2]) {
+        : width((int)p.width),
+          nz((int)p.n[0]),
+          ny((int)p.n[1]),
+          nx((int)p.n[2]),
+          all(p.n[0] * p.n[1] * p.n[2]),
+          is_periodic(p.periodic & 6) {
         color = (int)(item * width / all);
         at = item * width - color * all;
-        const Size slice = (Size)ny * nx;
-        const int z = (int)(at / slice), nz = (int)p.n[0];
-        y = (int)(at % slice) / nx, x = (int)(at % nx);
-        is_inner = !(p.periodic & 6), is_first = z == 0, is_last = z == nz - 1;
-        below[0] = is_first ? (nz - 1) * slice : -slice;
-        above[0] = is_last ? (1 - nz) * slice : slice;
+        const int row = (int)(at / nx);
+        z = row / ny, y = row % ny, x = (int)(at - (Size)row * nx);
         UNROLLED
         for (int a = 0; a < 3; ++a) c[a] = p.c[a] + color % p.face_colors * all + at;
     }
     template <class P> INLINE P* own(P* array, Size colors) const {
         return array + color % colors * all + at;
     }
-    // How far the neighbors of a cell lie, along each axis.
-    struct Neighbors {
-        Size below[3], above[3];
-    };
-    // Calls `act` for each cell, with its neighbors. Faces on the box are zero: except for the
-    // first and the last row of all it makes no difference which cells lie beyond them, and all
-    // rows are one loop. Where rows or columns are periodic, each row is by itself.
+    // The neighbors of a cell: past the ends of an axis they go around.
+    INLINE Neighbors around(int y, int x) const {
+        const Size slice = (Size)ny * nx;
+        return {
+            {z > 0 ? -slice : (nz - 1) * slice, y > 0 ? -nx : (ny - 1) * nx, x > 0 ? -1 : nx - 1},
+            {z < nz - 1 ? slice : (1 - nz) * slice, y < ny - 1 ? nx : (1 - ny) * nx,
+             x < nx - 1 ? 1 : 1 - nx}};
+    }
+    // Calls `act` for each cell, with its neighbors. Faces on the box are zero: but in the first
+    // and the last row of all it makes no difference which cells lie beyond them, and a slice is
+    // one loop. Where rows or columns are periodic, each row is by itself.
     template <class Act> INLINE void visit(const Act& act) const {
-        if (width == 1) return visit_row(act, 0, 0, 1);
-        const int from = is_inner ? is_first * nx : width, to = is_inner ? width - is_last * nx : 0;
-        const Neighbors beside = {{below[0], -nx, -1}, {above[0], nx, 1}};
+        if (IS_GPU) return act(0, around(y, x));
+        const int from = is_periodic ? width : z == 0 ? nx : 0;
+        const int to = is_periodic ? 0 : z == nz - 1 ? width - nx : width;
+        Neighbors beside = around(0, 0);
+        beside.below[1] = -nx, beside.above[1] = nx, beside.below[2] = -1, beside.above[2] = 1;
         INDEPENDENT
         for (int i = from; i < to; ++i) act(i, beside);
-        for (int row = 0; row < ny; ++row)
-            if (row * nx < from || row * nx >= to) visit_row(act, row, row * nx, nx);
+        for (int y = 0; y < ny; ++y)
+            if (y * nx < from || y * nx >= to) visit_row(act, y);
     }
-    template <class Act>
-    INLINE void visit_row(const Act& act, int row, int start, int count) const {
-        const int number = y + row, end = start + count;
-        Neighbors beside = {
-            {below[0], number > 0 ? -nx : (ny - 1) * nx, -1},
-            {above[0], number < ny - 1 ? nx : (1 - ny) * nx, 1}};
-        const bool has_first = x == 0, has_last = x + count == nx;
+    template <class Act> INLINE void visit_row(const Act& act, int y) const {
+        const int start = y * nx;
+        Neighbors beside = around(y, 0);
+        act(start, beside);
+        if (nx > 1) act(start + nx - 1, around(y, nx - 1));
+        beside.below[2] = -1, beside.above[2] = 1;
         INDEPENDENT
-        for (int i = start + has_first; i < end - has_last; ++i) act(i, beside);
-        if (has_last && !(has_first && count == 1)) {
-            beside.above[2] = 1 - nx;
-            act(end - 1, beside);
-        }
-        if (has_first) {
-            beside.below[2] = nx - 1, beside.above[2] = nx > 1 ? 1 : 0;
-            act(start, beside);
-        }
+        for (int i = start + 1; i < start + nx - 1; ++i) act(i, beside);
     }
     // Calls `act(c, k)` for each face of cell i along an axis: what it conducts, and which cell
     // lies beyond it.
@@ -185,7 +193,6 @@ template <class F> struct Work {
     // Products, residuals and relaxations: one pass over seven points.
     INLINE void multiply(Size item) const {
         const Stencil<F> stencil(p, item);
-        typedef typename Stencil<F>::Neighbors Neighbors;
         const Size place = stencil.color * stencil.all + stencil.at;
         const F *const b = work + p.source + place, *const v = work + p.u + place;
         const F* const loss = stencil.own(p.loss, p.cell_colors);
@@ -221,12 +228,12 @@ template <class F> struct Work {
     // 1 / diagonal, the part of that which is exchanged, and sums of the ties along each axis.
     INLINE void scale(Size item) const {
         const Stencil<F> stencil(p, item);
-        typedef typename Stencil<F>::Neighbors Neighbors;
         const Size place = stencil.color * stencil.all + stencil.at;
         const F* const loss = stencil.own(p.loss, p.cell_colors);
         F *const inverse = p.made[0] + place, *const kept = p.made[1] + place;
         F z = 0, y = 0, x = 0;
         stencil.visit([&](int i, const Neighbors& beside) HERE {
+            REORDERED
             F sums[3] = {0, 0, 0};
             stencil.template at_faces<0>(i, beside, [&](F c, Size) HERE { sums[0] += c; });
             stencil.template at_faces<1>(i, beside, [&](F c, Size) HERE { sums[1] += c; });
@@ -324,11 +331,9 @@ template <class F> struct Work {
         double* const row = (double*)p.made[0] + item * all;
         for (Size k = 0; k < all; ++k) row[k] = 0;
         row[at] = *stencil.own(p.loss, p.cell_colors);
-        stencil.visit([&](int i, const typename Stencil<F>::Neighbors& beside) HERE {
-            stencil.at_faces(i, beside, [&](F c, Size there) HERE {
-                row[at] += c;
-                row[at + there] -= c;
-            });
+        stencil.at_faces(0, stencil.around(stencil.y, stencil.x), [&](F c, Size there) HERE {
+            row[at] += c;
+            row[at + there] -= c;
         });
     }
     INLINE void solve(Size item) const {
@@ -367,7 +372,8 @@ template <class F, int AXES> struct Transfer {
     }
     template <int AXIS> INLINE bool has() const { return (AXES ? AXES : (int)p.axes) >> AXIS & 1; }
 
-    // Sum of a pair, less what its cells send to the pairs beside it, plus what those send.
+    // Sum of a pair, less what its cells send to the pairs beside it, plus what those send: the
+    // transpose of `prolonged`.
     template <int AXIS> INLINE F restricted(const Cell& cell, const Beside& x, bool inner) const {
         if constexpr (AXIS < 0) {
             return in[cell.in(fine)];
@@ -383,11 +389,21 @@ template <class F, int AXES> struct Transfer {
             };
             const Size here = cell.in(sizes[AXIS]);
             const Size last = cell.moved<AXIS>(beside.before).in(sizes[AXIS]);
-            const F one = residual(2 * k), two = residual(second(k));
-            const F before = residual(second(beside.before)), after = residual(2 * beside.after);
-            return one + (second(k) > 2 * k ? two : F(0)) -
-                   (below[AXIS][here] * two - above[AXIS][here] * after) +
-                   (below[AXIS][last] * before - above[AXIS][last] * one);
+            const bool has_second = second(k) > 2 * k;
+            F sum = 0;
+            COUNTED
+            for (int j = 0; j < 4; ++j) {
+                const int number = j == 0   ? 2 * k
+                                   : j == 1 ? second(k)
+                                   : j == 2 ? second(beside.before)
+                                            : 2 * beside.after;
+                const F part = j == 0   ? 1 - above[AXIS][last]
+                               : j == 1 ? (has_second ? 1 - below[AXIS][here] : F(0))
+                               : j == 2 ? below[AXIS][last]
+                                        : above[AXIS][here];
+                sum += part * residual(number);
+            }
+            return sum;
         }
     }
     // A cell between its pair and the one beside that, as light is.
@@ -450,8 +466,10 @@ template <int AXES, bool ADDS, class F> INLINE void prolong_cells(const Work<F>&
 }
 template <int AXES, class F> INLINE void transfer(const Work<F>& work, Size item) {
     if (work.p.kind == RESTRICT) restrict_cells<AXES>(work, item);
-    if (work.p.kind == CORRECT && work.p.kept) prolong_cells<AXES, true>(work, item);
-    if (work.p.kind == CORRECT && !work.p.kept) prolong_cells<AXES, false>(work, item);
+    if (work.p.kind != CORRECT) return;
+    // A GPU does all axes at once.
+    if (IS_GPU || work.p.kept) return prolong_cells<AXES, true>(work, item);
+    prolong_cells<AXES, false>(work, item);
 }
 template <int AXIS, class F> INLINE void halve(const Work<F>& work, Size item) {
     if (work.p.kind == WEIGH) work.template weigh<AXIS>(item);

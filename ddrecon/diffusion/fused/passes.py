@@ -18,7 +18,7 @@ from torch import Tensor
 from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
-from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.kernels.text import Bound, TextKernel, declarations
 
 Kind = IntEnum(
     "Kind",
@@ -90,9 +90,8 @@ class KernelPasses(Passes):
         return matrix
 
     def run(self) -> None:
-        kernel = prepare_kernel(8 * self.like.itemsize)
-        program = Program(self, kernel, self.like.new_empty(1))
-        program.launch(program.cut(0, len(self.rows)))
+        program = Program(self, prepare_kernel(8 * self.like.itemsize))
+        launch(program.bind(self.like.new_empty(1)), program.cut(0, len(self.rows)))
         self.rows.clear()
 
     def product(self, operator: Operator, u: Vector) -> Vector:
@@ -227,17 +226,23 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
 
 
 class Program:
-    """Passes in a table where kernels see it, and launches that do them on vectors in `work`."""
+    """A table of passes where kernels see it, with the launches that do them.
 
-    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor):
-        self.rows, self.kept = [*passes.rows], [*passes.kept]
+    `kept`: what the table points to; `size`: how many numbers vectors take.
+    """
+
+    def __init__(self, passes: KernelPasses, kernel: TextKernel):
+        self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
+        self.kernel, self.is_on_gpu = kernel, passes.like.is_cuda
         names = [*entries_of(PASS)]
         table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
         # Without waiting: the numbers have left the processor's memory when this returns.
-        table = table.to(work.device, non_blocking=True)
-        self.bound = kernel.bind({"table": table}, {"work": work})
-        self.is_alone = not work.is_cuda and thread_count(work) == 1
-        self.is_shared = work.is_cuda
+        self.table = table.to(passes.like.device, non_blocking=True)
+        self.is_alone = not self.is_on_gpu and thread_count(table) == 1
+
+    def bind(self, work: Tensor) -> Bound:
+        """The kernel, for vectors in `work`."""
+        return self.kernel.bind({"table": self.table}, {"work": work})
 
     def cut(self, first: int, last: int) -> list[tuple[int, int, int]]:
         """The launches that do passes `first` to `last`: items, the first pass, the one after it.
@@ -245,20 +250,20 @@ class Program:
         One item may be several passes: then a thread does them all.
         """
         launches = []
-        for number in range(first, last):
-            row = self.rows[number]
+        for number, row in enumerate(self.rows[first:last], first):
             is_large = row["items"] * row["width"] > SMALL and not self.is_alone
-            if self.is_shared or is_large:
+            if self.is_on_gpu or is_large:
                 if first < number:
                     launches.append((1, first, number))
                 launches.append((row["items"], number, number + 1))
                 first = number + 1
         return [*launches, *([(1, first, last)] if first < last else [])]
 
-    def launch(self, launches: Sequence[tuple[int, int, int]]) -> None:
-        """Does what was `cut`."""
-        for items, begin, end in launches:
-            self.bound.launch(items, begin=begin, end=end, is_whole=items == 1)
+
+def launch(bound: Bound, launches: Sequence[tuple[int, int, int]]) -> None:
+    """Does the passes of a `bound` program, as it was `cut`."""
+    for items, begin, end in launches:
+        bound.launch(items, begin=begin, end=end, is_whole=items == 1)
 
 
 def passes_kernel(name: str, bits: int) -> TextKernel:
@@ -292,40 +297,49 @@ def name_kernels(like: Tensor) -> None:
         launch_later(kernel(8 * like.itemsize).kernel, like)
 
 
-def prepare(operator: Operator) -> tuple[Operator, Hierarchy]:
-    """`operator` as kernels take it, and its grids."""
-    faces = max(map(len, operator.conductances))
-    z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
-    loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
-    operator = Operator((z, y, x), loss, operator.periodic)
-    return operator, Hierarchy.of(operator, KernelPasses(loss))
+class KernelGrids:
+    """The grids of an operator, and the program of products and cycles for each count of colors."""
+
+    def __init__(self, operator: Operator):
+        faces = max(map(len, operator.conductances))
+        z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
+        loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
+        self.operator = Operator((z, y, x), loss, operator.periodic)
+        self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss))
+        self.programs: dict[int, tuple[Program, list[Vector]]] = {}
+
+    def program(self, colors: int) -> tuple[Program, list[Vector]]:
+        """The program, a product before a cycle; direction and residual, product and solution."""
+        if colors not in self.programs:
+            loss = self.operator.loss
+            passes = KernelPasses(loss, colors)
+            given = [passes.new_vector(loss.shape[1:]) for _ in range(2)]
+            product = passes.product(self.operator, given[0])
+            solution = self.hierarchy.cycle(passes, given[1])
+            program = Program(passes, cycle_kernel(8 * loss.itemsize))
+            self.programs[colors] = program, [*given, product, solution]
+        return self.programs[colors]
 
 
 class KernelCycle:
     """Products and V-cycles of an operator, of vectors like `source`, by kernels."""
 
     def __init__(self, operator: Operator, source: Tensor):
-        operator, self.hierarchy = operator.once(prepare)
-        passes = KernelPasses(source, len(source))
-        direction, residual = (passes.new_vector(source.shape[1:]) for _ in range(2))
-        product = passes.product(operator, direction)
-        u = self.hierarchy.cycle(passes, residual)
-        work = source.new_empty(passes.size)
-        self.direction, self.residual, self._product, self._u = (
-            work[vector.place :][: source.numel()].view_as(source)
-            for vector in (direction, residual, product, u)
-        )
-        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work)
-        self._first, self._others = (
-            self._program.cut(*ends) for ends in ((0, 1), (1, len(passes.rows)))
+        grids = operator.once(KernelGrids)
+        program, vectors = grids.program(len(source))
+        work = source.new_empty(program.size)
+        self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
+        self._first, self._others = program.cut(0, 1), program.cut(1, len(program.rows))
+        self.direction, self.residual, self._product, self._solution = (
+            work[vector.place :][: source.numel()].view_as(source) for vector in vectors
         )
 
     def product(self) -> Tensor:
         """A times the direction."""
-        self._program.launch(self._first)
+        launch(self._bound, self._first)
         return self._product
 
     def cycle(self) -> Tensor:
         """Roughly A^-1 times the residual."""
-        self._program.launch(self._others)
-        return self._u
+        launch(self._bound, self._others)
+        return self._solution
