@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -20,8 +21,6 @@ from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
 from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
-from ddrecon.medium.phase_cells import SeenNodes
-from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
@@ -171,9 +170,7 @@ def integrate_segments(
     diffuse = diffuse + at_nodes["emitted"] if "emitted" in at_nodes else diffuse
     scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
     scattered = scattered * emission.diffuse_scale.view(-1, 1)
-    seen: SeenPhase | SeenNodes = emission.seen
-    if "number" in at_nodes:
-        seen = SeenNodes(seen.phase, at_nodes["number"], seen.degree)
+    seen = replace(emission.seen, number=at_nodes.get("number"))
     for index, beam in enumerate(emission.beams):
         # E8.7: the depth of the forward peak, from where the light enters to the camera.
         # On faces that are lit it is 0 but for rounding, whose exponential may overflow.

@@ -67,13 +67,19 @@ NUMBERS: dict[type, tuple[str, ...]] = {
 def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     """Masses are interpolated linearly, and E8.7 is summed itself, in the fast march as well."""
 
-    def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
+    def along(seen: SeenPhase, depth: Tensor | None, cosine: Tensor) -> Tensor:
+        if seen.number is not None:
+            cells = seen.phase.with_cells(seen.number.movedim(1, 0)[..., None])
+            seen = SeenPhase(cells, seen.degree)
+        elif depth is None:
+            return seen.phase.value(cosine)
+        if depth is None:
+            return seen.phase.value(cosine[..., None])[..., 0].movedim(0, 1)
         return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
 
     def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
-        if depth is None:
-            return seen.value(angle.cos()).movedim(0, 1)
-        return summed_series(seen, depth.movedim(1, 0), angle.cos()).movedim(0, 1)
+        found = along(seen, depth, angle.cos())
+        return found.movedim(0, 1) if depth is None and seen.number is None else found
 
     monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
     monkeypatch.setattr(SeenPhase, "along", along)
@@ -118,7 +124,7 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
         cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
         mass = interpolate(grid, fields[f"mass {index}"], points)
         if emission.peak is None:
-            phase = seen.value(cosine[..., None])[..., 0]
+            phase = seen.phase.value(cosine[..., None])[..., 0]
         else:
             # E8.7: the forward peak spreads the light on its way to the node and to the camera.
             peak = interpolate(grid, fields.get("peak", emission.peak), points)
