@@ -182,7 +182,7 @@ def results(path: Path, device: torch.device) -> dict[str, Tensor]:
         values["density"] = (0.2 + 0.6 * drawn).to(values["density"])
     with torch.no_grad():
         light = solve_light(with_values(scene, values), SolveMemory())
-    tensors = {"light": light.diffuse.mean}
+    tensors = {"light": light.diffuse[0]}
     if light.medium.emission is not None:
         tensors["emission"] = light.medium.emission
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}

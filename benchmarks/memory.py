@@ -53,7 +53,7 @@ from ddrecon.renderer import solve_light
 from ddrecon.scene_file.build import load_scene
 scene = load_scene(Path(sys.argv[1]))
 density = scene.volume.density.requires_grad_()
-torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse.mean.sum(), density)
+torch.autograd.grad(solve_light(scene, SolveMemory()).diffuse[0].sum(), density)
 """
 
 
@@ -138,9 +138,9 @@ def place() -> str:
 def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, float, str]:
     """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
     import numpy as np
+    from ddrecon.diffusion.solvers.fused import multigrid
 
     from ddrecon.diffusion.implicit import SolveMemory
-    from ddrecon.diffusion.solvers.fused import multigrid
     from ddrecon.reconstruct.loop import Reconstruction
     from ddrecon.renderer import render_each
     from ddrecon.scene_file.build import load_scene

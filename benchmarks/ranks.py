@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import torch.distributed
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.ranks import (
     alone,
-    exchanged,
     is_first,
     join_ranks,
     leave_ranks,
@@ -45,17 +45,34 @@ class Iteration(NamedTuple):
     size: float
 
 
+exchanged: list[tuple[int, float]] = []
+"""Bytes and seconds of each sum over ranks."""
+
+
+def count_exchanges() -> None:
+    """Has each sum over ranks note its bytes and its seconds in `exchanged`."""
+    reduce_all = torch.distributed.all_reduce
+
+    def reduce_and_note(tensor: Tensor) -> None:
+        start = time.perf_counter()
+        reduce_all(tensor)
+        exchanged.append((tensor.nbytes, time.perf_counter() - start))
+
+    torch.distributed.all_reduce = reduce_and_note
+
+
 def iterate(scene: Scene, values: Mapping[str, Tensor]) -> Iteration:
     """One iteration by all ranks that are together."""
     sum_numbers([0])  # all begin together
-    (before, waited), start, worked = exchanged(), time.perf_counter(), time.process_time()
+    exchanged.clear()
+    start, worked = time.perf_counter(), time.process_time()
     names = [view.name for view in scene.views]
     differentiate(scene, names, values, lambda _, image: image.square().mean(), SolveMemory())
     busiest = [0.0] * rank_count()
     busiest[own_rank()] = time.process_time() - worked
-    seconds, (after, waited_after) = time.perf_counter() - start, exchanged()
-    work = max(sum_numbers(busiest))
-    return Iteration(seconds, work, waited_after - waited, (after - before) / 2**20)
+    seconds = time.perf_counter() - start
+    size, waited = (sum(column) for column in zip(*exchanged, strict=True)) if exchanged else (0, 0)
+    return Iteration(seconds, max(sum_numbers(busiest)), waited, size / 2**20)
 
 
 def main() -> None:
@@ -66,6 +83,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     join_ranks(has_gpu=False)
+    count_exchanges()
     scene = load_scene(given.scene, overrides=given.overrides)
     names = scene.optimize.parameters if scene.optimize else density_names(scene)
     values = {name: value_of(scene, name).detach().requires_grad_() for name in names}

@@ -23,7 +23,7 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import add, fill, weigh
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.refracted import enter_faces
@@ -80,8 +80,8 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     reflected = outside.sum((0, 1))
     factors = remaining_moments(medium)[: medium.degree + 1]
     received = light_field.received.source
-    source = light_field.diffuse.weighted(factors).plus(received)
-    light = light_field.diffuse.mean + received.mean
+    source = add(weigh(light_field.diffuse, factors), received)
+    light = light_field.diffuse[0] + received[0]
     rise = steep_gradient(average_cells(medium), light, box.directions)
     scattered = (
         passing - unscattered + box.sweep_out(medium, source, rise, light=light_field.diffuse)
@@ -184,7 +184,7 @@ class _Box:
         power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
         empty = power / (2 * len(FACES))
         even = torch.ones_like(medium.extinction.value)
-        given = Moments(even), cell_gradient(even)
+        given = even[None], cell_gradient(even)
         found = (self.sweep_out(medium.emitting, *given) for medium in self.media)
         return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *found))
 
@@ -195,7 +195,7 @@ class _Box:
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
         parts = (halves * areas)[..., None].to(radiance.device)
-        falling, given = math.pi * parts * radiance, (Moments(nothing), cell_gradient(nothing))
+        falling, given = math.pi * parts * radiance, (nothing[None], cell_gradient(nothing))
         index = self.media[0].index
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
         inflow = index**2 * radiance.view(-1, 1, 1, 1)
@@ -256,21 +256,21 @@ class _Box:
     def sweep_out(
         self,
         medium: Medium,
-        source: Moments,
+        source: Tensor,
         rise: Tensor,
         inflow: Tensor | None = None,
-        light: Moments | None = None,
+        light: Tensor | None = None,
     ) -> Tensor:
-        """The power that leaves in one sweep of light that `source` scatters in `medium`.
+        """The power that leaves in one sweep of light that `source` phi scatters in `medium`.
 
         `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in
         an empty box. Where faces reflect light inside, it is swept until that has come to rest,
         from `light` on, None for none.
         """
-        grid, moments, cells = medium.grid, source.harmonics(medium.degree), average_cells(medium)
+        grid, moments, cells = medium.grid, fill(source, medium.degree), average_cells(medium)
         courses, weights, values = sweep_rule(self.directions, len(moments))
         mirror, rows = face_mirror(medium, self.directions), values.to(moments)
-        begun = 0 * moments if light is None else light.harmonics(medium.degree)
+        begun = 0 * moments if light is None else fill(light, medium.degree)
         for sweep in range(1 if mirror is None else SWEEPS):
             if mirror is not None:
                 mirror.begin(begun if sweep == 0 else None)

@@ -24,7 +24,7 @@ class Displayed:
 
     def __repr__(self) -> str:
         """What differs from its default, a line each; of tensors shape, device and range."""
-        lines = "".join(f"  {part},\n" for part in _Brief().parts_of(self, 6))
+        lines = "".join(f"  {entry},\n" for entry in _Brief().parts_of(self, 6))
         return f"{type(self).__name__}(\n{lines})"
 
 
@@ -36,14 +36,14 @@ class _Brief(reprlib.Repr):
         self.maxlist, self.maxdict, self.maxstring = 2, 2, 100
 
     def parts_of(self, record: Any, level: int) -> list[str]:
-        parts = []
+        entries = []
         for field in fields(record):
             value, default = getattr(record, field.name), field.default
             if field.default_factory is not MISSING:
                 default = field.default_factory()
             if type(value) is not type(default) or value != default:
-                parts.append(f"{field.name}={self.repr1(value, level - 1)}")
-        return parts
+                entries.append(f"{field.name}={self.repr1(value, level - 1)}")
+        return entries
 
     def repr_instance(self, x: Any, level: int) -> str:
         if is_dataclass(x):

@@ -2,15 +2,15 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. What is torch's with either engine is what
-`terms.parts_in_torch` finds in a scene, and tangents in forward mode by where lights are.
+same formulas, so their numbers agree to rounding. `TORCH_ALONE` is the one table of what warp has
+not; besides, warp has no tangents by some tensors (`numerics.autodiff.is_fused`).
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -19,11 +19,15 @@ from ddrecon.errors import MissingExtraError, UsageError
 from ddrecon.extras import advice
 
 ENGINES = ("torch", "warp")
-"""The engines there are."""
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-PARTS = "view rays", "light", "diffusion", "transport rounds"
-"""The parts of the renderer, which every engine has."""
+TORCH_ALONE: dict[str, frozenset[str]] = {
+    "view rays": frozenset(),
+    "light": frozenset(),
+    "diffusion": frozenset({"printed", "flux_limited"}),
+    "transport rounds": frozenset({"gpu", "periodic", "refracting"}),
+}
+"""Each part of the renderer, and the traits of a scene with any of which torch runs it."""
 CACHE = "WARP_CACHE_PATH"
 """The environment variable that names the folder where Warp keeps kernels."""
 LOG = "ddrecon.engine"
@@ -56,24 +60,19 @@ def current_engine() -> str:
     return _engine
 
 
-def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
-    """The engine that runs each part of the renderer: the current one, but for those `in_torch`.
-
-    These may be other parts than `PARTS`, within them.
-    """
-    return dict.fromkeys(PARTS, current_engine()) | dict.fromkeys(in_torch, "torch")
+def has_kernels(part: str, **traits: bool) -> bool:
+    """Whether `part`, a key of `TORCH_ALONE`, runs as kernels of warp with these `traits`."""
+    is_left = any(is_so and trait in TORCH_ALONE[part] for trait, is_so in traits.items())
+    return not is_left and current_engine() == "warp"
 
 
-def has_kernels(part: str, is_on_gpu: bool) -> bool:
-    """Whether warp has kernels for `part` on such a device.
-
-    Multigrid and sweeps go through rows, on a processor.
-    """
-    return not (is_on_gpu and part in ("diffusion", "transport rounds"))
+def engine_of_parts(**traits: bool) -> dict[str, str]:
+    """The engine that runs each part of the renderer for a scene with these `traits`."""
+    return {part: "warp" if has_kernels(part, **traits) else "torch" for part in TORCH_ALONE}
 
 
 def name_engines(engines: Mapping[str, str]) -> str:
-    """In words, the `engines` of parts: with warp what it runs and what it leaves to torch."""
+    """The `engines` of parts in words: with warp what it runs and what it leaves to torch."""
     fused = [part for part, engine in engines.items() if engine == "warp"]
     others = [part for part, engine in engines.items() if engine == "torch"]
     if not fused:
@@ -84,11 +83,12 @@ def name_engines(engines: Mapping[str, str]) -> str:
 
 def engine_versions() -> dict[str, str]:
     """The current `engine`, and the version of `warp-lang` where that is warp."""
-    from importlib.metadata import version  # here, so that help answers at once
+    from importlib.metadata import version  # imported late, so that help answers at once
 
-    if current_engine() == "torch":
-        return {"engine": "torch"}
-    return {"engine": "warp", "warp-lang": version("warp-lang")}
+    is_torch = current_engine() == "torch"
+    return (
+        {"engine": "torch"} if is_torch else {"engine": "warp", "warp-lang": version("warp-lang")}
+    )
 
 
 def _resolve(name: str, asked: str) -> str:
@@ -98,17 +98,16 @@ def _resolve(name: str, asked: str) -> str:
     if name == "torch":
         return name
     # Looked for, not imported: that takes a third of a second.
-    is_installed = find_spec("warp") is not None
-    if name == "warp" and not is_installed:
+    if find_spec("warp") is not None:
+        return _place_kernels(name, asked)
+    if name == "warp":
         raise MissingExtraError(f"{asked} {advice('warp')}")
-    if is_installed:
-        return _keep_kernels(name, asked)
     missing = 'engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast'
     logging.getLogger(LOG).info(missing)
     return "torch"
 
 
-def _keep_kernels(name: str, asked: str) -> str:
+def _place_kernels(name: str, asked: str) -> str:
     """`warp`, once there is a folder for its kernels; `torch` where there is none, with `auto`.
 
     Where the usual one cannot be written, as in containers, `auto` takes a temporary one. Raises
@@ -117,28 +116,29 @@ def _keep_kernels(name: str, asked: str) -> str:
     usual = os.environ.get(CACHE) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     if os.name != "posix" or _is_writable(Path(usual)):
         return "warp"
-    advice = f"set {CACHE} to a folder that can be written"
-    lost = f"kernels cannot be kept in {usual}"
+    lost, mend = (
+        f"kernels cannot be kept in {usual}",
+        f"set {CACHE} to a folder that can be written",
+    )
     if name == "warp":
-        raise UsageError(f"{asked}: {lost}; {advice}")
+        raise UsageError(f"{asked}: {lost}; {mend}")
     folder = Path(os.environ.get("TMPDIR") or "/tmp", f"ddrecon-{os.getuid()}")
     # What others put there would be run as kernels.
-    if _is_writable(folder) and folder.lstat().st_uid == os.getuid():
+    is_own = _is_writable(folder) and folder.lstat().st_uid == os.getuid()
+    engine, instead = ("warp", f", but in {folder}") if is_own else ("torch", "")
+    if is_own:
         os.environ[CACHE] = str(folder)
-        name, instead = "warp", f", but in {folder}"
-    else:
-        name, instead = "torch", ""
-    logging.getLogger(LOG).info(f"engine {name}: {lost}{instead}; {advice}")
-    return name
+    logging.getLogger(LOG).info(f"engine {engine}: {lost}{instead}; {mend}")
+    return engine
 
 
-def _is_writable(folder: Path) -> bool:
-    """Whether files can be written to `folder`, which is made."""
+def _is_writable(path: Path) -> bool:
+    """Whether files can be written to the folder `path`, which is made."""
     try:
-        place = folder.expanduser()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.mkdir(0o700, exist_ok=True)
-        with TemporaryFile(dir=place):
+        folder = path.expanduser()
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(0o700, exist_ok=True)
+        with TemporaryFile(dir=folder):
             return True
     except (OSError, RuntimeError):  # the latter where nobody knows a home
         return False

@@ -1,7 +1,7 @@
 """Visual hulls: where there may be smoke, by what views show, and the box around it.
 
-A place is left out where any view that sees it sees nothing there (Laurentini 1994,
-doi:10.1109/34.273735). Pictures are taken at full resolution, whatever the grid's.
+A place is left out where a view looks at it and shows nothing (Laurentini 1994,
+doi:10.1109/34.273735). Pictures are used at full resolution, whatever the grid's.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 
 DARKEST = 0.1
-"""So much of each picture, at least, is background. Chosen on the capture, as what follows."""
+"""The least part of each picture that is background. Chosen on the capture, as the next three."""
 DEVIATIONS = 4.0
-"""Black is less than so many deviations of noise above it."""
+"""Deviations of noise above the darkest pixels up to which a pixel is black."""
 TAIL = 0.98
-"""This part of black is within two deviations."""
+"""The part of black pixels within two deviations."""
 TOGETHER = 0.3
-"""Smoke is where this part of neighbors show something; what noise shows stands alone."""
+"""The part of neighbors that show something around smoke; noise stands alone."""
 MOST_PIXELS = 256
-"""Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""
+"""Pixels a side of the reduced pictures in which neighbors are counted and boxes found."""
 BOX_CELLS, SHRINKS = 48, 0.97
-"""A box is cut to the cells that are left of so many along each side, again and again until no side
-shrinks below this part of itself."""
+"""Cells along each side of a box, which is cut to those that are left, until no side shrinks below
+this part of itself."""
 
 
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
-"""A box is far too large if less than the first part of it may hold smoke, is elsewhere or far too
-small if it has less than the second of what may, and cuts off what reaches beyond it by the third
-of a side. It fits what it has more than the last of."""
+"""A box is far too large if less than FILLED of it may hold smoke; it is elsewhere or far too small
+if it holds less than HELD of the smoke, cuts off smoke that reaches beyond it by CUT of a side, and
+fits if it holds more than ALL."""
 
 
 OUTSIDE = "no overlap", "hardly any overlap"
@@ -53,9 +53,9 @@ class HullError(SceneError):
 def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
-    By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    with `auto`, where it is brighter than its black, or differs from its background, by more than
-    noise, or is not known. Raises HullError where that is most of its edges.
+    A pixel shows something by the mask, or without one where it is not black, as alpha 0 is. With
+    `auto`, it does where it is brighter than black, or differs from the background, by more than
+    noise, or is masked out. Raises HullError where most of the edges show something.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
@@ -120,9 +120,9 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    `shown` [h, w] is whether a pixel shows something; a cell may hold it where a pixel does within
-    `margin` pixels of those that the cell covers. Beyond its image, a camera shows what the nearest
-    pixel does.
+    `shown` [h, w] is whether a pixel shows something; a cell may hold medium where a pixel does
+    within `margin` pixels of those that the cell covers. Outside the image the nearest pixel
+    counts.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
@@ -161,14 +161,14 @@ def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
     """The corners [2, 3] (x, y, z) [u] of the box around all that the views of `frames` may show.
 
-    By the pixels [h, w] that each shows, single ones left out, widened by `margin`. A frame of
+    Each view shows the pixels [h, w], single ones left out, widened by `margin`. A frame of
     which a view shows nothing has no smoke yet. Raises HullError where the views leave no place,
     or any.
     """
     boxes = []
     for views, pixels in frames:
-        shown = [avg_pool2d(each.float()[None], 3, 1, 1)[0] > 0.5 for each in pixels]
-        if shown and all(bool(each.any()) for each in shown):
+        shown = [avg_pool2d(mask.float()[None], 3, 1, 1)[0] > 0.5 for mask in pixels]
+        if shown and all(bool(mask.any()) for mask in shown):
             boxes.append(_bound_frame([view.camera for view in views], shown, margin))
     if not boxes:
         raise HullError(
@@ -183,15 +183,15 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     factors = [math.ceil(max(camera.size) / MOST_PIXELS) for camera in cameras]
     cameras = [camera.resize(factor) for camera, factor in zip(cameras, factors, strict=True)]
     shown = [
-        adaptive_max_pool2d(each.float()[None], camera.size)[0] > 0
-        for camera, each in zip(cameras, shown, strict=True)
+        adaptive_max_pool2d(mask.float()[None], camera.size)[0] > 0
+        for camera, mask in zip(cameras, shown, strict=True)
     ]
-    seen = [cast_rays(c).select(each.flatten()) for c, each in zip(cameras, shown, strict=True)]
+    seen = [cast_rays(c).select(mask.flatten()) for c, mask in zip(cameras, shown, strict=True)]
     origins = array_order(torch.stack([rays.origin.mean(0) for rays in seen])).double().cpu()
-    ways = array_order(torch.stack([rays.direction.mean(0) for rays in seen])).double().cpu()
-    ways = normalize(ways)
+    directions = array_order(torch.stack([rays.direction.mean(0) for rays in seen])).double().cpu()
+    directions = normalize(directions)
     # The place nearest to the middle of what each shows, and a cube about it that holds no camera.
-    across = torch.eye(3).double() - ways[:, :, None] * ways[:, None]
+    across = torch.eye(3).double() - directions[:, :, None] * directions[:, None]
     middle = torch.linalg.lstsq(across.sum(0), (across @ origins[..., None]).sum(0)).solution[:, 0]
     reach = min(
         float((origin - middle).norm()) / 2 if c.is_perspective else 1.5 * float(c.half_width)
@@ -203,8 +203,8 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
         low, high = box.tolist()
         grid = Grid.from_xyz((BOX_CELLS,) * 3, tuple(low), tuple(high))
         hulls = [
-            hull_of(camera, each, grid, margin / factor)[0]
-            for camera, each, factor in zip(cameras, shown, factors, strict=True)
+            hull_of(camera, mask, grid, margin / factor)[0]
+            for camera, mask, factor in zip(cameras, shown, factors, strict=True)
         ]
         places = array_order(torch.stack(hulls).all(0).nonzero()).cpu()
         if not len(places):
@@ -233,27 +233,27 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
     if held < HELD and filled < 0.5:
-        what = (
+        fault = (
             f"{OUTSIDE[held > 0]}, {100 * held:.2g} % of where the pictures show smoke is in them"
         )
     elif held < HELD:
-        what = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+        fault = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
     elif filled < FILLED:
-        what = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
+        fault = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
     elif float(lacks[end, axis]) > CUT:
         beyond = f"{('below', 'above')[end]} {float(box[end, axis]):.3g} along {'xyz'[axis]}"
-        what = f"cut off, the pictures show smoke {beyond}"
+        fault = f"cut off, the pictures show smoke {beyond}"
     else:
         return None
     # Where up does not tell of a turn, the longest side may.
-    before, after = upright
-    if before == after:
-        before, after = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
+    old, new = upright
+    if old == new:
+        old, new = (int((ends[1] - ends[0]).argmax()) for ends in (shown, box))
     # A box that is cut off is of the right unit.
     powers = () if held >= HELD and filled >= FILLED else (3, -3, 2, -2, 1, -1)
-    reason = _explain(shown, box, before, after, [1.0, *(10.0**power for power in powers)])
+    reason = _explain(shown, box, old, new, [1.0, *(10.0**power for power in powers)])
     up = f" and up: {'xyz'[upright[0]]}" if upright[0] != upright[1] else ""
-    return f"{what}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
+    return f"{fault}{reason}; take {bounds_text(shown)}{up}, or move the cameras"
 
 
 def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
@@ -263,17 +263,17 @@ def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
     return float(held), float(filled)
 
 
-def _explain(shown: Tensor, box: Tensor, before: int, after: int, units: Sequence[float]) -> str:
-    """Which of `units`, and turn of the axis `before` to that `after`, have `shown` fill `box`."""
-    for times, (order, signs) in product(units, _turns(before, after)):
+def _explain(shown: Tensor, box: Tensor, old: int, new: int, units: Sequence[float]) -> str:
+    """Which of `units`, and turn of the axis `old` to `new`, have `shown` fill `box`."""
+    for times, (order, signs) in product(units, _turns(old, new)):
         ends = times * shown[:, list(order)] * shown.new_tensor(signs)
         held, filled = _share(ends.sort(0).values, box)
         if held < ALL or filled < FILLED:
             continue
         words = list[str]()
-        if before != after:
+        if old != new:
             turned = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
-            up = f"as if {'xyz'[before]} were up in the one and {'xyz'[after]} in the other"
+            up = f"as if {'xyz'[old]} were up in the one and {'xyz'[new]} in the other"
             words.append(f"({turned}) of the cameras as its (x, y, z), {up}")
         if times != 1:
             words.append(f"lengths of the cameras times {times:g}, as of another unit")
@@ -281,15 +281,15 @@ def _explain(shown: Tensor, box: Tensor, before: int, after: int, units: Sequenc
     return ""
 
 
-def _turns(before: int, after: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Which axes, with which signs, come to be x, y and z where the upright one does, by turns.
+def _turns(old: int, new: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Which axes, with which signs, become x, y and z in turns that take the axis `old` to `new`.
 
-    That which moves the fewest is the first; where it is the same already, none is moved.
+    The turn that moves the fewest axes comes first; none is moved where both are the same.
     """
     turns = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         is_even = order[1] == (order[0] + 1) % 3
-        if order[after] == before and signs[after] > 0 and (math.prod(signs) > 0) == is_even:
+        if order[new] == old and signs[new] > 0 and (math.prod(signs) > 0) == is_even:
             turns.append((order, signs))
     turns.sort(key=lambda turn: sum(i != axis for i, axis in enumerate(turn[0])) - sum(turn[1]) / 9)
-    return turns[:1] if before == after else turns
+    return turns[:1] if old == new else turns

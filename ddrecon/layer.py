@@ -18,15 +18,11 @@ from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.scene import Scene
-from ddrecon.supported import require_above, require_settings
+from ddrecon.supported import require_above
+from ddrecon.variables.forms import is_real
 from ddrecon.variables.kinds import PAIRS
-from ddrecon.variables.values import (
-    is_real,
-    require_legal,
-    require_scene,
-    shapes_of,
-    with_values,
-)
+from ddrecon.variables.legal import require_legal, require_scene
+from ddrecon.variables.values import shapes_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""
@@ -50,11 +46,9 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 def _look_at(scene: Scene, view: str | None) -> None:
     """Raises where a `view` of `scene` cannot be rendered, and notices what changed in it."""
     require_plain_autograd()
-    require_scene(scene)
     require_legal(scene, view)
     if scene.volume.density.is_cpu:
         require_above(scene)
-    require_settings(scene)
     scene.settle()
     forget_changed()
 
@@ -91,33 +85,33 @@ class VolumeRenderer(torch.nn.Module):
 
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
-        (`ddrecon.variables`). What is not given is the scene's. Each may have one more axis in
-        front than it may have else, of n entries; the images then are `[n, views, 3, h, w]`. Raises
-        UsageError for a name the scene does not have, for other shapes, another device, and where
-        `render` does; NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
+        (`ddrecon.variables`). What is None is the scene's. With one more axis in front, of n
+        entries, images are `[n, views, 3, h, w]`. Raises UsageError for a name the scene does not
+        have, for other shapes, another device, and where `render` does; NotImplementedError within
+        `torch.func.vmap` or `torch.func.grad`.
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
-        given = {name: value for name, value in named.items() if value is not None}
-        if twice := given.keys() & (values or {}):
+        inputs = {name: value for name, value in named.items() if value is not None}
+        if twice := inputs.keys() & (values or {}):
             raise UsageError(f"{min(twice)}: given twice, by its own name and in values")
-        given |= values or {}
-        if all(given.keys() & pair for pair in PAIRS):
-            names = ", ".join(sorted(given))
+        inputs |= values or {}
+        if all(inputs.keys() & pair for pair in PAIRS):
+            names = ", ".join(sorted(inputs))
             raise UsageError(f"{names}: give sigma_a and sigma_s, or sigma_t and albedo, not both")
-        own = self.scene.volume.density
-        with torch.autocast("cpu" if own.is_meta else own.device.type, enabled=False):
-            given = {n: v.to(own.dtype) if is_real(v) else v for n, v in given.items()}
-            counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
+        like = self.scene.volume.density
+        with torch.autocast("cpu" if like.is_meta else like.device.type, enabled=False):
+            inputs = {n: v.to(like.dtype) if is_real(v) else v for n, v in inputs.items()}
+            counts = {name: len(v) for name, v in inputs.items() if self._is_batch(name, v)}
             if len(set(counts.values())) > 1 or 0 in counts.values():
                 raise UsageError(f"batches differ in size, or hold nothing: {counts}")
-            images = []
-            for index in range(next(iter(counts.values()), 1)):
-                # Each entry starts from its own last solutions.
-                if len(self.memories) <= index:
-                    self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
-                self.memories[index].records.clear()
-                one = {n: v[index] if n in counts else v for n, v in given.items()}
-                images.append(render(with_values(self.scene, one), view, self.memories[index]))
+            count, images = next(iter(counts.values()), 1), []
+            # Each entry starts from its own last solutions.
+            while len(self.memories) < count:
+                self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
+            for index, memory in enumerate(self.memories[:count]):
+                memory.records.clear()
+                entry = {n: v[index] if n in counts else v for n, v in inputs.items()}
+                images.append(render(with_values(self.scene, entry), view, memory))
             return torch.stack(images) if counts else images[0]
 
     if TYPE_CHECKING:
@@ -152,6 +146,6 @@ def _map_tensors(fn: Callable[[Tensor], Tensor], record: Any) -> Any:
     if isinstance(record, dict):
         return {key: _map_tensors(fn, entry) for key, entry in record.items()}
     if is_dataclass(record) and not isinstance(record, type):
-        parts = {part.name: getattr(record, part.name) for part in fields(record) if part.init}
-        return replace(record, **{name: _map_tensors(fn, part) for name, part in parts.items()})
+        keys = [key.name for key in fields(record) if key.init]
+        return replace(record, **{key: _map_tensors(fn, getattr(record, key)) for key in keys})
     return record

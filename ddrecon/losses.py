@@ -1,4 +1,4 @@
-"""How far rendered images are from their targets, and how rough a field is."""
+"""How far rendered images are from their targets."""
 
 from __future__ import annotations
 
@@ -8,20 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
 from ddrecon.pictures.noise import Noise
 from ddrecon.pictures.scales import Scale, scale_of
 from ddrecon.pictures.similarity import structural_similarity
 
-ROUNDING = 1e-2
-"""Gradients below this, in units of one over the box's shortest side, are penalized quadratically
-rather than as total variation.
-"""
-KNEE = 1.2
-"""Total variation is that of densities far below it, and of the logarithm of those above (E11.3).
-
-It is in optical depths across the box's shortest side, whatever the unit of density is.
-"""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05
@@ -51,8 +41,9 @@ def huber(error: Tensor, target: Target) -> Tensor:
 
     Huber 1964, doi:10.1214/aoms/1177703732.
     """
-    part = (error / target.scale).abs()
-    return torch.where(part < HUBER, part**2, HUBER * (2 * part - HUBER)) * target.scale**2
+    relative = (error / target.scale).abs()
+    line = HUBER * (2 * relative - HUBER)
+    return torch.where(relative < HUBER, relative**2, line) * target.scale**2
 
 
 def relative_l2(error: Tensor, target: Target) -> Tensor:
@@ -70,8 +61,7 @@ def display(error: Tensor, target: Target) -> Tensor:
     is still black, and flat where it is too bright. What is brighter than a target that is white
     does not err.
     """
-    error = torch.where(target.image >= WHITE, error.clamp(max=0), error)
-    return l2(error, target)
+    return l2(torch.where(target.image >= WHITE, error.clamp(max=0), error), target)
 
 
 LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
@@ -89,9 +79,9 @@ class Target:
     """What images are compared with, `image` [3, h, w] (linear radiance), and how: by a `loss`.
 
     `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
-    numbers that do; `scale`: the root of their mean square. `on` is the scale on which quality is
-    told, `compared` the image on it and `slope` its derivative there; `peak` is its largest value
-    that counts.
+    numbers that do; `scale`: the root of their mean square. Quality is told on the scale `on`:
+    `compared` is the image on it, `slope` its derivative there, and `peak` the largest value that
+    counts.
     """
 
     loss: str
@@ -112,16 +102,16 @@ class Target:
 
         `noise` is for the loss `photon`, estimated where it is None.
         """
-        tiny = torch.finfo(image.dtype).tiny
+        least = torch.finfo(image.dtype).tiny ** 0.25
         if mask is None:
-            count, square = image.new_full((), image[0].numel() * 3), image.square()
+            count, seen = image.new_full((), image[0].numel() * 3), image
         else:
-            count, square = (3 * mask.sum()).clamp(min=1), image.square() * mask
-        scale = (square.sum() / count).sqrt().clamp(min=tiny**0.25)
+            count, seen = (3 * mask.sum()).clamp(min=1), image * mask
+        scale = (seen.square().sum() / count).sqrt().clamp(min=least)
         on = scale_of(loss, image, noise)
         compared = on.values(image)
         largest = (compared if mask is None else torch.where(mask > 0, compared, 0)).max()
-        peak = largest.clamp(min=tiny**0.25) if on.peak is None else scale.new_tensor(on.peak)
+        peak = largest.clamp(min=least) if on.peak is None else scale.new_tensor(on.peak)
         return Target(loss, image, mask, count, scale, on, compared, on.slope(image), peak)
 
     def loss_of(self, image: Tensor) -> Tensor:
@@ -135,8 +125,7 @@ class Target:
         (Huber 1981, doi:10.1002/0471725250): its slope over the error, which counts as at least
         `SMALL` of the target's scale.
         """
-        error = (image - self.image).detach()
-        least = SMALL * self.scale
+        error, least = (image - self.image).detach(), SMALL * self.scale
         error = torch.where(error.abs() < least, least.copysign(error), error).requires_grad_()
         with torch.enable_grad():
             (slope,) = torch.autograd.grad(LOSSES[self.loss](error, self).sum(), error)
@@ -161,42 +150,3 @@ class Target:
     def _mean(self, values: Tensor) -> Tensor:
         """The mean of `values` [3, h, w] over the numbers that count."""
         return (values if self.seen is None else values * self.seen).sum() / self.count
-
-
-def total_variation(field: Tensor, grid: Grid) -> Tensor:
-    """The mean length of the gradient of `field` [..., z, y, x] over the cells of `grid`.
-
-    The gradient is by position in units of the box's shortest side.
-
-    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the
-    same at every resolution and world scale, and rounded off at zero so that its derivative is
-    finite in flat regions.
-    """
-    side = min(grid.extent)
-    square = torch.full_like(field, ROUNDING**2)
-    for axis, spacing in zip((-3, -2, -1), grid.spacing, strict=True):
-        square = square + (rise_to_next(field, axis, grid) * (side / spacing)) ** 2
-    return (square.sqrt() - ROUNDING).mean()
-
-
-def rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
-    """By how much `field` [..., z, y, x] is more in the next cell along `axis`, -3 to -1.
-
-    After the last cell of a period comes its first; in a box the last has no next, and 0.
-    """
-    if axis % 3 in grid.periodic:
-        return field.roll(-1, axis) - field
-    return torch.cat([field.diff(dim=axis), torch.zeros_like(field.narrow(axis, 0, 1))], axis)
-
-
-def compress(field: Tensor, knee: float) -> Tensor:
-    """What of the density `field` is penalized: log(1 + field / `knee`) / 3 (E11.3).
-
-    `field` >= 0; `knee` > 0 is in its unit.
-    """
-    return torch.log1p(field / knee) / 3
-
-
-def compressed_slope(field: Tensor, knee: float) -> Tensor:
-    """The derivative of `compress` at `field`."""
-    return (3 * (field + knee)).reciprocal()

@@ -26,7 +26,7 @@ IN_PIXEL = 18
 SHORTAGE = "(out of|not enough) memory|(can.t|failed to) allocate|bad.?alloc|alloc_(cpu|failed)"
 """What torch and Warp say, in one place or another, where they get no memory."""
 _latest: list[Needs] = []
-"""Of the scene that was built last: a shortage may come anywhere later."""
+"""Those of the scene that was built last: a shortage may come anywhere later."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,19 @@ class Needs:
         """Bytes that rendering all views takes at its peak, without torch itself."""
         alive = self.numbers * math.prod(self.resolution) + IN_PIXEL * self.pixels
         return int(OVERHEAD * self.size * alive)
+
+    def smaller(self, limit: int) -> Iterator[str]:
+        """What takes at most `limit` bytes, in the words of the command line and scene file."""
+        if self.size == 8 and self.total <= 2 * limit:
+            yield "--dtype float32"
+        pixels = replace(self, resolution=(0, 0, 0)).total
+        cells = self.total - pixels
+        share = ((limit - pixels) / cells) ** (1 / 3) if limit > pixels else 0.0
+        if (coarser := [int(share * n) for n in self.resolution]) and min(coarser) > 0:
+            yield f"volume.resolution: {coarser}"
+        if pixels and cells < limit:
+            share = math.sqrt((limit - cells) / pixels)
+            yield f"images of {math.floor(100 * share)}% the width and height"
 
 
 def numbers_in_cell(colors: int, varied: int, moments: int, is_limited: bool) -> float:
@@ -73,7 +86,7 @@ def refuse_excess(needs: Needs, device: torch.device) -> str | None:
     place = "this machine" if device.type == "cpu" else "the GPU"
     return (
         f"takes about {gibibytes(needs.total)}, but {place} has {gibibytes(free)} free; "
-        f"this would fit: {', or '.join(_smaller(needs, free)) or 'nothing'}"
+        f"this would fit: {', or '.join(needs.smaller(free)) or 'nothing'}"
     )
 
 
@@ -85,63 +98,46 @@ def explain_shortage(error: BaseException) -> str | None:
     amount = re.search(r"allocate ([\d.]+ (?:[KMGT]i?B|bytes))", text)
     line = f"out of memory: {amount[1] if amount else 'what is needed next'} is not free"
     # More was needed than predicted: how much more is unknown, so what is said to fit takes half.
-    fits = ", or ".join(word for needs in _latest for word in _smaller(needs, needs.total // 2))
+    fits = ", or ".join(word for needs in _latest for word in needs.smaller(needs.total // 2))
     return f"{line}; this would fit: {fits or 'fewer cells of volume.resolution, smaller images'}"
 
 
-def _smaller(needs: Needs, limit: int) -> Iterator[str]:
-    """What takes at most `limit` bytes, in the words of the command line and the scene file."""
-    if needs.size == 8 and replace(needs, size=4).total <= limit:
-        yield "--dtype float32"
-    part, coarser = 1.0, needs
-    while coarser.total > limit and part > 1e-3:
-        part *= 0.95
-        coarser = replace(needs, resolution=tuple(max(1, int(part * n)) for n in needs.resolution))
-    if coarser.total <= limit:
-        yield f"volume.resolution: [{', '.join(map(str, coarser.resolution))}]"
-    of_cells = replace(needs, pixels=0).total
-    if of_cells < limit:
-        part = math.sqrt((limit - of_cells) / (needs.total - of_cells))
-        yield f"images of {math.floor(100 * part)}% the width and height"
-
-
 def free_memory(device: torch.device) -> int | None:
-    """Bytes that this process can still take on `device`, None if unknown.
-
-    By what the system says, and its limits on groups of processes.
+    """Bytes that this process can still take on `device`, by the system and by the limits of
+    control groups; None if unknown.
     """
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device))
-    known = []
+    amounts = []
     with suppress(OSError, TypeError):
         text = Path("/proc/meminfo").read_text()
-        known.append(1024 * int(re.search(r"MemAvailable: *(\d+)", text)[1]))  # type: ignore[index]
+        amounts.append(1024 * int(re.search(r"MemAvailable: *(\d+)", text)[1]))  # type: ignore[index]
     for limit, used in LIMITS.items():
         for allowed, text in _group_files(limit, "memory.stat"):
-            with suppress(ValueError, TypeError):  # of "max"; where it is not told
-                number = re.search(rf"^{used} (\d+)$", text, re.MULTILINE)
-                known.append(int(allowed) - int(number[1]))  # type: ignore[index]
-    return min(known, default=None)
+            with suppress(ValueError, TypeError):  # "max" is no number; `used` may be missing
+                in_use = re.search(rf"^{used} (\d+)$", text, re.MULTILINE)
+                amounts.append(int(allowed) - int(in_use[1]))  # type: ignore[index]
+    return min(amounts, default=None)
 
 
 def usable_cores() -> int:
     """How many cores this process may use, by its affinity and the quotas of its control groups."""
-    is_limited = hasattr(os, "sched_getaffinity")
-    cores = [len(os.sched_getaffinity(0)) if is_limited else os.cpu_count() or 1]
+    has_affinity = hasattr(os, "sched_getaffinity")
+    cores = [len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1]
     for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
         for texts in _group_files(*names):
-            with suppress(ValueError):  # of "max"
+            with suppress(ValueError):  # "max" is no number
                 quota, period = map(int, " ".join(texts).split())
                 cores += [math.ceil(quota / period)] * (quota > 0)
     return min(cores)
 
 
 def _group_files(*names: str) -> Iterator[list[str]]:
-    """The files of these `names` of each control group that holds this process."""
+    """The contents of the files `names` in each control group that holds this process."""
     lines = OWN_GROUPS.read_text().splitlines() if OWN_GROUPS.exists() else []
     for _, kinds, path in (line.split(":", 2) for line in lines):
-        top = GROUPS / kinds  # of Linux's second version, where groups of all kinds are one, none
+        top = GROUPS / kinds  # version 2 has no kinds: all its groups are in one tree
         inner = top / path.lstrip("/")
         for folder in (inner, *inner.parents):
             if folder.is_relative_to(top):
@@ -151,7 +147,5 @@ def _group_files(*names: str) -> Iterator[list[str]]:
 
 def gibibytes(amount: int) -> str:
     """`amount` bytes in words."""
-    size = amount / 2**30
-    if size >= 100:
-        return f"{size:.0f} GiB"
-    return f"{size:.3g} GiB" if size >= 1 else f"{amount / 2**20:.0f} MiB"
+    size, unit = (amount / 2**30, "GiB") if amount >= 2**30 else (amount / 2**20, "MiB")
+    return f"{size:.0f} {unit}" if size >= 100 else f"{size:.3g} {unit}"

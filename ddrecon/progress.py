@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
-"""`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
+"""`progress(items, text)` yields the `items` one by one, beside a bar of this `text`."""
 
 
 IN_A_LOG = 30.0
@@ -35,16 +35,16 @@ def bar_settings(is_quiet: bool) -> dict[str, Any]:
     return settings
 
 
-def say(what: str, is_quiet: bool) -> None:
-    """Says on stderr, above all bars, `what` is being done now; unless `is_quiet`."""
+def say(text: str, is_quiet: bool) -> None:
+    """Writes `text` to stderr, above all bars, unless `is_quiet`."""
     if not is_quiet:
-        tqdm.write(what, file=sys.stderr)
+        tqdm.write(text, file=sys.stderr)
 
 
 @contextmanager
-def tell(what: str, is_quiet: bool) -> Iterator[None]:
-    """Says `what` is being done until the block ends, where that takes long."""
-    timer = Timer(LONG, say, (f"{what} ...", is_quiet))
+def tell(text: str, is_quiet: bool) -> Iterator[None]:
+    """Writes `text` to stderr if the block takes long."""
+    timer = Timer(LONG, say, (f"{text} ...", is_quiet))
     timer.daemon = True
     timer.start()
     try:

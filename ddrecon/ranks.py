@@ -1,8 +1,8 @@
 """Ranks: the processes that share the work of one run, as torchrun starts them.
 
-Each does its own part, and what they find is summed. Without torchrun, or with a single process of
-it, there is one rank: nothing is imported, nothing is exchanged. What is drawn or decided alike on
-all ranks needs no exchange either.
+Each computes a share, and the shares are summed. Without torchrun, or with a single process of it,
+there is one rank: nothing is imported, nothing is exchanged. What is drawn or decided alike on all
+ranks needs no exchange either.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
-from time import perf_counter
 from typing import TYPE_CHECKING, TypeVar
 
 from ddrecon.errors import RanksError, UsageError, one_line
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MEET_SECONDS = 120.0
-"""So long ranks wait for each other at the start; the environment variable says otherwise."""
+"""So long ranks wait for each other at the start, unless `MEET_VARIABLE` says otherwise."""
 MEET_VARIABLE = "DDRECON_MEET_SECONDS"
 EXCHANGE_SECONDS = 1800.0
 """So long they wait in an exchange. A rank that has ended is noticed at once."""
@@ -30,17 +29,12 @@ EXCHANGE_SECONDS = 1800.0
 T = TypeVar("T")
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Group:
-    """This process's place among `count` ranks.
-
-    `bytes` were handed to exchanges so far, which took `seconds`. One rank exchanges nothing.
-    """
+    """This process is number `rank` of `count`."""
 
     rank: int = 0
     count: int = 1
-    bytes: int = 0
-    seconds: float = 0.0
 
 
 _group = _Group()
@@ -66,31 +60,22 @@ def join_ranks(has_gpu: bool) -> None:
         )
     rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
     seconds = float(os.environ.get(MEET_VARIABLE, MEET_SECONDS))
-    wait, limit = timedelta(seconds=seconds), timedelta(seconds=EXCHANGE_SECONDS)
-    keys = [f"ddrecon/here/{other}" for other in range(count)]
+    keys = [f"rank {other}" for other in range(count)]
     try:
-        store, *_ = next(dist.rendezvous("env://", timeout=wait))
-        store.set(keys[rank], "here")
+        store, *_ = next(dist.rendezvous("env://", timeout=timedelta(seconds=seconds)))
+        store = dist.PrefixStore("ddrecon", store)
+        store.set(keys[rank], "is there")
+        store.wait(keys, timedelta(seconds=seconds))
+        backend, limit = "cpu:gloo,cuda:nccl" if has_gpu else "gloo", EXCHANGE_SECONDS
+        dist.init_process_group(
+            backend, store=store, rank=rank, world_size=count, timeout=timedelta(seconds=limit)
+        )
     except (RuntimeError, ValueError, OSError) as error:
         raise RanksError(
             f"rank {rank} of {count} cannot meet the others at {os.environ['MASTER_ADDR']}:"
-            f"{os.environ['MASTER_PORT']} within {seconds:g} s ({_reason(error)});"
-            " check MASTER_ADDR and MASTER_PORT, or torchrun's rendezvous"
-        ) from error
-    try:
-        store.wait(keys, wait)
-    except RuntimeError as error:
-        absent = ", ".join(str(other) for other in range(count) if not store.check([keys[other]]))
-        raise RanksError(
-            f"rank {rank} of {count} has waited {seconds:g} s in vain for rank {absent}"
-        ) from error
-    backend, own = "cpu:gloo,cuda:nccl" if has_gpu else "gloo", dist.PrefixStore("ddrecon", store)
-    try:
-        dist.init_process_group(backend, store=own, rank=rank, world_size=count, timeout=limit)
-    except RuntimeError as error:
-        raise RanksError(
-            f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
-            "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
+            f"{os.environ['MASTER_PORT']} within {seconds:g} s ({_reason(error)}); check "
+            "MASTER_ADDR, MASTER_PORT and torchrun's rendezvous; GLOO_SOCKET_IFNAME and "
+            "NCCL_SOCKET_IFNAME name the network to use"
         ) from error
     _group = _Group(rank, count)
 
@@ -131,11 +116,6 @@ def alone() -> Iterator[None]:
         _group = group
 
 
-def exchanged() -> tuple[int, float]:
-    """Bytes that this rank has handed to exchanges so far, and the seconds that they took."""
-    return _group.bytes, _group.seconds
-
-
 def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     """The sums over ranks of each of `tensors`, of one device: the same bits on all of them.
 
@@ -146,12 +126,14 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     import torch
 
     flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
-    with _exchange(flat.nbytes):
+    with _exchange():
         torch.distributed.all_reduce(flat)
         if flat.is_cuda:
             torch.cuda.synchronize(flat.device)
-    parts = flat.split([tensor.numel() for tensor in tensors])
-    return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
+    sums = flat.split([tensor.numel() for tensor in tensors])
+    return [
+        total.view(like.shape).to(like.dtype) for total, like in zip(sums, tensors, strict=True)
+    ]
 
 
 def sum_numbers(numbers: Sequence[float]) -> list[float]:
@@ -181,25 +163,21 @@ def from_first(value: T) -> T:
         torch.save(value, stream)
     content = torch.frombuffer(bytearray(stream.getvalue() or b"0"), dtype=torch.uint8)
     size = torch.tensor(len(content))
-    with _exchange(0):
+    with _exchange():
         torch.distributed.broadcast(size, 0)
-    content = content if _group.rank == 0 else content.new_empty(int(size))
-    with _exchange(content.nbytes):
+        content = content if _group.rank == 0 else content.new_empty(int(size))
         torch.distributed.broadcast(content, 0)
     copy: T = torch.load(BytesIO(content.numpy().tobytes()), map_location="cpu", weights_only=True)
     return copy
 
 
 @contextmanager
-def _exchange(count: int) -> Iterator[None]:
-    """An exchange of `count` bytes, which becomes a RanksError where a rank has ended."""
-    begun = perf_counter()
+def _exchange() -> Iterator[None]:
+    """An exchange, whose error becomes a RanksError: another rank has ended."""
     try:
         yield
     except RuntimeError as error:
         raise RanksError(f"another rank has ended ({_reason(error)})") from error
-    _group.bytes += count
-    _group.seconds += perf_counter() - begun
 
 
 def tell_failure(error: BaseException) -> str | None:

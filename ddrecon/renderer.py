@@ -22,14 +22,14 @@ from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import iterate_picard, solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.printed import iterate_jacobi, solve_printed
-from ddrecon.diffusion.solvers.multigrid import name_kernels, solve_by_multigrid
+from ddrecon.diffusion.solve import name_kernels, solve_by_multigrid
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Cut, add, cut, fill, floored, weigh
 from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towards, sum_turned
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
@@ -75,25 +75,27 @@ EXCHANGES = 4
 class LightField:
     """All light inside a medium.
 
-    `beams` are those of directional and point lights (E2.2), `diffuse` the other light, L0 and L1.
+    `beams` are those of directional and point lights (E2.2), `diffuse` phi of the other light.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `outside` [C, 1, 1, 1] is the radiance that enters through faces, None where
-    nothing is known of that. `turned` is light that backward peaks have turned (E8.11). `received`
-    is what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells, else values
-    at centers. `ground` is what lies below, where there is any. `reflected` is what of `diffuse`
-    are beams that faces have reflected (E5.8): no camera looks along these.
+    camera's rays anew. `outside` [C, 1, 1, 1] is the radiance that enters through faces, and
+    `source` [1 or 4, C, z, y, x] are moments of what is received of beams there, Q0 and Q1; None
+    where nothing is known of that. `turned` is light that backward peaks have turned (E8.11).
+    `received` is what cells receive of `beams`. After rounds `diffuse` light `has_means` of cells,
+    else values at centers. `ground` is what lies below, where there is any. `reflected` is what of
+    `diffuse` are beams that faces have reflected (E5.8): no camera looks along these.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
-    diffuse: Moments
+    diffuse: Tensor
     received: Received
     has_means: bool = False
     skies: tuple[Sky, ...] = ()
     turned: tuple[TurnedBeam, ...] = ()
     ground: LitGround | None = None
     outside: Tensor | None = None
-    reflected: Moments | None = None
+    source: Tensor | None = None
+    reflected: Tensor | None = None
 
     def unrolled(self) -> tuple[Unrolled, LightField]:
         """What view rays meet on their way through one period of the medium."""
@@ -103,11 +105,10 @@ class LightField:
         beams = (replace(beam, mass=period.extend(beam.mass)) for beam in self.beams)
         turned = (replace(one, radiance=period.extend(one.radiance)) for one in self.turned)
         medium = self.medium.put(period.wide, period.extend)
-        light, source = self.diffuse.mapped(period.extend), self.received.source
-        source = Moments(source.mean, source.flux).mapped(period.extend)
+        light = period.extend(self.diffuse)
+        source = None if self.source is None else period.extend(self.source)
         wide = replace(self, medium=medium, beams=tuple(beams), diffuse=light, turned=tuple(turned))
-        wide = replace(wide, received=replace(self.received, source=source))
-        return period, wide
+        return period, replace(wide, source=source)
 
 
 @dataclass(frozen=True)
@@ -192,12 +193,12 @@ def _find_light(
     lights: Sequence[Source],
     settings: DiffusionSettings,
     memory: SolveMemory,
-    below: Moments | None = None,
+    below: Tensor | None = None,
 ) -> LightField:
     """The light of `lights` in `volume`, and of what comes from `below` on a grid of the box."""
     medium = refine_medium(_medium_of(volume, settings), settings.times, settings.refine_along)
     if below is not None:
-        below = below.mapped(lambda field: resample(field, medium.grid))
+        below = resample(below, medium.grid)
     reflected = None
     if medium.index != 1:
         # With what faces reflect inside of light that is not yet scattered (E5.8).
@@ -212,24 +213,26 @@ def _find_light(
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     if below is not None:
-        sky = below if sky is None else sky.plus(below)
-    source = received.source
+        sky = below if sky is None else add(sky, below)
+    source = beamed = cut(received.source)
     if sky is not None:
-        source = source.plus(sky.weighted(remaining_moments(cells)))
+        source = cut(add(received.source, weigh(sky, remaining_moments(cells))))
     outside = ambient_radiance(lights, cells.g)
     if medium.index != 1:
         outside = medium.index**2 * outside
     # L0 and L1: E2.4 to E2.6.
     diffuse = solve_diffuse(cells, source, outside, settings, memory)
     # Skies scatter by E2.3 as well; beams by E2.2 on each view ray.
-    light = diffuse if sky is None else diffuse.plus(sky)
+    light = diffuse if sky is None else add(diffuse, sky)
     beams, has_means = follow_lights(medium, lights), settings.rounds > 0
     found = LightField(medium, beams, light, received, has_means, turned=received.turned)
-    return replace(found, outside=outside if has_means else None, reflected=reflected)
+    if not has_means:
+        return replace(found, reflected=reflected)
+    return replace(found, outside=outside, source=beamed[0], reflected=reflected)
 
 
 def follow_unscattered_light(
-    medium: Medium, lights: Sequence[Source], below: Moments | None = None
+    medium: Medium, lights: Sequence[Source], below: Tensor | None = None
 ) -> LightField:
     """The light inside `medium` that has not been scattered.
 
@@ -239,11 +242,11 @@ def follow_unscattered_light(
     skies = tuple(light for light in lights if isinstance(light, Sky))
     if any(isinstance(light, AmbientLight) for light in lights):
         skies = (*skies, ambient_sky(ambient_radiance(lights, medium.g)))
-    light = Moments(torch.zeros_like(medium.extinction.value)) if below is None else below
+    light = torch.zeros_like(medium.extinction.value)[None] if below is None else below
     if medium.is_anisotropic:
         return LightField(medium, beams, light, received, skies=skies)
     sky = sum_unscattered_sky(medium, skies, 0)
-    light = light if sky is None else light.plus(sky)
+    light = light if sky is None else add(light, sky)
     return LightField(medium, beams, light, received)
 
 
@@ -259,12 +262,12 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
     """The fluence [C, z, y, x] >= 0, averaged over each cell of the medium."""
     medium = light_field.medium
-    mean = light_field.diffuse.mean + light_field.received.mean
+    mean = light_field.diffuse[0] + light_field.received.mean
     sky = sum_unscattered_sky(medium, light_field.skies, 0)
-    mean = mean if sky is None else mean + sky.mean
+    mean = mean if sky is None else mean + sky[0]
     if medium.emission is not None and not multiply_scatters(medium, settings):
         cells, directions = average_cells(medium), DIRECTIONS[settings.angles]
-        mean = mean + sweep_emission(cells, directions, face_mirror(cells, directions)).mean
+        mean = mean + sweep_emission(cells, directions, face_mirror(cells, directions))[0]
     return 4 * math.pi * mean.clamp(min=0)
 
 
@@ -282,14 +285,14 @@ def _glow(
         return replace(each[0], diffuse=torch.cat([one.diffuse for one in each]))
     period, wide = light_field.unrolled()
     light, degree = scatter_once_more(wide.medium, wide.diffuse), wide.medium.degree
-    values = harmonics(-upwards(plane)[0], degree).T.to(light.mean)
-    diffuse = torch.tensordot(values, light.harmonics(degree), 1)
+    values = harmonics(-upwards(plane)[0], degree).T.to(light)
+    diffuse = torch.tensordot(values, fill(light, degree), 1)
     if wide.turned:
         diffuse = diffuse + torch.stack([sum_turned(wide.medium, r, wide.turned) for r in bundles])
-    diffuse = recompute(light.floored, diffuse)
+    diffuse = recompute(floored, diffuse, light[0], len(light) > 1)
     if light_field.has_means:
         diffuse = sharpen(wide.medium, diffuse.flatten(0, 1)).unflatten(0, (len(bundles), -1))
-    scattered = torch.tensordot(values, light_field.received.source.harmonics(degree), 1)
+    scattered = torch.tensordot(values, fill(light_field.received.source, degree), 1)
     if not wide.medium.is_cellwise:
         scattered = (1 - wide.medium.forward_fraction) * scattered
     diffuse = (diffuse + period.extend(scattered)).flatten(0, 1)
@@ -310,20 +313,21 @@ def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
 
 def solve_diffuse(
     medium: Medium,
-    source: Moments,
+    source: Cut,
     outside: Tensor,
     settings: DiffusionSettings,
     memory: SolveMemory,
-) -> Moments:
-    """L0 and L1 (E2.4 to E2.6), by the scheme of `settings`.
+) -> Tensor:
+    """phi of light (E2.4 to E2.6, E2.10), by the scheme of `settings`.
 
-    `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
+    `source`: moments of Q0 and Q1, and those of higher degree; `outside` [C, 1, 1, 1]: the radiance
+    of ambient light.
     """
     if (settings.model, settings.scheme) != ("p1", "conservative"):
         scattering = medium.remaining_scattering
-        scattered = source.scaled(scattering, scattering)
+        scattered = scattering * source[0]
         if medium.emission is not None:
-            scattered = replace(scattered, mean=scattered.mean + medium.emission)
+            scattered = add(scattered, medium.emission[None])
         if settings.model == "flux_limited":
             solve = SolverWithMemory(iterate_picard, settings.tolerance, memory)
             return solve_flux_limited(medium, scattered, outside, solve, medium.has_flux)
@@ -332,11 +336,10 @@ def solve_diffuse(
         return solve_printed(medium, diffusion, scattered, outside, solve, medium.has_flux)
     solve = SolverWithMemory(solve_by_multigrid, settings.tolerance, memory)
     closure = Closure(settings.closure, medium.grid, settings.floor)
-    problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
+    problem = DiffusionProblem(medium, closure, source[0], outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(
-        problem, light, solve, settings.rounds, settings.angles, settings.transport_tolerance or 0.0
-    )
+    tolerance = settings.transport_tolerance or 0.0
+    return run_rounds(problem, source[1], light, solve, settings.rounds, settings.angles, tolerance)
 
 
 def view_picture(
@@ -392,13 +395,12 @@ def _without_glow(light_field: LightField) -> LightField:
 
 def _without_diffuse(light_field: LightField) -> LightField:
     """What comes in through faces is then what the medium would emit there."""
-    outside, nothing = light_field.outside, torch.zeros_like(light_field.diffuse.mean)
-    given = replace(light_field, diffuse=Moments(nothing), skies=(), turned=(), reflected=None)
+    outside, nothing = light_field.outside, torch.zeros_like(light_field.diffuse[0])
+    given = replace(light_field, diffuse=nothing[None], skies=(), turned=(), reflected=None)
     given = replace(given, outside=None)
     if outside is None or light_field.medium.emission is None:
         return given
-    received = Received(Moments(nothing), nothing)
-    return replace(given, received=received, outside=torch.zeros_like(outside))
+    return replace(given, source=nothing[None], outside=torch.zeros_like(outside))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -441,9 +443,9 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
         at_faces, sky = light_field.diffuse, sum_unscattered_sky(medium, light_field.skies, 0)
-        at_faces = at_faces if sky is None else at_faces.plus(sky)
+        at_faces = at_faces if sky is None else add(at_faces, sky)
         if light_field.reflected is not None:
-            at_faces = at_faces.plus(light_field.reflected.scaled(-1, -1, -1))
+            at_faces = add(at_faces, -light_field.reflected)
         beside = look_behind(rays, given)
         radiance = rays.direction.new_zeros(1, 1) if beside is None else beside
         for window in windows:
@@ -491,7 +493,7 @@ def _emission(
     )
     if not light_field.medium.grid.periodic:
         return emission
-    depends = light_field.diffuse.flux is not None or light_field.skies
+    depends = len(light_field.diffuse) > 1 or light_field.skies
 
     def from_eye(eye: Tensor) -> Emission:
         return _emission(light_field, replace(bundle, eye=eye), (period, wide))
@@ -501,7 +503,7 @@ def _emission(
 
 def _inflow(light_field: LightField, rays: Rays) -> Inflow | None:
     """What comes in through faces, as seen along `rays`."""
-    if light_field.outside is None:
+    if light_field.outside is None or light_field.source is None:
         return None
     medium = light_field.medium
     kept = (
@@ -512,7 +514,7 @@ def _inflow(light_field: LightField, rays: Rays) -> Inflow | None:
     # Faces let out and in a part only of what goes through.
     let_in = transmitted_moments(medium.index)[0]
     back = [let_in * part for part in scatter_back(medium, rays)]
-    return Inflow(light_field.outside, light_field.received.source, kept, back)
+    return Inflow(light_field.outside, light_field.source, kept, back)
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor | None:

@@ -21,6 +21,7 @@ from ddrecon.light.lights import Light
 from ddrecon.march.samplers import choose_steps
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
+from ddrecon.records import bounded, faults_of
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, RenderSettings
 
 
@@ -41,11 +42,11 @@ class View:
     image: Tensor | None = None
     mask: Tensor | None = None
     is_test: bool = False
-    weight: float = 1.0
+    weight: float = bounded(1.0, above=0)
     exposure: Tensor | None = None
     offset: Tensor | None = None
     background: Tensor | None = None
-    step: float = 0.0
+    step: float = bounded(0.0, minimum=0)
     noise: Noise | None = None
 
     @property
@@ -83,11 +84,10 @@ class Scene(Displayed):
 
     def settle(self) -> None:
         """Has what settings leave out become what the medium deserves, in files and in Python."""
+        if any(faults_of(self, keys=("volume", "render", "diffusion"))):
+            return  # it cannot be rendered, which `render` says
         volume, optimized = self.volume, self.optimize.parameters if self.optimize else ()
         media = [*volume.media.values()] if volume.media else [volume]
-        numbers = [number for one in media for number in (one.density, one.sigma_a, one.sigma_s)]
-        if not all(isinstance(one, Tensor) for one in numbers):
-            return  # it cannot be rendered, which `render` says
         with torch.no_grad():
             self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
             if self.render.steps_per_voxel is None:

@@ -1,91 +1,34 @@
 """The sections `render`, `diffusion` and `optimize` of a scene: defaults and legal values.
 
-What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
-`below` of its numbers, or its `choices`, which are the names of a table of implementations. No
-table is loaded here: a scene file is read without torch. `violations` yields what is wrong with
-several values together.
+The `choices` of a field are the names of a table of implementations. No table is loaded here: a
+scene file is read without torch. `violations` yields what is wrong with several values together.
 """
 
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypedDict, Unpack
+from typing import Literal
+
+from ddrecon.records import Violation, bounded, one_of
 
 FLOOR = 3.3
-"""Optical thickness across the box's shortest side that the closure `smooth` gives empty space.
-
-See docs/theory.md, section 5.
-"""
+"""Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
-
-LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
-    "minimum": ("at least", operator.ge),
-    "above": ("above", operator.gt),
-    "maximum": ("at most", operator.le),
-    "below": ("below", operator.lt),
-}
-"""What a bound in a field's metadata means."""
-Violation = tuple[str, str]
-"""The key of a record that breaks a rule, and what is wrong with its value."""
-
-
-class Limits(TypedDict, total=False):
-    """What each number of a field must be: `minimum` and `maximum` are legal, the others not.
-
-    `expert`: whether no scene needs the field, so that the manual has it on a page of its own.
-    """
-
-    minimum: float
-    above: float
-    maximum: float
-    below: float
-    expert: bool
-
-
-def bounded(default: Any = MISSING, **limits: Unpack[Limits]) -> Any:
-    """A number, or numbers, within `limits`; the scene must give it where it has no `default`."""
-    return field(default=default, metadata=dict(limits))
-
-
-def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
-    """One of `choices`, `default` where the scene gives none."""
-    return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
-
-
-def faults_of(record: Any) -> Iterator[Violation]:
-    """The keys of `record`, made in Python, whose values a scene file could not have, and why."""
-    for part in fields(record):
-        value, known = getattr(record, part.name), part.metadata
-        if value is None and part.default is None:
-            continue
-        if value not in known.get("choices", [value]):
-            words = ", ".join(map(str, known["choices"]))
-            yield part.name, f"expected one of {words}, found {value!r}"
-        for name, (words, is_within) in LIMITS.items():
-            if name not in known:
-                continue
-            if not isinstance(value, Real):
-                yield part.name, f"expected a number, found {value!r}"
-            elif not is_within(float(value), known[name]):
-                yield part.name, f"must be {words} {known[name]:g}, found {float(value):g}"
 
 
 @dataclass(frozen=True)
 class RenderSettings:
     """How view rays are sampled.
 
-    `steps_per_voxel`: a scene file that leaves it out gets what its densest cell deserves.
-    `tolerance`: pixels closer together than half a voxel are interpolated between rays that are
-    half a voxel apart. A pixel that this may change by more than this part of the image's root mean
-    square has rays of its own; with 0 every pixel has. `background`: ambient light and environment
-    maps are also seen directly.
+    `steps_per_voxel` is chosen by the medium where it is None. Pixels closer together than half a
+    voxel are interpolated between rays half a voxel apart, unless that may change a pixel by more
+    than `tolerance` of the image's root mean square; 0 gives every pixel a ray of its own.
+    `background`: ambient light and environment maps are also seen directly.
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
@@ -95,29 +38,22 @@ class RenderSettings:
 
     @property
     def steps(self) -> int:
-        """Samples a cell along a ray: left out, one."""
-        return 1 if self.steps_per_voxel is None else self.steps_per_voxel
+        """Samples a cell along a ray: 1 where `steps_per_voxel` is None."""
+        return self.steps_per_voxel or 1
 
 
 @dataclass(frozen=True)
 class DiffusionSettings:
     """How multiply scattered light is computed.
 
-    `tolerance` is the relative residual of each linear solve. A reconstruction solves less closely
-    where its gradient needs no more.
-
-    The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
-    iteration; the model `flux_limited` has no closure. `floor` is that of the smooth closure.
-    `transport_rounds` sweeps take P1 towards transport, and keep angles to `degree`; with a
-    `transport_tolerance` they end where one changes light by less of it (docs/theory.md, section
-    7). Light is computed and seen in cells a `refine`th as wide along the axes `refine_along`. A
-    scene file that leaves these out gets what its medium deserves.
+    `tolerance` is the relative residual of each linear solve; a reconstruction solves less closely
+    where its gradient needs no more. The scheme `printed` is the paper's own, always with the
+    closure `smooth`, whose empty space has the optical thickness `floor`; the model `flux_limited`
+    has no closure. `transport_rounds` of sweeps take P1 towards transport, with angles up to
+    `degree`; with a `transport_tolerance` rounds end where one changes light by less of it
+    (docs/theory.md, section 7). Cells of light are `refine` times as narrow along `refine_along`.
+    What is None is chosen by the medium.
     """
-
-    RETIRED: ClassVar[Mapping[str, str]] = {
-        "transport_directions": "directions follow from diffusion.transport_rounds and degree"
-    }
-    """Keys of old scene files, and what to write instead."""
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"), expert=True)
@@ -132,27 +68,29 @@ class DiffusionSettings:
     refine_along: str = one_of("xyz", ("x", "y", "z", "xy", "xz", "yz", "xyz"), expert=True)
 
     @property
-    def angles(self) -> int:
-        """The degree to which light's angles are kept: left out 3, and 1 by diffusion alone."""
-        if not self.rounds:
-            return 1
-        return 3 if self.degree is None else self.degree
-
-    @property
-    def times(self) -> int:
-        """How many times as narrow cells are in which light is computed: left out, as they are."""
-        return 1 if self.refine is None else self.refine
+    def has_rounds(self) -> bool:
+        """Whether transport rounds are possible: they begin with P1 in conservative form."""
+        return (self.model, self.scheme) == ("p1", "conservative")
 
     @property
     def rounds(self) -> int:
-        """How many transport rounds there are at most: left out, one where there can be any."""
-        can_have_rounds = (self.model, self.scheme) == ("p1", "conservative")
-        return int(can_have_rounds) if self.transport_rounds is None else self.transport_rounds
+        """The most transport rounds: where None, one if any are possible."""
+        return int(self.has_rounds) if self.transport_rounds is None else self.transport_rounds
+
+    @property
+    def angles(self) -> int:
+        """The degree up to which light's angles are kept: where None 3, without rounds 1."""
+        return (self.degree or 3) if self.rounds else 1
+
+    @property
+    def times(self) -> int:
+        """How many times as narrow as the medium's the cells of light are."""
+        return self.refine or 1
 
     def violations(self) -> Iterator[Violation]:
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
-        if self.rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
+        if self.rounds > 0 and not self.has_rounds:
             yield (
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",
@@ -176,8 +114,6 @@ Iterations = int | Literal["auto"]
 """How many iterations a run has, or `auto`: it ends by itself."""
 AUTO: Literal["auto"] = "auto"
 MASKS = "masks"
-
-
 MARGIN = 2.0
 """By how many pixels what a view shows is widened, unless a scene says."""
 
@@ -186,23 +122,13 @@ MARGIN = 2.0
 class ParameterSettings:
     """How one parameter is optimized.
 
-    It starts from `init` (None: what the scene says), stays within [`min`, `max`] and has the
-    learning rate `lr` (None: that of its kind).
-
-    `field`: whether it differs from cell to cell (None: if it does so where it starts; density
-    always does).
-
-    `tv` weighs its total variation, of density by E11.3; 1 would weigh it as much as the whole
-    brightness of the targets.
-
-    `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
-    brighter than black; widened by `support_margin` pixels, or `MARGIN`. None is anywhere.
+    It starts from `init` (None: the scene's own value), stays within [`min`, `max`] and has the
+    learning rate `lr` (None: that of its kind). `field`: whether it differs from cell to cell
+    (None: if its start does; density always does). `tv` weighs its total variation, of density by
+    E11.3; 1 weighs it as much as the whole brightness of the targets. `support`: density is 0
+    outside what pictures show, by `masks` or, `auto`, by what is brighter than black, widened by
+    `support_margin` pixels, or `MARGIN`; None allows it anywhere.
     """
-
-    RETIRED: ClassVar[Mapping[str, str]] = {
-        "even_until": "cells are free from the start now: leave it out",
-        "l1": "haze is left out by support: masks or support: auto; leave l1 out",
-    }
 
     init: Start | None = None
     lr: float | None = bounded(None, above=0)
@@ -249,17 +175,16 @@ class OptimizeSettings:
     """What is optimized, and how.
 
     `iterations`: in all; with `auto` a run ends when it is done, see `reconstruct.schedule`.
-    `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
-    `begin_at`: the fraction that counts as made already, as for a frame of a film that begins with
-    another: what is left begins at the resolution and rates of then. `keep_start`: the part of what
-    fields began with that is mixed into them in the end. `final_rate`: the part of
-    their value to which learning rates fall over a run. A twentieth takes fewer iterations at full
-    resolution where pictures agree (the plume); a fifth is better where they do not (the capture).
-    `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
-    all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
-    that of the diffusion (the paper's Fig. 9). `loss`: None is what the kind of pictures deserves.
-    `noise` is that of all pictures that have none of their own, for the loss `photon` and to know
-    when it is left.
+    `loss`: None is chosen by the kind of pictures. `noise`: of all pictures without their own, for
+    the loss `photon` and to know when only noise is left. `views_per_iteration`: training views
+    drawn at random for an iteration; 0 for all. `derivatives`: the radiance that passes
+    derivatives on: all of it, that scattered once, or that of the diffusion (the paper's Fig. 9).
+    `refine_at`: fractions of the run at which the grid becomes finer. `begin_at`: the fraction that
+    counts as done, so that a film's frame begins at the resolution and rates of then.
+    `keep_start`: the share of the fields' start that is mixed into them in the end. `final_rate`:
+    the share of their value to which learning rates fall over a run. A twentieth takes fewer
+    iterations at full resolution where pictures agree (the plume); a fifth is better where they do
+    not (the capture).
     """
 
     parameters: Mapping[str, ParameterSettings]

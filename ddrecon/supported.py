@@ -7,20 +7,12 @@ from collections.abc import Iterator
 from ddrecon.errors import UsageError
 from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.scene import Scene
-from ddrecon.settings import faults_of
 
 
 def require_supported(scene: Scene) -> None:
     """Raises UsageError for what is not computed of `scene`; its line begins with the key."""
     for problem in _unsupported(scene):
         raise UsageError(problem)
-
-
-def require_settings(scene: Scene) -> None:
-    """Raises UsageError for a setting of `scene` that no scene file may have."""
-    for section in ("render", "diffusion"):
-        for key, what in faults_of(getattr(scene, section)):
-            raise UsageError(f"{section}.{key}: {what}")
 
 
 def require_above(scene: Scene) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.engine import engine_of_parts, has_kernels
+from ddrecon.engine import engine_of_parts
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import (
@@ -21,7 +21,7 @@ from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.medium.fresnel import transmitted_moments
-from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
+from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import exchange_grid, multiply_scatters
 from ddrecon.scene import Scene
@@ -42,7 +42,7 @@ def needed_terms(scene: Scene) -> list[str]:
         *_light_terms(scene, is_diffuse),
         *_glow_terms(scene.volume, is_diffuse),
         *_face_terms(scene.volume.index),
-        *([] if scene.ground is None else [_ground_term(scene.ground, scene.volume.grid)]),
+        *_ground_terms(scene.ground, scene.volume.grid),
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {depth:.2g} optical depths",
     ]
@@ -50,55 +50,35 @@ def needed_terms(scene: Scene) -> list[str]:
 
 def engine_of_scene(scene: Scene) -> dict[str, str]:
     """The engine that runs each part of rendering `scene`."""
-    return engine_of_parts(parts_in_torch(scene, scene.volume.density.is_cuda))
-
-
-def parts_in_torch(scene: Scene, is_on_gpu: bool) -> tuple[str, ...]:
-    """The parts that are torch's with every engine, for what `scene` asks of them.
-
-    Of diffusion in a volume that repeats that is the solve. Of point lights that is all but the
-    mass on the way to them; of phase functions by cell, what light and rounds are at cells: view
-    rays look them up.
-    """
-    settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
-    is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    is_fused = is_fused and has_kernels("diffusion", is_on_gpu)
-    has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
-    is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
-    repeats = bool(scene.volume.grid.periodic)
-    parts = {
-        "diffusion": not is_fused or (repeats and is_diffuse),
-        "transport rounds": has_rounds
-        and (repeats or scene.volume.index != 1 or not has_kernels("transport rounds", is_on_gpu)),
-        "point lights": any(isinstance(light, PointLight) for light in scene.lights),
-        "pairs of beams": is_diffuse and _has_pairs(medium, scene),
-        "phases by cell": medium.is_cellwise,
-        "faces that refract": scene.volume.index != 1,
-        "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
-    }
-    return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
+    volume, settings = scene.volume, scene.diffusion
+    return engine_of_parts(
+        gpu=volume.density.is_cuda,
+        periodic=bool(volume.grid.periodic),
+        refracting=volume.index != 1,
+        printed=settings.scheme == "printed",
+        flux_limited=settings.model == "flux_limited",
+    )
 
 
 def _color_term(scene: Scene) -> str:
     """How many color channels there are, and what has as many."""
     volume, ground = scene.volume, scene.ground
-    lights = [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS]
     views = [v for each in scene.views for v in (each.exposure, each.offset, each.background)]
-    colors = {
-        "the medium": _count_colors(volume.sigma_a, volume.sigma_s),
-        "the phase function": volume.phase.colors,
-        "what glows": _count_colors(volume.emission, volume.black_body),
-        "lights": _count_colors(*lights),
-        "the ground": _count_colors(None if ground is None else ground.albedo),
-        "views": _count_colors(*views),
+    values: dict[str, list[Tensor | None]] = {
+        "the medium": [volume.sigma_a, volume.sigma_s],
+        "what glows": [volume.emission, volume.black_body],
+        "lights": [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS],
+        "the ground": [] if ground is None else [ground.albedo],
+        "views": views,
     }
-    colored = ", ".join(name for name, count in colors.items() if count > 1)
-    return f"3 color channels ({colored})" if colored else "1 color channel (all is gray)"
-
-
-def _count_colors(*values: Tensor | None) -> int:
-    """Of `values` [C, ...], numbers and Nones the largest C, or 1."""
-    return max((len(value) for value in values if value is not None and value.ndim), default=1)
+    colored = ["the phase function"] * (volume.phase.colors > 1)
+    for name, tensors in values.items():
+        # Colors are the first axis; a number without axes is a factor of all colors.
+        if any(value is not None and value.ndim and len(value) > 1 for value in tensors):
+            colored.append(name)
+    return (
+        f"3 color channels ({', '.join(colored)})" if colored else "1 color channel (all is gray)"
+    )
 
 
 def _face_terms(index: float) -> list[str]:
@@ -127,49 +107,44 @@ def _diffuse_terms(medium: Medium, scene: Scene, is_diffuse: bool) -> list[str]:
     """The terms of light that is scattered more than once."""
     if not is_diffuse:
         return ["no multiple scattering: no diffusion solve"]
-    settings, terms = scene.diffusion, []
-    fraction = medium.forward_fraction
+    settings, fraction = scene.diffusion, medium.forward_fraction
+    methods = {
+        ("p1", "conservative"): f"{settings.closure} closure, multigrid",
+        ("p1", "printed"): "smooth closure, printed scheme by Jacobi iteration",
+        ("flux_limited", "conservative"): "damped Picard iteration with multigrid",
+    }
+    method = methods[settings.model, settings.scheme]
+    terms = [f"multiple scattering by {settings.model} diffusion, {method}"]
     if bool((fraction > 0).any()):
-        part = _listed(fraction, medium.is_cellwise)
-        terms.append(f"delta-Eddington scaling of the forward peak, {part} of scattering")
-    if settings.scheme == "printed":
-        method = "smooth closure, printed scheme by Jacobi iteration"
-    elif settings.model == "flux_limited":
-        method = "damped Picard iteration with multigrid"
-    else:
-        method = f"{settings.closure} closure, multigrid"
-    terms.append(f"multiple scattering by {settings.model} diffusion, {method}")
-    if settings.rounds:
-        rounds = _count(settings.rounds, "transport round")
-        if settings.transport_tolerance is not None:
-            rounds += f" at most, to a residual of {settings.transport_tolerance:g},"
-        directions = count_directions(settings.angles, settings.rounds)
-        rounds += f" of sweeps along {directions} directions, each with a diffusion solve"
-        if medium.degree > 1:
-            left = remaining_moments(medium)[2].abs().max().item()
-            rounds += f"; each leaves up to {left:.2g} of what diffusion lacks"
-        terms.append(rounds)
-        if settings.times > 1:
-            finer = scene.volume.grid.refine(settings.times, settings.refine_along)
-            cells = " x ".join(map(str, reversed(finer.shape)))
-            along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
-            terms.append(f"light in {cells} cells, {settings.times} times as narrow{along}")
-        if scene.reason:
-            terms.append(f"by default {scene.reason}")
-        if _has_pairs(medium, scene):
-            part = _listed(backward_fraction(medium), medium.is_cellwise)
-            terms.append(f"beams in pairs: a backward peak turns {part} of scattering back")
-    else:
-        terms.append("no transport rounds: diffusion alone")
+        share = _listed(fraction, medium.is_cellwise)
+        terms.insert(0, f"delta-Eddington scaling of the forward peak, {share} of scattering")
+    terms += _round_terms(medium, scene) or ["no transport rounds: diffusion alone"]
     moments = count_harmonics(medium.degree)
-    kept = ["no fluxes Q1 and L1 (g = 0)", "fluxes Q1 and L1 (g is not 0)"]
-    kept += [f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"]
-    return [*terms, kept[min(medium.degree, 2)]]
+    degrees = ["no fluxes Q1 and L1 (g = 0)", "fluxes Q1 and L1 (g is not 0)"]
+    degrees += [f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"]
+    return [*terms, degrees[min(medium.degree, 2)]]
 
 
-def _has_pairs(medium: Medium, scene: Scene) -> bool:
-    """Whether backward peaks turn beams back and forth (E8.11)."""
-    return has_backward_peak(medium) and _has_beams(scene)
+def _round_terms(medium: Medium, scene: Scene) -> list[str]:
+    """The terms of transport rounds, none without rounds."""
+    settings = scene.diffusion
+    if not settings.rounds:
+        return []
+    rounds = _count(settings.rounds, "transport round")
+    if settings.transport_tolerance is not None:
+        rounds += f" at most, to a residual of {settings.transport_tolerance:g},"
+    directions = count_directions(settings.angles, settings.rounds)
+    terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
+    if settings.times > 1:
+        finer = scene.volume.grid.refine(settings.times, settings.refine_along)
+        along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
+        terms.append(f"light in {_cells(finer)}, {settings.times} times as narrow{along}")
+    if scene.reason:
+        terms.append(f"by default {scene.reason}")
+    if has_backward_peak(medium) and _has_beams(scene):
+        share = _listed(backward_fraction(medium), medium.is_cellwise)
+        terms.append(f"beams in pairs: a backward peak turns {share} of scattering back")
+    return terms
 
 
 def _has_beams(scene: Scene) -> bool:
@@ -183,39 +158,39 @@ def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:
     for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
         if count := sum(isinstance(light, kind) for light in lights):
             terms.append(f"transmittance towards {_count(count, name)}")
-    for light in lights:
-        if isinstance(light, BeamLight):
-            radius = float(seen_radius(light.radius, max(scene.volume.grid.spacing)))
-            terms.append(
-                f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
-            )
+    for beam in (light for light in lights if isinstance(light, BeamLight)):
+        radius = float(seen_radius(beam.radius, max(scene.volume.grid.spacing)))
+        terms.append(f"transmittance towards a beam from outside, {radius:.3g} u in radius here")
     ambient = "by quadrature over 50 directions"
     if is_diffuse:
         ambient = "as inflow of the diffusion through the box's faces"
     if any(isinstance(light, AmbientLight) for light in lights):
         terms.append(f"ambient light, {ambient}")
-    for light in lights:
-        if isinstance(light, EnvironmentLight):
-            (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
-            beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
-            sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
-            terms.append(f"environment map {width} x {height}: {beams}{sky}")
+    for sky_map in (light for light in lights if isinstance(light, EnvironmentLight)):
+        (height, width), (suns, directions) = sky_map.radiance.shape[1:], count_suns(sky_map)
+        beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
+        sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
+        terms.append(f"environment map {width} x {height}: {beams}{sky}")
     return terms
 
 
-def _ground_term(ground: Ground, grid: Grid) -> str:
+def _ground_terms(ground: Ground | None, grid: Grid) -> list[str]:
     """A ground, and on what it and the volume light each other."""
-    plane = ground.plane
+    if ground is None:
+        return []
     albedo = _listed(ground.mean_albedo, is_by_cell=False)
     if ground.albedo.ndim > 1:
         rows, columns = ground.albedo.shape[1:]
         albedo += f" in the mean of {columns} x {rows} pixels"
-    cells = " x ".join(map(str, reversed(exchange_grid(grid).shape)))
-    return (
-        f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}: direct light ray by "
-        f"ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
-        f"to and fro in {cells} cells"
-    )
+    return [
+        f"ground at {'zyx'[ground.plane.axis]} = {ground.plane.height:g}, albedo {albedo}: direct "
+        f"light ray by ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
+        f"to and fro in {_cells(exchange_grid(grid))}"
+    ]
+
+
+def _cells(grid: Grid) -> str:
+    return f"{' x '.join(map(str, reversed(grid.shape)))} cells"
 
 
 def _listed(numbers: Tensor, is_by_cell: bool) -> str:

@@ -16,8 +16,9 @@ from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 from ddrecon import settings
+from ddrecon.records import alternatives, type_hints
 from ddrecon.scene_file import schema
-from ddrecon.scene_file.read import alternatives, describe_type, type_hints
+from ddrecon.scene_file.read import describe_type
 from ddrecon.variables.kinds import DENSITY_STEP, KINDS, Kind
 
 FOLDER = Path(__file__).parent

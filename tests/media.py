@@ -106,7 +106,7 @@ def march_rays(emission: Emission, rays: Rays, settings: RenderSettings) -> tupl
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid))
+    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid), grid.periodic)
 
 
 def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:
@@ -132,10 +132,8 @@ def dense_matrix(operator: Operator) -> Tensor:
         place = [cell // strides[0], cell // strides[1] % shape[1], cell % shape[2]]
         matrix[:, cell, cell] += operator.loss[:, place[0], place[1], place[2]]
         for axis in range(3):
-            faces, is_last = operator.conductances[axis], place[axis] + 1 == shape[axis]
-            if place[axis] == faces.shape[1 + axis]:
-                continue
-            conductance = faces[:, place[0], place[1], place[2]]
+            is_last = place[axis] + 1 == shape[axis]
+            conductance = operator.conductances[axis][:, place[0], place[1], place[2]]
             neighbor = cell + strides[axis] * (1 - shape[axis] * is_last)
             matrix[:, cell, cell] += conductance
             matrix[:, neighbor, neighbor] += conductance

@@ -52,7 +52,7 @@ def scene_of(case: str, dtype: torch.dtype = torch.float64) -> Scene:
     if case in EVERY_LIGHT:
         tensor = density.new_tensor
         scene.lights += [
-            PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
+            PointLight(tensor([0.9, 0.7, 0.2137]), tensor([1.0, 2.0, 0.5])),
             EnvironmentLight(
                 random_values(3, 4, 8, seed=3, dtype=dtype), tensor(0.5), tensor(20.0), 6
             ),

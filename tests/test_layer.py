@@ -15,10 +15,12 @@ from media import make_scene, random_values, tensor
 from torch import Tensor
 
 import ddrecon
+from ddrecon.engine import ENGINES
 from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.light.ground import Ground, Plane
-from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
+from ddrecon.light.lights import BeamLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.pictures.noise import Noise
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO
 from ddrecon.variables.values import value_of, variable_names, with_values
@@ -224,6 +226,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
         "overrides: expected a list, [\"key.path=value\"], found 'a=b'",
     ),
     "no overrides": (lambda: ddrecon.load_scene(BALL, overrides=None), "overrides: expected a li"),
+    "odd overrides": (lambda: ddrecon.load_scene(BALL, overrides=[3]), "overrides: expected a li"),
     "iterations": (lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"), "iterations: exp"),
     "no views": (
         lambda: ddrecon.render(replace(small_layer().scene, views=[])),
@@ -305,28 +308,41 @@ def test_a_view_that_cannot_be_is_refused(part: str, value: object, problem: str
 
 
 RECORDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
-    ({"exposure": 2.0}, {}, "views.view.exposure: expected a tensor, found float"),
+    ({"exposure": 2.0}, {}, "views.view.exposure: expected a tensor, found 2.0"),
     ({"offset": torch.zeros(2, **DOUBLE)}, {}, "views.view.offset: has shape [2]; expected [1] or"),
     ({"background": torch.full((1, 1, 1), math.nan)}, {}, "views.view.background: must be finite"),
-    ({}, {"size": (0, 4)}, "views.view.camera: expected a size (height, width), found (0, 4)"),
+    ({}, {"size": (0, 4)}, "views.view.camera.size.0: must be at least 1, found 0"),
     ({}, {"half_width": 0.0}, "must be above 0 and finite, found 0"),
     (
         {},
         {"pose": torch.eye(4, **DOUBLE)},
-        "views.view.camera: expected a pose [3, 4], found [4, 4",
+        "views.view.camera.pose: has shape [4, 4]; expected [3, 4]",
     ),
-    ({}, {"principal_point": [0.5]}, "principal_point: must be two finite numbers, found (0.5,)"),
-    ({}, {"principal_point": (0.5, math.nan)}, "principal_point: must be two finite numbers"),
-    ({}, {"pixel_aspect": 0.0}, "views.view.camera: pixel_aspect must be above 0 and finite"),
-    ({}, {"pixel_aspect": math.nan}, "camera: pixel_aspect must be above 0 and finite, found nan"),
+    ({}, {"principal_point": [0.5]}, "point: expected 2 numbers or a tensor, found (0.5,)"),
+    ({}, {"principal_point": (0.5, math.nan)}, "camera.principal_point.1: must be finite"),
+    ({}, {"pixel_aspect": 0.0}, "views.view.camera.pixel_aspect: must be above 0, found 0"),
+    ({}, {"pixel_aspect": math.nan}, "camera.pixel_aspect: must be finite, found nan"),
+    ({}, {"half_width": "a"}, "half_width: expected a number or a tensor, found 'a'"),
     ({}, {"pose": 2 * torch.eye(3, 4, **DOUBLE)}, "pose must be of unit length"),
     ({}, {"pose": torch.tensor([-1.0, 1, 1]).double().diag()[:, [0, 1, 2, 2]]}, "and not mirror"),
-    ({}, {"lens": "fish", "distortion": torch.zeros(4, **DOUBLE)}, "expected a lens among opencv,"),
-    ({}, {"lens": "fisheye"}, "views.view.distortion: lens fisheye takes [4], found NoneType"),
-    ({}, {"lens": "opencv", "distortion": torch.zeros(2, **DOUBLE)}, "takes [6], found [2]"),
-    ({"background": torch.ones(2)}, {}, "background: expected a tensor [C, 1, 1] or [C, "),
-    ({"background": 0.5}, {}, "[C, 1, 1] or [C, 4, 5], found float"),
-    ({"weight": math.nan}, {}, "views.view.weight: must be above 0 and finite, found nan"),
+    (
+        {},
+        {"lens": "fish", "distortion": torch.zeros(4, **DOUBLE)},
+        "camera.lens: expected one of opencv, fisheye",
+    ),
+    ({}, {"lens": "fisheye"}, "view.camera: give both lens and distortion, or neither"),
+    (
+        {},
+        {"lens": "opencv", "distortion": torch.zeros(2, **DOUBLE)},
+        "views.view.distortion: has shape [2]; expected [6]",
+    ),
+    ({"background": torch.ones(2)}, {}, "has shape [2]; expected [1, 1, 1] or [1, 4, 5] or [3, "),
+    ({"background": 0.5}, {}, "views.view.background: expected a tensor, found 0.5"),
+    ({"weight": math.nan}, {}, "views.view.weight: must be finite, found nan"),
+    ({"step": math.nan}, {}, "views.view.step: must be finite, found nan"),
+    ({"noise": Noise(math.nan, 0.0)}, {}, "views.view.noise.read: must be finite, found nan"),
+    ({"image": torch.ones(3, 5, 4)}, {}, "view.image: has shape [3, 5, 4]; expected [3, 4, 5]"),
+    ({"mask": torch.ones(2, 5)}, {}, "views.view.mask: has shape [2, 5]; expected [4, 5]"),
 ]
 
 
@@ -339,14 +355,29 @@ def test_so_is_one_made_in_python(view: dict[str, Any], camera: dict[str, Any], 
         render(scene)
 
 
-def test_neither_lights_nor_a_ground_are_guessed() -> None:
+SUN = DirectionalLight(tensor(0.0, -1.0, 0.0), 3.0)  # type: ignore[arg-type]
+PARTS: list[tuple[str, str, Any, str]] = [
+    ("", "lights", [SUN], "lights.0.irradiance: expected a tensor, found 3.0"),
+    ("", "lights", [None], "lights.0: expected DirectionalLight or AmbientLight or "),
+    ("", "ground", Ground(tensor(0.5), Plane(math.nan, 1)), "ground.plane.height: must be finite"),
+    ("", "ground", Ground(tensor(0.5), Plane(-9.0, 7)), "ground.plane.axis: must be at most 2, "),
+    ("", "diffusion", {}, "diffusion: expected DiffusionSettings, found dict"),
+    ("volume", "phase", None, "volume.phase: expected PhaseFunction, found None"),
+    ("volume", "black_body", 2000.0, "volume.black_body: expected a tensor, found 2000.0"),
+    ("volume", "support", torch.ones(2, 2, 2), "volume.support: has shape [2, 2, 2]; expected ["),
+    ("volume", "index", 0.5, "volume.index: must be at least 1, found 0.5"),
+]
+
+
+@pytest.mark.parametrize(("owner", "name", "value", "problem"), PARTS)
+def test_no_part_of_a_scene_is_guessed(owner: str, name: str, value: Any, problem: str) -> None:
     scene = small_layer().scene
-    light = replace(scene.lights[0], irradiance=3.0)
-    with pytest.raises(UsageError, match=r"lights\.0\.irradiance: expected a tensor, found float"):
-        render(replace(scene, lights=[light]))
-    ground = Ground(tensor(0.5), Plane(math.nan, 1))
-    with pytest.raises(UsageError, match=r"ground\.height: must be finite, found nan"):
-        render(replace(scene, ground=ground))
+    setattr(getattr(scene, owner) if owner else scene, name, value)
+    with pytest.raises(UsageError, match="^" + re.escape(problem)):
+        render(scene)
+    if not owner:
+        with pytest.raises(UsageError, match="^" + re.escape(problem)):
+            render(replace(small_layer().scene, **{name: value}))
 
 
 def test_one_precision_and_a_known_view() -> None:
@@ -378,6 +409,20 @@ def test_what_torch_cannot_do_is_said() -> None:
     both = torch.stack([image, image]).detach()
     with pytest.raises(NotImplementedError, match="light has one cotangent a pass"):
         torch.autograd.grad(image, density, both, is_grads_batched=True)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_a_change_in_place_before_the_backward_pass_is_noticed(engine: str, rounds: int) -> None:
+    """As autograd does: what is computed again there would be that of other numbers."""
+    ddrecon.use_engine(engine)
+    scene = make_scene(random_values(*SHAPE), transport_rounds=rounds)
+    density = scene.volume.density.requires_grad_()
+    total = render(scene).sum()
+    with torch.no_grad():
+        density *= 2
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
 
 
 @pytest.mark.slow

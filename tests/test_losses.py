@@ -1,21 +1,16 @@
-"""Losses: closed forms, masks, and invariances of total variation."""
+"""Losses: closed forms and masks."""
 
 import numpy as np
 import pytest
 import torch
 
-from ddrecon.grid import Grid
-from ddrecon.losses import HUBER, LOSSES, Target, compress, compressed_slope, total_variation
+from ddrecon.losses import HUBER, LOSSES, Target
 from ddrecon.pictures import srgb
 from ddrecon.pictures.noise import Noise
 
 
 def image_loss(loss: str, image: torch.Tensor, target: torch.Tensor, mask=None, noise=None):
     return Target.of(target, mask, loss, noise).loss_of(image)
-
-
-def box(cells: int, side: float = 1.0) -> Grid:
-    return Grid((cells,) * 3, (0.0,) * 3, (side,) * 3)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -128,36 +123,3 @@ def test_what_counts_is_averaged() -> None:
     kept = mask.bool()
     expected = float(((image - target)[:, kept] ** 2).mean())
     assert float(image_loss("l2", image, target, mask)) == pytest.approx(expected, rel=1e-6)
-
-
-@pytest.mark.parametrize("cells", [8, 16, 32])
-def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells: int) -> None:
-    grid = box(cells)
-    ramp = 2 * grid.centers(torch.zeros(1, dtype=torch.float64))[2].expand(*grid.shape)
-    inner = (cells - 1) / cells
-    assert float(total_variation(ramp, grid)) == pytest.approx(2 * inner, rel=0.01)
-
-
-def test_total_variation_does_not_depend_on_world_scale() -> None:
-    field = torch.rand(6, 6, 6, dtype=torch.float64)
-    one, other = (float(total_variation(field, box(6, side))) for side in (1.0, 7.0))
-    assert one == pytest.approx(other, rel=1e-12)
-
-
-@pytest.mark.parametrize("of", [torch.clone, lambda x: compress(x, 0.1)])
-def test_total_variation_has_a_finite_derivative_where_flat(of) -> None:
-    field = torch.zeros(4, 4, 4, requires_grad=True)
-    total_variation(of(field), box(4)).backward()
-    assert torch.isfinite(field.grad).all()
-
-
-def test_total_variation_of_compressed_density_has_its_derivative() -> None:
-    field = torch.rand(3, 4, 5, dtype=torch.float64, requires_grad=True)
-    grid = Grid((3, 4, 5), (0, 0, 0), (1, 1, 1))
-    assert torch.autograd.gradcheck(lambda x: total_variation(compress(x, 0.1), grid), field)
-
-
-def test_the_slope_of_compression_is_its_derivative() -> None:
-    field = torch.tensor([0.0, 0.01, 0.3, 20.0], dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(compress(field, 0.2).sum(), field)
-    torch.testing.assert_close(compressed_slope(field, 0.2), slope)

@@ -63,7 +63,7 @@ SETTINGS = [
         "diffusion.model: expected one of none, p1, flux_limited, found",
     ),
     ("diffusion", {"degree": 4}, "diffusion.degree: expected one of 1, 3, 5, 7, found 4"),
-    ("diffusion", {"tolerance": math.nan}, "diffusion.tolerance: must be above 0, found nan"),
+    ("diffusion", {"tolerance": math.nan}, "diffusion.tolerance: must be finite, found nan"),
     ("diffusion", {"tolerance": "small"}, "diffusion.tolerance: expected a number, found 'small'"),
     ("render", {"samples_per_pixel": 0}, "render.samples_per_pixel: must be at least 1, found 0"),
 ]

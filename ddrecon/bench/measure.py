@@ -6,11 +6,11 @@ precision; the whole error is against path tracing by Mitsuba 3.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -29,12 +29,24 @@ from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.settings import DiffusionSettings
 from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
 
-FLOOR = 1e-8
-"""Errors below this are drawn here."""
+LEAST_DRAWN = 1e-8
+"""Errors below this are drawn as this."""
+EXACT: dict[str, Any] = {"tolerance": 1e-8, "warm_start": False}
+EXACT_LIMITED = 1e-5
+"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
+minutes.
+"""
+EXACT_STEPS = 3
+TURNS = 2
+PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
+"""Paths a pixel that Mitsuba is tried with."""
+TRUTH_PASSES, TRUTH_SEED = 4, 1000
+"""The truth is the mean of so many images of the most paths, whose seeds begin here."""
+
+Change = Callable[[Scene], Scene]
 
 
 @dataclass(frozen=True)
@@ -71,16 +83,11 @@ class Row:
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
     """The same rows, those marked that no other beats in both time of an image and error."""
-    return [
-        replace(
-            row,
-            is_best=not any(
-                other.image_seconds < row.image_seconds and other.error <= row.error
-                for other in rows
-            ),
-        )
-        for row in rows
-    ]
+
+    def is_beaten(row: Row) -> bool:
+        return any(o.image_seconds < row.image_seconds and o.error <= row.error for o in rows)
+
+    return [replace(row, is_best=not is_beaten(row)) for row in rows]
 
 
 HEAD = (
@@ -130,24 +137,19 @@ def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> 
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Writes a PNG of times against errors: of the image, and of image and gradient.
 
-    Dots have the numbers of their rows, and a color for each kind of variant. Raises
-    MissingExtraError where matplotlib is not installed.
+    Dots have the numbers of their rows. Raises MissingExtraError where matplotlib is not installed.
     """
     load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
-    kinds = list(dict.fromkeys(row.name.split(" ")[0] for row in rows))
     for number, row in enumerate(rows, 1):
-        color, label = f"C{kinds.index(row.name.split(' ')[0]) % 10}", f"{number}  {row.name}"
         dots = (row.image_seconds, row.error), (row.both_seconds, row.gradient_numerical)
         for axis, (seconds, error) in zip(axes, dots, strict=True):
             if error is not None:
-                place = seconds, max(error, FLOOR)
-                axis.plot(*place, "o", color=color, label=label)
+                place = seconds, max(error, LEAST_DRAWN)
+                axis.plot(*place, "o", color=f"C{number % 10}", label=f"{number}  {row.name}")
                 axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
-    front = sorted((row.image_seconds, max(row.error, FLOOR)) for row in rows if row.is_best)
-    axes[0].step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
     for axis, what in zip(axes, ("an image", "an image and its gradient"), strict=True):
         axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")
         axis.grid(which="major", alpha=0.3)
@@ -157,21 +159,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     plt.close(figure)
 
 
-Change = Callable[[Scene], Scene]
-EXACT: dict[str, Any] = {"tolerance": 1e-8, "warm_start": False}
-EXACT_LIMITED = 1e-5
-"""The tolerance in place of that for `flux_limited`.
-
-Its damped iteration gains a digit in many minutes.
-"""
-EXACT_STEPS = 3
-
-
 def variants_of(scene: Scene, is_quick: bool) -> dict[str, Change]:
     """What makes the variants of `scene`, by name: itself first, then all that differ from it."""
-    base, known = {"base": lambda scene: scene}, _settings(scene)
+    base, settings = {"base": lambda scene: scene}, _settings(scene)
     return base | {
-        name: change for name, change in _changes(is_quick) if _settings(change(scene)) != known
+        name: change for name, change in _changes(is_quick) if _settings(change(scene)) != settings
     }
 
 
@@ -188,23 +180,15 @@ def exact_scene(scene: Scene) -> Scene:
     return replace(scene, render=render, diffusion=diffusion)
 
 
-def model_of(scene: Scene) -> tuple[object, ...]:
-    """What two scenes must share for their exact images to be the same."""
-    shape, _, diffusion = _settings(replace(scene, diffusion=replace(scene.diffusion, **EXACT)))
-    return shape, diffusion
-
-
 def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
     """What is tried, one setting at a time; a quick bench tries less."""
-    for name, values in (
-        ("tolerance", (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)),
-        ("closure", CLOSURES),
-        ("model", ("p1",) if is_quick else ("p1", "flux_limited")),
-    ):
-        # Rounds are as many as the model has by default.
-        more = {"transport_rounds": None} if name == "model" else {}
-        for value in values:
-            yield f"{name} {value}", _vary("diffusion", **{name: value, **more})
+    tolerances = (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+    for tolerance in tolerances:
+        yield f"tolerance {tolerance}", _vary("diffusion", tolerance=tolerance)
+    for closure in CLOSURES:
+        yield f"closure {closure}", _vary("diffusion", closure=closure)
+    for model in ("p1",) if is_quick else ("p1", "flux_limited"):
+        yield f"model {model}", _vary("diffusion", model=model, transport_rounds=None)
     for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
         change = _vary("diffusion", transport_rounds=rounds, degree=degree)
         yield f"rounds {rounds}, degree {degree}", change
@@ -213,7 +197,7 @@ def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
     for tolerance in (0, 0.05) if is_quick else (0, 0.01, 0.05, 1):
         yield f"pixels {tolerance}", _vary("render", tolerance=tolerance)
     for factor in (2,) if is_quick else (2, 4):
-        yield f"grid {factor} times coarser", functools.partial(_coarsen, factor)
+        yield f"grid {factor} times coarser", partial(_coarsen, factor)
 
 
 def _vary(section: str, **changes: Any) -> Change:
@@ -228,18 +212,8 @@ def _settings(scene: Scene) -> tuple[object, ...]:
     """What is varied; without the degree where there are no rounds that it could matter to."""
     diffusion = scene.diffusion
     if not diffusion.rounds:
-        diffusion = replace(diffusion, degree=DiffusionSettings.degree)
+        diffusion = replace(diffusion, degree=None)
     return scene.volume.grid.shape, scene.render, diffusion
-
-
-TURNS = 2
-PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
-"""Paths a pixel that Mitsuba is tried with.
-
-The truth is the mean of `TRUTH_PASSES` of the most, by other paths, whose seeds begin at
-`TRUTH_SEED`.
-"""
-TRUTH_PASSES, TRUTH_SEED = 4, 1000
 
 
 @dataclass(frozen=True)
@@ -285,25 +259,24 @@ def run_bench(
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
     variants = variants_of(scene, is_quick)
-    exact = dict[str, Shot]()  # alike models are solved once
-    solved = dict[tuple[object, ...], Shot]()
+    exact = dict[str, Shot]()
+    solved = dict[tuple[object, ...], Shot]()  # alike models are solved once
     for name, change in progress(list(variants.items()), "exact solutions"):
-        changed = change(double)
-        if (model := model_of(changed)) not in solved:
-            solved[model] = shoot(exact_scene(changed))
-        exact[name] = solved[model]
+        reference = exact_scene(change(double))
+        shape, _, diffusion = _settings(reference)
+        if (shape, diffusion) not in solved:
+            solved[shape, diffusion] = shoot(reference)
+        exact[name] = solved[shape, diffusion]
     contestants: dict[str, Callable[[], Shot]] = {
-        name: functools.partial(shoot, change(scene)) for name, change in variants.items()
+        name: partial(shoot, change(scene)) for name, change in variants.items()
     }
     truth = None
     if tracer is not None:
         paths = QUICK_PATHS if is_quick else PATHS
         seeds = range(TRUTH_SEED, TRUTH_SEED + TRUTH_PASSES)
         truth = Traced.of([trace(tracer, paths[-1], seed).image.numpy() for seed in seeds])
-        contestants |= {
-            f"Mitsuba {samples} paths a pixel": functools.partial(trace, tracer, samples)
-            for samples in paths
-        }
+        for samples in paths:
+            contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
     return with_best([row_of(name, each, exact.get(name), truth) for name, each in shots.items()])
 
@@ -317,9 +290,8 @@ def measure(
     counted: kernels are compiled in it.
     """
     shots: dict[str, list[Shot]] = {name: [] for name in contestants}
-    for turn, name in progress(
-        [(turn, name) for turn in range(turns + 1) for name in contestants], "bench"
-    ):
+    schedule = [(turn, name) for turn in range(turns + 1) for name in contestants]
+    for turn, name in progress(schedule, "bench"):
         if turn == len(shots[name]):
             with suppress(SolveError):
                 shots[name].append(contestants[name]())
@@ -328,23 +300,16 @@ def measure(
 
 def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced | None) -> Row:
     """The row of what took these `shots`; times are medians."""
-    shot = shots[0]
-    row = Row(
-        name,
-        median(each.image_seconds for each in shots),
-        median(each.image_seconds + each.gradient_seconds for each in shots),
-        shot.iterations,
-    )
+    shot, errors = shots[0], dict[str, Any]()
     if exact is not None and exact.gradient is not None and shot.gradient is not None:
-        row = replace(
-            row,
-            image_numerical=relative_error(shot.image, exact.image),
-            gradient_numerical=relative_error(shot.gradient, exact.gradient),
-        )
+        errors["image_numerical"] = relative_error(shot.image, exact.image)
+        errors["gradient_numerical"] = relative_error(shot.gradient, exact.gradient)
     if truth is not None:
-        error = truth.error(shot.image.numpy())
-        row = replace(row, image_error=error, image_noise=truth.noise)
-    return row
+        errors["image_error"] = truth.error(shot.image.numpy())
+        errors["image_noise"] = truth.noise
+    image_seconds = median(each.image_seconds for each in shots)
+    both_seconds = median(each.image_seconds + each.gradient_seconds for each in shots)
+    return Row(name, image_seconds, both_seconds, shot.iterations, **errors)
 
 
 def _now(like: Tensor) -> float:

@@ -50,7 +50,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
 
     Where it has no support it is as by `support: auto`, if pictures tell.
     """
-    found = list[Support]()
+    supports = list[Support]()
     for scene in frames:
         train, settings = select_views(scene, is_test=False), scene.optimize
         density = settings.parameters.get("density") if settings is not None else None
@@ -58,12 +58,12 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
             auto = replace(density, support=density.support or AUTO)
             with nullcontext() if density.support else suppress(SceneError):
                 support = find_support(train, replace(settings, parameters={"density": auto}))
-                if support is not None and found:
-                    # Of a film the first pictures alone: all take more memory than there is.
+                if support is not None and supports:
+                    # A film keeps the pictures of its first frame: all take too much memory.
                     views = [View(view.name, view.camera) for view in support.views]
                     support = replace(support, views=views)
-                found += [] if support is None else [support]
-    return found
+                supports += [] if support is None else [support]
+    return supports
 
 
 def asks_support(scene: Scene) -> bool:

@@ -54,9 +54,9 @@ def check(session: Session, scene: Path) -> None:
     support = report["support"] or {}
     if (doubt := support.get("doubt")) and "cells" not in support:
         raise scene_file.refused("volume.bounds", doubt)
-    for told in (doubt and f"volume.bounds: {doubt}", support.get("cut")):
-        if told is not None:
-            warn(told, DataWarning, 2)
+    for text in (doubt and f"volume.bounds: {doubt}", support.get("cut")):
+        if text is not None:
+            warn(text, DataWarning, 2)
     session.show(report, lines(report))
 
 
@@ -108,7 +108,7 @@ def balance(session: Session, scene: Path) -> None:
 )
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
 @click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
-@click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
+@click.option("--frames", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @DTYPE
 @REPORT
 @in_session
@@ -117,7 +117,7 @@ def render(
     scene: Path,
     output: Path,
     lights: tuple[str, ...],
-    part: str | None,
+    frames: str | None,
     overwrite: bool,
     **options: Any,
 ) -> None:
@@ -132,21 +132,21 @@ def render(
     from ddrecon.ranks import is_first
 
     if kind_of_folder(scene) != FILM:
-        if part is not None:
+        if frames is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
         session.show(*_render(session, scene, output, choice))
         return
     from ddrecon.film.folder import finished_frames
 
-    frames = finished_frames(scene, part)
+    runs = finished_frames(scene, frames)
     claim = claim_folder(output, RENDER, overwrite=overwrite)
     with claim if is_first() else nullcontext() as folder:
-        if folder is not None and part is None:
+        if folder is not None and frames is None:
             folder.clear()
-        found = {run.name: _render(session, run, output / run.name, choice) for run in frames}
+        reports = {run.name: _render(session, run, output / run.name, choice) for run in runs}
     session.show(
-        {name: report for name, (report, _) in found.items()},
-        [*chain.from_iterable(lines for _, lines in found.values())],
+        {name: report for name, (report, _) in reports.items()},
+        [*chain.from_iterable(lines for _, lines in reports.values())],
     )
 
 
@@ -227,8 +227,8 @@ def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
 
     of_run = scene_file.path.with_name("scene.yaml")
     if scene_file.path.name == RESULT and of_run.is_file():
-        said = tuple(each for each in session.overrides if each.startswith("diffusion"))
-        scene_file = replace(session, overrides=said).read(of_run)
+        overrides = (text for text in session.overrides if text.startswith("diffusion"))
+        scene_file = replace(session, overrides=tuple(overrides)).read(of_run)
     return scene_file.tree.diffusion.transport_rounds is not None
 
 
@@ -248,7 +248,7 @@ def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
     metavar="K",
     help="Write pictures every K iterations.",
 )
-@click.option("--frames", "part", metavar="A:B", help="Of a film, the frames from A to B alone.")
+@click.option("--frames", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @click.option(
     "--shared",
     type=click.Path(path_type=Path),
@@ -272,7 +272,7 @@ def optimize(
     iterations: str | None,
     resume: bool,
     preview_every: int | None,
-    part: str | None,
+    frames: str | None,
     shared: Path | None,
     exported: str | None,
 ) -> None:
@@ -296,10 +296,10 @@ def optimize(
 
         film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
         choice = {"overwrite": overwrite, "resume": resume, "shared": shared}
-        _optimize_film(session, film, part, exported, choice)
+        _optimize_film(session, film, frames, exported, choice)
         return
-    given = {"--frames": part, "--shared": shared, "--export": exported}
-    if of_films := [option for option, value in given.items() if value is not None]:
+    film_options = {"--frames": frames, "--shared": shared, "--export": exported}
+    if of_films := [option for option, value in film_options.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
     from ddrecon.io.files.folders import RUN, claim_folder
     from ddrecon.progress import tell
@@ -318,7 +318,7 @@ def optimize(
 
 
 def _optimize_film(
-    session: Session, film: Film, part: str | None, exported: str | None, choice: dict[str, Any]
+    session: Session, film: Film, frames: str | None, exported: str | None, choice: dict[str, Any]
 ) -> None:
     """Reconstructs the frames of `film` that are this rank's; `choice` is how its folder opens."""
     from ddrecon.film.drive import drive_film, share_out
@@ -326,16 +326,16 @@ def _optimize_film(
     from ddrecon.film.report import film_lines
     from ddrecon.ranks import alone, from_first, is_first
 
-    own = share_out(choose_frames(film.frames.numbers, part))
+    numbers = share_out(choose_frames(film.frames.numbers, frames))
     film.environment = session.environment()
     if not is_first():
         from_first(None)  # others find the folder as it is to be
         choice = {"overwrite": False, "resume": True, "shared": None}
-    with open_film(film, part, own, **choice):
+    with open_film(film, frames, numbers, **choice):
         if is_first():
             from_first(None)
         with alone():
-            record = drive_film(film, own, exported)
+            record = drive_film(film, numbers, exported)
     session.show(record, film_lines(record, film.path))
 
 
@@ -374,10 +374,8 @@ def _optimize_film(
 @click.option(
     "--next-view",
     type=click.Choice(["ring"]),
-    help="Which picture next? Rank twelve by how far off those taken they are: by the first "
-    "camera, turned around the volume.",
+    help="Rank 12 candidate cameras on a ring by their angle to the nearest existing camera.",
 )
-@click.option("--tolerance", type=float, hidden=True)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
@@ -391,7 +389,6 @@ def uncertainty(
     read: float | None,
     has_samples: bool,
     next_view: str | None,
-    tolerance: float | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -405,8 +402,6 @@ def uncertainty(
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
-    if tolerance is not None:
-        warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     require_no_film(run)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):

@@ -81,14 +81,14 @@ class Session:
         use_engine(self.engine or current_engine())
         self.place = torch.device("cuda" if has_gpu else "cpu")
         if has_gpu and rank_count() > 1:
-            own, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
-            if own >= count:
+            local_rank, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
+            if local_rank >= count:
                 raise UsageError(
-                    f"--nproc-per-node: {own + 1} processes or more, but torch sees {count} GPU "
-                    "here; start one for each, or say --device cpu"
+                    f"--nproc-per-node: {local_rank + 1} processes or more, but torch sees {count} "
+                    "GPU here; start one for each, or say --device cpu"
                 )
-            torch.cuda.set_device(own)
-            self.place = torch.device("cuda", own)
+            torch.cuda.set_device(local_rank)
+            self.place = torch.device("cuda", local_rank)
         cores = max(1, usable_cores() // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
         usual = torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else cores
         self.threads = self.threads or usual
@@ -139,9 +139,9 @@ class Session:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))
 
-    def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
+    def progress(self, items: Sequence[Any], text: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
-        return tqdm(items, desc=what, leave=self.verbose, **bar_settings(self.is_quiet))
+        return tqdm(items, desc=text, leave=self.verbose, **bar_settings(self.is_quiet))
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""

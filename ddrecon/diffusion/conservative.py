@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
+import torch
 from torch import Tensor
 
 from ddrecon.diffusion.closures import Closure
@@ -22,28 +23,32 @@ from ddrecon.diffusion.operator import (
     conductance,
     face_fluxes,
 )
-from ddrecon.light.moments import Moments, Vector, add_vectors
+from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.periods import Unrolled, unroll
 
 
 @dataclass(frozen=True)
 class DiffusionProblem:
     """E2.4 to E2.6 in `medium`, as a linear system for L0, and L1 of its solution.
 
-    `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside`
-    [C, 1, 1, 1]: radiance that enters through the box's faces. L0 and L1 hold all of that,
-    scattered or not, which keeps a white furnace exact (docs/theory.md, section 5). `has_flux`:
-    whether light's direction matters, so that L1 is asked for.
+    `closure` turns transport extinction into D; `source` [1 or 4, C, z, y, x]: moments of Q0 and
+    Q1; `outside` [C, 1, 1, 1]: radiance that enters through the box's faces. L0 and L1 hold all of
+    that, scattered or not, which keeps a white furnace exact (docs/theory.md, section 5).
+    `has_flux`: whether light's direction matters, so that L1 is asked for.
     """
 
     medium: Medium
     closure: Callable[[Tensor], Tensor]
-    source: Moments
+    source: Tensor
     outside: Tensor
     has_flux: bool
+
+    @cached_property
+    def _source(self) -> tuple[Tensor, Tensor | None]:
+        """Q0, and the moments of Q1."""
+        return mean_and_first(self.source)
 
     @cached_property
     def diffusion(self) -> Tensor:
@@ -62,111 +67,85 @@ class DiffusionProblem:
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E2.7."""
-        if self.medium.grid.periodic:
-            return self._periodic_system
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import assemble_system
 
             z, y, x, loss, right = assemble_system(
-                self.medium, self.diffusion, self.source, self.outside
+                self.medium, self.diffusion, self._source, self.outside
             )
-            return Operator((z, y, x), loss), self._with_emission(right)
+            return self._operator(z, y, x, loss), self._with_emission(right)
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
-            _loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside
+            _loss_and_source, self.medium, self.diffusion, self._source[0], self.outside
         )
-        for axis, flux in zip(AXES, self.source.flux or (), strict=self.source.flux is not None):
-            right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
-        return Operator((z, y, x), loss), self._with_emission(right)
+        if self._source[1] is not None:
+            right = right - self._spread(self._source[1])
+        return self._operator(z, y, x, loss), self._with_emission(right)
 
-    @cached_property
-    def _unrolled(self) -> tuple[Unrolled, DiffusionProblem]:
-        """The same in a period and a cell more on both sides, beyond which lie faces of a box."""
-        period = unroll(self.medium.grid, 1)
-        medium, source = self.medium.put(period.wide, period.extend), self.source
-        diffusion = period.extend(self.diffusion)
-        wide = source.mapped(period.extend), self.outside, self.has_flux
-        return period, DiffusionProblem(medium, lambda _: diffusion, *wide)
-
-    @property
-    def _periodic_system(self) -> tuple[Operator, Tensor]:
-        period, problem = self._unrolled
-        operator, right = problem.system
-        z, y, x = (
-            self._crop_faces(faces, axis)
-            for axis, faces in zip(AXES, operator.conductances, strict=True)
-        )
-        return Operator((z, y, x), period.crop(operator.loss)), period.crop(right)
-
-    def _crop_faces(self, faces: Tensor, axis: int) -> Tensor:
-        """The `faces` along `axis` of a period, the last of them that at its ends."""
-        for other, count in zip(AXES, self.medium.grid.shape, strict=True):
-            if other - 1 in self.medium.grid.periodic:
-                # A cell that is its own neighbor exchanges nothing.
-                count = 0 if other == axis and count == 1 else count
-                faces = faces.narrow(other, 1, count)
-        return faces
+    def _operator(self, z: Tensor, y: Tensor, x: Tensor, loss: Tensor) -> Operator:
+        return Operator((z, y, x), loss, self.medium.grid.periodic)
 
     def _with_emission(self, right: Tensor) -> Tensor:
         return right if self.medium.emission is None else right + self.medium.emission
 
     def flux(
-        self, mean: Tensor, more: Vector | None = None, begun: Vector | None = None, sign: int = 1
-    ) -> Vector | None:
+        self, mean: Tensor, more: Tensor | None = None, begun: Tensor | None = None, sign: int = 1
+    ) -> Tensor | None:
         """L1 of L0 = `mean`, with `more` flux in the source; None without directions.
 
-        Times the `sign`, and added to a flux that is `begun`.
+        Times the `sign`, and added to a flux that is `begun`. All three fluxes are given by their
+        moments of degree 1, [3, C, z, y, x].
         """
         if not self.has_flux:
             return None
-        if self.medium.grid.periodic:
-            period, problem = self._unrolled
-            light, added, start = (
-                Moments(mean, one).mapped(period.extend) for one in (None, more, begun)
-            )
-            found = problem.flux(light.mean, added.flux, start.flux, sign)
-            return Moments(light.mean, found).mapped(period.crop).flux
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import find_flux
 
             return find_flux(
-                self.medium, self.diffusion, self.source.flux, self.outside, mean, more, begun, sign
+                self.medium, self.diffusion, self._source[1], self.outside, mean, more, begun, sign
             )
-        source = add_vectors(self.source.flux, more)
-        z, y, x = (
-            recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
-            for axis, flux in zip(AXES, source or (None, None, None), strict=True)
+        sources = [one for one in (self._source[1], more) if one is not None]
+        fluxes = flux_along_axes(reduce(torch.add, sources)) if sources else [None] * 3
+        first = moments_of_flux(
+            [
+                recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
+                for axis, flux in zip(AXES, fluxes, strict=True)
+            ]
         )
-        return add_vectors(begun, (z, y, x) if sign > 0 else (-z, -y, -x))
+        return sign * first if begun is None else begun + sign * first
 
-    def right_side(self, source: Tensor, flux: Vector | None) -> Tensor:
-        """The right side of E2.7 with more in it: a `source`, and - div(D kappa_s `flux`)."""
+    def right_side(self, source: Tensor, flux: Tensor | None) -> Tensor:
+        """The right side of E2.7 with more in it: a `source`, and - div(D kappa_s times a flux).
+
+        `flux` [3, C, z, y, x]: its moments of degree 1, None for nothing.
+        """
         _, right = self.system
         if flux is None:
             return right + source
-        if self.medium.grid.periodic:
-            period, problem = self._unrolled
-            wide = Moments(source, flux).mapped(period.extend)
-            return period.crop(problem.right_side(wide.mean, wide.flux))
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import spread_flux
 
             return spread_flux(self.medium, self.diffusion, flux, (right, source))
+        return right + (source - self._spread(flux))
+
+    def _spread(self, flux: Tensor) -> Tensor:
+        """div(D kappa_s times a flux) of the moments `flux`."""
         z, y, x = (
             recompute(_divergence, self.medium, self.diffusion, along, axis)
-            for axis, along in zip(AXES, flux, strict=True)
+            for axis, along in zip(AXES, flux_along_axes(flux), strict=True)
         )
-        return right + (source - (z + y + x))
+        return z + y + x
 
     def solved(self, solve: SolverWithMemory, right: Tensor) -> Tensor:
         """u of A u = `right`."""
         return solve_diffusion(solve, self.system[0], right)
 
 
-def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Moments:
-    """L0 and, where `problem` has flux, L1."""
+def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory) -> Tensor:
+    """phi of L0 and, where `problem` has flux, L1."""
     mean = problem.solved(solve, problem.system[1])
-    return Moments(mean, problem.flux(mean))
+    first = problem.flux(mean)
+    return mean[None] if first is None else torch.cat([mean[None], first])
 
 
 def _loss_and_source(

@@ -25,11 +25,10 @@ from ddrecon.diffusion.operator import (
     conductance,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution, solve_by_multigrid
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
 from ddrecon.medium.coefficients import Medium
 
 DAMPING, MAX_ITERATIONS = 0.7, 1000
@@ -97,29 +96,33 @@ class LimitedOperator(AutodiffOperator):
 
 
 def solve_flux_limited(
-    medium: Medium, scattered: Moments, outside: Tensor, solve: SolverWithMemory, has_flux: bool
-) -> Moments:
-    """L0 and, where it `has_flux`, L1, in `medium`.
+    medium: Medium, scattered: Tensor, outside: Tensor, solve: SolverWithMemory, has_flux: bool
+) -> Tensor:
+    """phi of L0 and, where it `has_flux`, L1, in `medium`.
 
-    `scattered`: kappa_s Q0 and kappa_s Q1; `outside`: ambient radiance `[C, 1, 1, 1]`. `solve` must
-    use `iterate_picard`.
+    `scattered`: moments of kappa_s Q0 and kappa_s Q1; `outside`: ambient radiance `[C, 1, 1, 1]`.
+    `solve` must use `iterate_picard`.
     """
-    grid, extinction, flux = medium.grid, medium.transport_extinction, scattered.flux or ()
+    grid, extinction = medium.grid, medium.transport_extinction
+    source, first = mean_and_first(scattered)
+    flux = [] if first is None else flux_along_axes(first)
 
     def assemble(_: object, *coefficients: Tensor) -> LimitedOperator:
         return LimitedOperator(grid, tensors=coefficients)
 
-    source = scattered.mean.expand_as(scattered.mean + outside)
+    source = source.expand_as(source + outside)
     coefficients = extinction, medium.absorption.value, outside, *flux
     mean = ImplicitSolve.apply(solve, assemble, {}, source, *coefficients)
     if not has_flux:
-        return Moments(mean)
+        return mean[None]
     diffusion = limit_diffusion(mean, extinction, grid)
-    z, y, x = (
-        3 * cell_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
-        for axis, component in zip(AXES, flux or (None, None, None), strict=True)
+    moments = moments_of_flux(
+        [
+            3 * cell_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
+            for axis, component in zip(AXES, flux or (None, None, None), strict=True)
+        ]
     )
-    return Moments(mean, (z, y, x))
+    return torch.cat([mean[None], moments])
 
 
 def iterate_picard(

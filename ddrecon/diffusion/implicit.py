@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any, Self
 
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution
 from ddrecon.numerics.autodiff import keep, run_plainly
 
 
@@ -225,6 +225,6 @@ def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor)
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.
     """
-    return ImplicitSolve.apply(
-        solve, Operator.of, operator.prepared, source, operator.loss, *operator.conductances
-    )
+    tensors = source, operator.loss, *operator.conductances
+    assemble = partial(Operator.of, operator.periodic)
+    return ImplicitSolve.apply(solve, assemble, operator.prepared, *tensors)

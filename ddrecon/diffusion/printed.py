@@ -17,6 +17,7 @@ are Sigma1, 2, 6, 8 and 9.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,10 +25,10 @@ from torch import Tensor
 from torch.nn.functional import conv3d, pad
 
 from ddrecon.diffusion.implicit import AutodiffOperator, ImplicitSolve, SolverWithMemory
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
 from ddrecon.medium.coefficients import Medium
 
 MAX_ITERATIONS = 200_000
@@ -40,24 +41,25 @@ ROUNDING = 2.0
 def solve_printed(
     medium: Medium,
     diffusion: Tensor,
-    scattered: Moments,
+    scattered: Tensor,
     outside: Tensor,
     solve: SolverWithMemory,
     has_flux: bool,
-) -> Moments:
-    """L0 by Eq. 25 and, where it `has_flux`, L1 = kappa (-grad L0 + kappa_s Q1) by Eq. 5.
+) -> Tensor:
+    """phi of L0 by Eq. 25 and, where it `has_flux`, L1 = kappa (-grad L0 + kappa_s Q1) by Eq. 5.
 
-    `diffusion`: D [u], `[C, z, y, x]`; `scattered`: kappa_s Q0 and kappa_s Q1; `outside`: ambient
-    radiance `[C, 1, 1, 1]`, which enters through the ghost cells. `solve` must use
-    `iterate_jacobi`.
+    `diffusion`: D [u], `[C, z, y, x]`; `scattered`: moments of kappa_s Q0 and kappa_s Q1;
+    `outside`: ambient radiance `[C, 1, 1, 1]`, which enters through the ghost cells. `solve` must
+    use `iterate_jacobi`.
     """
-    grid, kappa, flux = medium.grid, 3 * diffusion, scattered.flux
+    grid, kappa, (mean_source, first) = medium.grid, 3 * diffusion, mean_and_first(scattered)
+    flux = None if first is None else flux_along_axes(first)
     stencils = make_stencils(grid, kappa)
     echo, inflow = fill_ghosts(grid, kappa, flux, outside)
     diagonal = 3 * medium.absorption.value + kappa * sum(2 / h**2 for h in grid.spacing)
     weights = torch.cat([kappa[:, None], convolve(extend(kappa), stencils[1:])], 1)
     # S; and what ghost cells hold by themselves is known, so it stands on the right side as well
-    source = 3 * scattered.mean + (weights * convolve(inflow, stencils)).sum(1)
+    source = 3 * mean_source + (weights * convolve(inflow, stencils)).sum(1)
     if flux is not None:
         # Eq. 44; ghost cells repeat their neighbors: nothing varies across the faces of the box
         moved = torch.stack([extend(kappa * component) for component in flux], 1)
@@ -68,11 +70,10 @@ def solve_printed(
 
     mean = ImplicitSolve.apply(solve, assemble, {}, source, diagonal, weights, echo)
     if not has_flux:
-        return Moments(mean)
+        return mean[None]
     driving = -convolve(echo * extend(mean) + inflow, stencils[1:])
     driving = driving if flux is None else driving + torch.stack(flux, 1)
-    z, y, x = (kappa[:, None] * driving).unbind(1)
-    return Moments(mean, (z, y, x))
+    return torch.cat([mean[None], moments_of_flux((kappa[:, None] * driving).unbind(1))])
 
 
 def make_stencils(grid: Grid, like: Tensor) -> Tensor:
@@ -96,7 +97,7 @@ def convolve(extended: Tensor, stencils: Tensor) -> Tensor:
 
 
 def fill_ghosts(
-    grid: Grid, kappa: Tensor, flux: Vector | None, outside: Tensor
+    grid: Grid, kappa: Tensor, flux: Sequence[Tensor] | None, outside: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Marshak's E2.6 in ghost cells: L0 there = echo L0 of the neighbor + inflow.
 

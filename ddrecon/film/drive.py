@@ -80,10 +80,10 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
 
     All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
     """
-    before, due = film.done(), 0.0
+    finished, due = film.done(), 0.0
     try:
         for number in drive_frames(film, numbers):
-            if number not in before and monotonic() >= due:
+            if number not in finished and monotonic() >= due:
                 start = monotonic()
                 _report(film)
                 due = monotonic() + (monotonic() - start) / REPORT_SHARE
@@ -131,9 +131,9 @@ def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
                 failed.pop(number, None)
             except (SolveError, FormatError, SceneError) as error:
                 failed[number] = error
-                what = "left out" if is_second else "skipped for now"
+                action = "left out" if is_second else "skipped for now"
                 first, *_ = str(error).splitlines()
-                warnings.warn(f"frame {number}, {what}: {first}", DataWarning, 2)
+                warnings.warn(f"frame {number}, {action}: {first}", DataWarning, 2)
                 continue
             yield number
     if failed:
@@ -194,8 +194,8 @@ def _drive_frame(film: Film, number: int, is_second: bool) -> None:
         with claim_folder(folder, RUN, overwrite=True) as claimed:
             resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
             scene_file = read_scene(folder / SCENE) if resume else film.scene_of(number, is_second)
-            parts = film.build(scene_file), scene_file, claimed, film.environment
-            run, run_folder = open_run(*parts, resume=resume)
+            arguments = film.build(scene_file), scene_file, claimed, film.environment
+            run, run_folder = open_run(*arguments, resume=resume)
             drive_run(run, run_folder, film.preview_every, film.is_quiet, f"frame {number}")
             (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(folder, VELOCITY).is_file():

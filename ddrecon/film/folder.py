@@ -40,7 +40,7 @@ from ddrecon.variables.kinds import kind_of
 SHARE = 6
 """A frame that begins with another makes so many times fewer iterations: the last of its run."""
 FINAL_RATE = 0.05
-"""To what part of their value its learning rates fall; with larger ones films flicker more."""
+"""The part of their value to which learning rates fall; with a larger one films flicker more."""
 KEPT = 0.2
 """It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
 FARTHEST = 3
@@ -128,23 +128,23 @@ class Film:
         They are those that it had in the calibration where no frame close before it is done, nor
         one after it where it `is_between` them; none where it had none.
         """
-        before, after = self._near(number)
-        after = after if is_between else []
-        if not before and not after:
+        earlier, later = self._near(number)
+        later = later if is_between else []
+        if not earlier and not later:
             return _fields_in(self.calibrated(number), names)
-        if not before or not after:
-            nearest = before[-1] if before else after[0]
+        if not earlier or not later:
+            nearest = earlier[-1] if earlier else later[0]
             fields, motion = _fields_in(self.of(nearest), names), self._velocity(nearest)
             if motion is None:
                 return fields
             # The air goes on as it went, and its motion with it.
-            way = motion * (number - nearest)
-            way = carry(way, way)
-            return {name: carry(value, way) for name, value in fields.items()}
-        last, following = before[-1], after[0]
+            displacement = motion * (number - nearest)
+            displacement = carry(displacement, displacement)
+            return {name: carry(value, displacement) for name, value in fields.items()}
+        last, following = earlier[-1], later[0]
         motion = self._flow(last, following)
-        ours, theirs = (_fields_in(self.of(each), names) for each in (last, following))
-        forth, back = ((number - each) * motion for each in (last, following))
+        ours, theirs = (_fields_in(self.of(frame), names) for frame in (last, following))
+        forth, back = ((number - frame) * motion for frame in (last, following))
         return {name: (carry(ours[name], forth) + carry(theirs[name], back)) / 2 for name in ours}
 
     def _near(self, number: int) -> tuple[list[int], list[int]]:
@@ -154,12 +154,12 @@ class Film:
         return [n for n in near if n < number], [n for n in near if n > number]
 
     def _flow(self, number: int, other: int) -> Tensor:
-        """The motion from the frame `number` to the `other`, a frame, in cells: [3, z, y, x]."""
+        """The motion a frame from frame `number` to `other`, in cells: [3, z, y, x]."""
         sums = []
-        for each in (number, other):
-            fields = _fields_in(self.of(each), self.optimized)
+        for frame in (number, other):
+            fields = _fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
-            # Of what has colors their mean.
+            # Colors are averaged.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
             sums.append(torch.stack(values).sum(0))
         return find_flow(*sums) / (other - number)
@@ -175,14 +175,14 @@ class Film:
 
         The first frame of a part has that of the second.
         """
-        before, _ = self._near(number)
-        if not before:
+        earlier, _ = self._near(number)
+        if not earlier:
             return
-        motion = self._flow(before[-1], number) * self._cell
-        for each in (number, before[-1]):
-            with claim_folder(self.of(each), RUN, resume=True, tell=self._tell):
-                if not volume_file(self.of(each), VELOCITY).is_file():
-                    write_volume(self.of(each), VELOCITY, motion.flip(0), self.grid)
+        motion = self._flow(earlier[-1], number) * self._cell
+        for frame in (number, earlier[-1]):
+            with claim_folder(self.of(frame), RUN, resume=True, tell=self._tell):
+                if not volume_file(self.of(frame), VELOCITY).is_file():
+                    write_volume(self.of(frame), VELOCITY, motion.flip(0), self.grid)
 
     def _velocity(self, number: int) -> Tensor | None:
         """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
@@ -195,22 +195,22 @@ class Film:
         return torch.tensor(self.grid.spacing).view(3, 1, 1, 1)
 
 
-def choose_frames(numbers: Sequence[int], part: str | None) -> list[int]:
-    """Those of the frames `numbers` that `part` names, `A:B`, both among them; None is all.
+def choose_frames(numbers: Sequence[int], frame_range: str | None) -> list[int]:
+    """Those of the frames `numbers` within `frame_range`, `A:B`, both included; None is all.
 
     Raises UsageError where there are none.
     """
-    ends = re.fullmatch(r"([0-9]*):([0-9]*)", part or ":")
+    ends = re.fullmatch(r"([0-9]*):([0-9]*)", frame_range or ":")
     first, last = (ends[1] or 0, ends[2] or numbers[-1]) if ends else (1, 0)
     chosen = [number for number in numbers if int(first) <= number <= int(last)]
     if not chosen:
         whole = f"{numbers[0]}:{numbers[-1]}"
-        raise UsageError(f"--frames {part}: names no frame; expected a part of {whole}")
+        raise UsageError(f"--frames {frame_range}: names no frame; expected a part of {whole}")
     return chosen
 
 
-def finished_frames(path: Path, part: str | None) -> list[Path]:
-    """The runs of those frames of the film in the folder `path` that are done, of a `part` of it.
+def finished_frames(path: Path, frame_range: str | None) -> list[Path]:
+    """The runs of finished frames of the film in the folder `path`, within `frame_range`.
 
     Raises UsageError where there are none.
     """
@@ -218,66 +218,66 @@ def finished_frames(path: Path, part: str | None) -> list[Path]:
     runs = {int(run.name): run for run in finished if run.name.isdecimal()}
     if not runs:
         raise UsageError(f"{path}: no frame is done")
-    return [runs[number] for number in choose_frames(sorted(runs), part)]
+    return [runs[number] for number in choose_frames(sorted(runs), frame_range)]
 
 
 @contextmanager
 def open_film(
     film: Film,
-    part: str | None,
+    frame_range: str | None,
     numbers: Sequence[int],
     *,
     overwrite: bool,
     resume: bool,
     shared: Path | None = None,
 ) -> Iterator[None]:
-    """Prepares the folder of `film`, of whose frames a `part` is asked for.
+    """Prepares the folder of `film` for its frames within `frame_range`.
 
     Its calibration may be `shared` from a file. Until the block ends no other process does any of
-    the frames `numbers`. What an earlier film has left there, of that part, is removed, unless this
-    one is to `resume` it. Raises UsageError for a folder that holds something else, or another
-    film; SceneError where pictures are missing, or nothing is optimized.
+    the frames `numbers`. An earlier film's files of these frames are removed, unless this one is to
+    `resume` it. Raises UsageError for a folder that holds something else, or another film;
+    SceneError where pictures are missing, or nothing is optimized.
     """
     scene_file, path = film.scene_file, film.path
     if not any(kind_of(name).is_cellwise for name in film.optimized):
-        what = "optimize.parameters: none changes from frame to frame; name one, such as density"
-        raise SceneError(f"{scene_file.path}: {what}")
+        text = "optimize.parameters: none changes from frame to frame; name one, such as density"
+        raise SceneError(f"{scene_file.path}: {text}")
     require_frames(scene_file)
-    known = path / SCENE
-    given = None if shared is None else read_shared(shared)
+    old_scene = path / SCENE
+    calibration = None if shared is None else read_shared(shared)
     with ExitStack() as stack:
         with film.claim(overwrite=overwrite, resume=resume) as folder:
-            chosen = choose_frames(film.frames.numbers, part)
+            chosen = choose_frames(film.frames.numbers, frame_range)
             _require_free(path, numbers if resume else chosen)
             if numbers:
                 lock = path / f"{PART}.{numbers[0]:04d}-{numbers[-1]:04d}.lock"
                 stack.enter_context(hold(lock))
-            is_same = (resume or part is not None) and known.is_file()
+            is_same = (resume or frame_range is not None) and old_scene.is_file()
             if is_same:
-                _require_same_film(path, describe(read_scene(known)), describe(scene_file))
+                _require_same_film(path, describe(read_scene(old_scene)), describe(scene_file))
             write_scene(scene_file, path)
             if not resume:
                 frames = [f"frames/{number:04d}/" for number in chosen]
                 frames += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
-                kept = [known, scene_file.path, *referenced_files(scene_file)]
+                kept = [old_scene, scene_file.path, *referenced_files(scene_file)]
                 kept += [] if shared is None else [shared]
                 folder.clear(kept, frames if is_same else [""])
-            if given is not None:
-                taken = path / SHARED
-                if taken.is_file() and read_shared(taken)["values"] != given["values"]:
-                    raise UsageError(f"{taken}: holds another calibration; leave --shared out")
-                write_json(taken, given)
+            if calibration is not None:
+                file = path / SHARED
+                if file.is_file() and read_shared(file)["values"] != calibration["values"]:
+                    raise UsageError(f"{file}: holds another calibration; leave --shared out")
+                write_json(file, calibration)
             for number in film.frames.numbers:
                 note_written(film.of(number), "/")
         yield
 
 
-def _require_same_film(path: Path, there: dict[str, Any], now: dict[str, Any]) -> None:
-    for scene in (there, now):
+def _require_same_film(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    for scene in (old, new):
         scene.pop("frames", None)  # a film may grow
         scene.get("optimize", {}).pop("iterations", None)
-    what = f"{path}: holds another film; use another output folder"
-    require_same(there, now, what)
+    text = f"{path}: holds another film; use another output folder"
+    require_same(old, new, text)
 
 
 def _require_free(path: Path, numbers: Sequence[int]) -> None:

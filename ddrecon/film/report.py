@@ -49,13 +49,13 @@ def write_film_report(film: Film) -> dict[str, Any]:
         registered = summaries[number].get("registered", {})
         row |= {f"registered_{key}": value for key, value in registered.items()}
         rows.append({"frame": number, **row})
-    found = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
-    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | found
+    calibration = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | calibration
     write_json(film.path / RECORD, record)
     if rows:
         sections = [section("Quality", side_by_side(*_curves(rows)))]
         sections += [section("Frames", *_figures(film, summaries))]
-        if found.get("values"):
+        if calibration.get("values"):
             sections += [section("Calibration", *_calibration(film.shared))]
         title = f"ddrecon: {film.path.absolute().name}"
         goes_on = len(rows) < record["asked"]
@@ -97,7 +97,7 @@ def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
     views = next(iter(summaries.values()))["views"]
     shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
     numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
-    parts = [paragraph("Target, render and what differs in them, four times enlarged.")]
+    blocks = [paragraph("Target, render and what differs in them, four times enlarged.")]
     for index, name in enumerate(shown):
         strips = [_strip(of.of(number) / "previews" / f"{name}.png") for number in numbers]
         figures = [
@@ -107,10 +107,10 @@ def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
             )
             for number, strip in zip(numbers, strips, strict=True)
         ]
-        parts.append(scrub(figures))
+        blocks.append(scrub(figures))
         if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
             write_animation(of.path / MOVIE, strips, 1.0)
-    return parts
+    return blocks
 
 
 def _strip(path: Path) -> np.ndarray:

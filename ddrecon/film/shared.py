@@ -35,8 +35,8 @@ def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
         else:
             values[p.name] = poses.get(p.name) or plain(value)
     spread = {name: value.tolist() for name, value in together.spread().items()}
-    before = together.runs[0].problem.scene
-    texts = {name: text for name, _, text in list_numbers(together.shared, before, scene)}
+    start = together.runs[0].problem.scene
+    texts = {name: text for name, _, text in list_numbers(together.shared, start, scene)}
     write_json(path, {"frames": numbers, "values": values, "spread": spread, "texts": texts})
 
 
@@ -65,21 +65,21 @@ def fix(described: dict[str, Any], values: Mapping[str, Any], source: Path) -> N
     """
     views = {view["name"]: view for view in described["views"]}
     lights = (f"lights.{index}" for index in range(len(described["lights"])))
-    known = {*lights, *(f"views.{name}" for name in views), *({"ground"} & {*described})}
+    owners = {*lights, *(f"views.{name}" for name in views), *({"ground"} & {*described})}
     strange = [
         name
         for name in values
         if name.startswith(("views.", "lights.", "ground."))
-        and name.rpartition(".")[0] not in known
+        and name.rpartition(".")[0] not in owners
     ]
     if strange:
         raise UsageError(f"{source}: {strange[0]}: the scene has none; name that of its cameras")
     train = [name for name, view in views.items() if view["split"] == "train" and "image" in view]
     for name in [*described["optimize"]["parameters"]]:
         keys = [name.replace(EVERY, f"views.{view}.") for view in train]
-        own = dict.fromkeys(keys if name.startswith(EVERY) else [name])
-        missing = [key for key in own if key not in values]
-        if missing and len(missing) < len(own):
+        names = dict.fromkeys(keys if name.startswith(EVERY) else [name])
+        missing = [key for key in names if key not in values]
+        if missing and len(missing) < len(names):
             raise UsageError(f"{source}: has no {missing[0]}; name that of the scene's cameras")
         if not missing:
             del described["optimize"]["parameters"][name]

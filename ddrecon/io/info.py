@@ -30,7 +30,8 @@ def describe(path: Path) -> dict[str, Any]:
     if not is_image:
         fields, reasons = read_fields(path)
         bounds = next((field.bounds for field in fields.values()), None)
-        report = describe_medium({name: each.values for name, each in fields.items()}, {}, bounds)
+        values = {name: field.values for name, field in fields.items()}
+        report = describe_medium(values, {}, bounds)
         for name, field in fields.items():
             report["fields"][name] |= {"unit": field.unit} if field.unit else {}
         return report | ({"no_fields": reasons} if reasons else {})
@@ -89,11 +90,11 @@ def lines(report: dict[str, Any]) -> list[str]:
     return [
         f"cells: {sizes_text(report['resolution'])} (x, y, z){box}",
         *(
-            f"{name}: {_values(each, FILLED, unit=each.get('unit', ''))}"
-            for name, each in report["fields"].items()
+            f"{name}: {_values(of_field, FILLED, unit=of_field.get('unit', ''))}"
+            for name, of_field in report["fields"].items()
         ),
         *(
-            f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
+            f"{name}: {' '.join(f'{number:.4g}' for number in np.atleast_1d(value))} everywhere"
             for name, value in report.get("constants", {}).items()
         ),
         *(f"no field: {reason}" for reason in report.get("no_fields", {}).values()),

@@ -26,15 +26,15 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     a column a color. Raises FormatError.
     """
     with guard_reading(path):
-        name, (first, *others) = _read_columns(path)
-    values = np.array(others)
+        name, (first, *columns) = _read_columns(path)
+    values = np.array(columns)
     if name not in ("angle", "cosine"):
         raise FormatError(path, f"its first column is {name!r}; call it angle (degrees) or cosine")
     if len(first) < 4:
         raise FormatError(path, f"has {len(first)} angles; a table needs at least 4")
-    if len(others) not in (1, 3):
+    if len(columns) not in (1, 3):
         raise FormatError(
-            path, f"has {len(others)} columns of values; expected 1, or 3 for r, g, b"
+            path, f"has {len(columns)} columns of values; expected 1, or 3 for r, g, b"
         )
     if not (np.isfinite(first).all() and np.isfinite(values).all()):
         raise FormatError(path, "holds numbers that are not finite")

@@ -60,7 +60,7 @@ class RowFunction:
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
         """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
 
-        After the first a field may be several, [n, C or 1, z, y, x].
+        A field may be several, [n, C or 1, z, y, x], and so may what is found.
         """
         found: Tensors = _Found.apply(self, numbers, *fields)
         return found
@@ -73,7 +73,7 @@ class RowFunction:
         "values"; "tangents" of what is `given`, `d_numbers` and `d_fields`; or "cotangents" from
         `bars`, those of what was found.
         """
-        like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[1:]
+        like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[-3:]
         width = 1 if like.is_cuda else self.width
         items = colors * math.prod(shape) // width
         made: dict[str, Any]
@@ -85,7 +85,7 @@ class RowFunction:
             made = {"made": _one_by_one(found), "sums": like.new_empty(len(numbers), items)}
         else:
             found = [like.new_empty(each) for each in self.shapes]
-            made = {"made": found}
+            made = {"made": _one_by_one(found)}
         fields = _one_by_one(fields)
         own = {
             "width": width,
@@ -102,7 +102,8 @@ class RowFunction:
 
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
         """The kernel of "values", "tangents" or "cotangents", for so many fields."""
-        code = self.header, self.name, self.place, self.declared, len(self.shapes)
+        outs = sum(math.prod(shape[:-4]) for shape in self.shapes)
+        code = self.header, self.name, self.place, self.declared, outs
         return _kernel(kind, ins, bits, code)
 
 
@@ -127,7 +128,8 @@ class _Found(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
-        found, sums = ctx.function.run("cotangents", numbers, fields, bars=bars)
+        each = _one_by_one(bars)
+        found, sums = ctx.function.run("cotangents", numbers, fields, bars=each)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
         field_bars = (
             _sum_colors(bar, one.shape[-4]) for bar, one in zip(found, fields, strict=True)

@@ -2,6 +2,13 @@
 // What kernels compute with: numbers F, float or double, and functions of a depth that become
 // vector code. Included at namespace scope by Warp, for processors and for GPUs.
 
+// Whether an item is one cell, ray or light way, which a thread of a GPU does. DDRECON_AS_ON_A_GPU
+// has a processor do the same, for tests: items then come one after another, in any order.
+#if defined(__CUDA_ARCH__) || defined(DDRECON_AS_ON_A_GPU)
+#define IS_GPU 1
+#else
+#define IS_GPU 0
+#endif
 #if defined(__CUDA_ARCH__)
 #define INLINE __device__ __forceinline__
 #define HERE
@@ -36,10 +43,8 @@
 
 namespace ddrecon {
 
-#if defined(__CUDA_ARCH__)
-constexpr bool IS_GPU = true;
-#else
-constexpr bool IS_GPU = false;
+#if IS_GPU && !defined(__CUDA_ARCH__)
+template <class F> INLINE void atomicAdd(F* to, F value) { *to += value; }
 #endif
 
 // How numbers are written, and log(2) in two parts, for `decay`; how many terms of series count.
@@ -59,9 +64,9 @@ template <> struct Format<double> {
     static constexpr double log2_low = 1.90821492927058770002e-10;
 };
 
-// How near to a cell's center a place counts as on it, in units of a line's length
+// How little before a cell's center a place counts as on it, in units of a line's length
 // (`numerics/third_order.py`).
-template <class F> constexpr F KINK = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
+template <class F> constexpr F NEARLY = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
 
 template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
 template <> inline constexpr double FACTORIAL<0> = 1.0;

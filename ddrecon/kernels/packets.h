@@ -8,7 +8,7 @@
 
 namespace ddrecon {
 
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
 constexpr int LANES = 1;
 #else
 // No packet crosses into code that was compiled for other vector registers.
@@ -23,7 +23,7 @@ constexpr unsigned ALL_LANES = (1u << LANES) - 1;
 // comparisons of V and of I give.
 template <class F> struct Packets {
     typedef Format<F> Own;
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
     typedef F V;
     typedef int I;
     typedef double W;
@@ -41,7 +41,7 @@ template <class F> struct Packets {
     static INLINE I pick(IM is, I one, I other) { return is ? one : other; }
     static INLINE V least(V a, V b) { return a < b ? a : b; }
     static INLINE V most(V a, V b) { return a > b ? a : b; }
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
     static INLINE V all(F x) { return x; }
     static INLINE I whole(V x) { return (int)x; }
     static INLINE V real(I x) { return F(x); }
@@ -60,6 +60,7 @@ template <class F> struct Packets {
     static INLINE V gather(const F* p, I at) { return p[at]; }
     static INLINE void add(F* p, I at, V x) { atomicAdd(p + at, x); }
     static INLINE V log(V x) { return ::log(x); }
+    static INLINE V decay(V depth) { return ddrecon::decay(depth); }
     static INLINE void add_one(F* p, F x) { atomicAdd(p, x); }
 #else
     static INLINE V all(F x) { return x - V{}; }
@@ -105,6 +106,7 @@ template <class F> struct Packets {
         for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
     }
     static INLINE void add_one(F* p, F x) { *p += x; }
+    static INLINE V decay(V depth) { return decay_of<F, M>(depth); }
     // log x = n log 2 + log m with x = 2^n m > 0 and m between the root of 1/2 and that of 2:
     // log m = 2 (s + s^3 / 3 + s^5 / 5 + ...), where s = (m - 1) / (m + 1).
     static INLINE V log(V x) {
@@ -115,7 +117,6 @@ template <class F> struct Packets {
         return F(2) * s * p + __builtin_convertvector(n, V) * F(0.69314718055994530942);
     }
 #endif
-    static INLINE V decay(V depth) { return decay_of<F, M>(depth); }
     // The lanes' sum, in double precision.
     static INLINE double sum(V x) {
         double total = 0.0;

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
@@ -71,26 +72,17 @@ def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Bea
     ]
 
 
-def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Moments:
-    """The moments up to `degree` of what `cells` scatter of the beams of `lights` (E2.2, E2.8).
+def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Tensor:
+    """phi up to `degree` of what `cells` scatter of the beams of `lights` (E2.2, E2.8).
 
-    These are the sum of p_l Y_k(w) E tau / (4 pi).
+    These moments are the sum of p_l Y_k(w) E tau / (4 pi).
     """
-    directions, *each = unit_directions(*(light.direction for light in lights))
-    is_even = degree <= 1 and not cells.is_cellwise
-    cosine = cells.mean_cosine if is_even and degree else None
-    weights = _beam_weights(directions, cosine, *(light.irradiance for light in lights))
-    if is_even:
-        return attenuate(cells, directions, weights, is_kept=True)
-    received = (
-        beam_moments(attenuate(cells, one, weight, is_kept=True).mean, direction, degree).weighted(
-            remaining_moments(cells)
-        )
-        for one, weight, direction in zip(
-            split_directions(directions, 1), weights.split(1), each, strict=True
-        )
-    )
-    return reduce(Moments.plus, received)
+    directions, *_ = unit_directions(*(light.direction for light in lights))
+    irradiances, factors = (light.irradiance for light in lights), remaining_moments(cells)
+    same = None if cells.is_cellwise else factors
+    weights = _beam_weights(directions, degree, same, *irradiances)
+    phi = attenuate(cells, directions, weights, is_kept=True)
+    return weigh(phi, factors) if cells.is_cellwise else phi
 
 
 @remember
@@ -107,21 +99,21 @@ def split_directions(directions: Tensor, count: int) -> tuple[Tensor, ...]:
 
 
 @remember
-def _beam_weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: Tensor) -> Tensor:
-    """What `attenuate` is to weight beams by: E / (4 pi), and 3 g' w times that for the flux."""
-    weights = torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
-    if mean_cosine is None:
-        return weights
-    flux = 3 * mean_cosine.view(-1) * directions[..., None] * weights
-    return torch.cat([weights.expand(-1, -1, flux.shape[2]), flux], 1)
+def _beam_weights(
+    directions: Tensor, degree: int, factors: Tensor | None, *irradiances: Tensor
+) -> Tensor:
+    """What `attenuate` is to weight beams by: Y_k(w) E / (4 pi), times `factors`, which are p_l."""
+    weights = harmonics(directions, degree).T[..., None]
+    weights = weights * torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
+    return weights if factors is None else weights * by_harmonic(factors, degree).flatten(1)
 
 
-def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False) -> Moments:
+def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False) -> Tensor:
     """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over `cells`.
 
     So the energy taken from a beam is what cells receive, however thick they are. `weights`
-    [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments. Where it
-    `is_kept`, as of lights, which are few, kernels keep what their adjoint needs.
+    [L, K, C] are those of each moment, and the sum is [K, C, z, y, x]. Where it `is_kept`, as of
+    lights, which are few, kernels keep what their adjoint needs.
     """
     field, (_, moments, colors) = cells.extinction.field, weights.shape
     quarter = moments * colors // (4 * len(field))
@@ -132,9 +124,7 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool 
     else:
         count = max(1, quarter // 8)
     parts = zip(split_directions(directions, count), weights.split(count), strict=True)
-    return Moments.of_sums(
-        reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
-    )
+    return reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
 
 
 def attenuate_few(

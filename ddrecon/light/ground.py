@@ -19,11 +19,11 @@ from torch.nn.functional import adaptive_avg_pool2d, pad
 from ddrecon.grid import Grid
 from ddrecon.light.beam import attenuate_few
 from ddrecon.light.lights import BeamLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import moment_weights
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.records import bounded
 
 UPWARDS = 24
 """Directions of the ground's light."""
@@ -34,7 +34,7 @@ class Plane:
     """The plane at `height` [u] along the array's `axis` that points up."""
 
     height: float
-    axis: int
+    axis: int = bounded(minimum=0, maximum=2)
 
     @property
     def across(self) -> tuple[int, int]:
@@ -172,8 +172,8 @@ def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
 
 def light_from_below(
     medium: Medium, plane: Plane, ambient: Tensor
-) -> Callable[[Tensor, Tensor], Moments]:
-    """What a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """phi of what a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
 
     It is given the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much more
     that is. What it returns is less the light that is `ambient` [C] from everywhere.
@@ -188,9 +188,9 @@ def light_from_below(
     drift = (centers[axis] - plane.height) / ways[axis]
     points = [centers[one] - ways[one] * drift for one in plane.across]
 
-    def send(even: Tensor, texels: Tensor) -> Moments:
+    def send(even: Tensor, texels: Tensor) -> Tensor:
         more = look_up_texels(texels, medium.grid, plane, *points).transpose(0, 1)
         sent = passed * ((even - ambient).view(-1, 1, 1, 1) + more)
-        return Moments.of_sums(torch.tensordot(weights.T, sent, 1))
+        return torch.tensordot(weights.T, sent, 1)
 
     return send

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from ddrecon.records import bounded, one_of
+
 
 @dataclass(eq=False)
 class DirectionalLight:
@@ -41,8 +43,8 @@ class EnvironmentLight:
     radiance: Tensor
     scale: Tensor
     rotation: Tensor
-    directions: int = 48
-    up: str = "y"
+    directions: int = bounded(48, minimum=1)
+    up: str = one_of("y", ("y", "z"))
 
 
 @dataclass(eq=False)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import radiance_along, weigh
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
@@ -18,12 +18,12 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember
 
 
-def scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E2.3, E8.12).
+def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
+    """(1 - f) p_l phi_k of `light` phi, per unit length and kappa_s (E2.3, E8.12).
 
     Where the phase function differs from cell to cell it is p_l phi_k, per (1 - f) kappa_s.
     """
-    return light.weighted(_factors(medium))
+    return weigh(light, _factors(medium))
 
 
 def _factors(medium: Medium) -> Tensor:
@@ -40,7 +40,7 @@ def _weigh(fraction: Tensor, moments: Tensor) -> Tensor:
 
 def scatter_towards(
     medium: Medium,
-    light: Moments,
+    light: Tensor,
     rays: Rays,
     turned: Sequence[TurnedBeam] = (),
     more: Tensor | None = None,
@@ -48,16 +48,17 @@ def scatter_towards(
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
 
     With what the `turned` beams scatter (E8.12), or with `more` of skies, of which `light` may say
-    what a ground hides. As `Moments.positive_along` has it.
+    what a ground hides. It is floored as `radiance_along` says.
     """
     more = recompute(sum_turned, medium, rays, turned) if turned else more
-    if is_fused() and light.flux and not medium.is_cellwise and rays.pane is None:
+    if is_fused() and len(light) > 1 and not medium.is_cellwise and rays.pane is None:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)
 
     def scatter() -> Tensor:
-        return scatter_once_more(medium, light).positive_along(rays.towards_eye(medium.grid), more)
+        towards = rays.towards_eye(medium.grid)
+        return radiance_along(scatter_once_more(medium, light), towards, more)
 
     return recompute(scatter)
 
@@ -82,7 +83,7 @@ def sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tens
     return functools.reduce(torch.add, (_scatter_turned(medium, beam, towards) for beam in turned))
 
 
-def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
+def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Sequence[Tensor]) -> Tensor:
     """What light of `beam` scatters `towards` a camera: its phase function is that of E8.12.
 
     It is per unit of what `scatter_once_more` is.

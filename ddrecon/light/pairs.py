@@ -26,7 +26,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.light.beam import unit_directions
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import add, beam_moments, weigh
 from ddrecon.light.shear import Shear, cross_grid, sum_masses
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
@@ -65,17 +65,11 @@ class Pair:
     along: Tensor
     against: Tensor
 
-    def source(self, medium: Medium) -> Moments:
-        """What both scatter but for their backward peak (E8.11)."""
-        factors = unturned_moments(medium)
-        both = [
-            beam_moments(radiance, direction, medium.degree).weighted(factors)
-            for radiance, direction in (
-                (self.along, self.direction),
-                (self.against, -self.direction),
-            )
-        ]
-        return both[0].plus(both[1])
+    def source(self, medium: Medium) -> Tensor:
+        """phi of what both scatter but for their backward peak (E8.11)."""
+        forth = beam_moments(self.along, self.direction, medium.degree)
+        back = beam_moments(self.against, -self.direction, medium.degree)
+        return weigh(add(forth, back), unturned_moments(medium))
 
     @property
     def turned(self) -> tuple[TurnedBeam, TurnedBeam]:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import beam_moments
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -89,8 +89,8 @@ def follow_point_light(medium: Medium, light: PointLight) -> PointBeam:
     return PointBeam(mass, position, irradiance, _least_square(medium.grid))
 
 
-def receive_point_light(cells: Medium, light: PointLight, degree: int) -> Moments:
-    """The moments of I tau / (4 pi r^2) at `cells` (E2.2).
+def receive_point_light(cells: Medium, light: PointLight, degree: int) -> Tensor:
+    """The moments phi of I tau / (4 pi r^2) at `cells` (E2.2).
 
     They go up to `degree`, and are those of radiance that all travels away from the light. tau is
     averaged over each cell along the light's ray.
@@ -98,7 +98,7 @@ def receive_point_light(cells: Medium, light: PointLight, degree: int) -> Moment
     entered, step, square, direction = _go_to_cells(cells, array_order(light.position))
     tau = cells.extinction.mean_transmittance(entered, step)
     received = along_colors(light.intensity) / (4 * math.pi) / square * tau
-    return beam_moments(received, direction.movedim(-1, 0), degree)
+    return beam_moments(received, direction, degree)
 
 
 def _least_square(grid: Grid) -> float:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams, receive_beams
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import add, moments_of_flux, weigh
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
 from ddrecon.light.profile import profile_in
@@ -34,25 +34,24 @@ from ddrecon.numerics.remember import remember
 class Received:
     """What each cell receives of beams, light that is not yet scattered, averaged over the cell.
 
-    `source`: Q0, Q1 and what follows, to the degree asked for. `mean` [C, z, y, x]: that of
-    the light itself over directions, what peaks have turned among it. `turned`: light that backward
-    peaks have turned back and forth (E8.11).
+    `source` [K, C, z, y, x]: Q0, Q1 and what follows, to the degree asked for. `mean` [C, z, y, x]:
+    that of the light itself over directions, what peaks have turned among it. `turned`: light that
+    backward peaks have turned back and forth (E8.11).
     """
 
-    source: Moments
+    source: Tensor
     mean: Tensor
     turned: tuple[TurnedBeam, ...] = ()
 
     def plus(self, other: Received) -> Received:
         """The light of both."""
-        source, turned = self.source.plus(other.source), self.turned + other.turned
+        source, turned = add(self.source, other.source), self.turned + other.turned
         return Received(source, self.mean + other.mean, turned)
 
     def across(self, profile: Tensor) -> Received:
         """This light of directional lights, its irradiance times `profile` [1, z, y, x]."""
         turned = (replace(one, radiance=profile * one.radiance) for one in self.turned)
-        source = self.source.scaled(profile, profile, profile)
-        return Received(source, profile * self.mean, tuple(turned))
+        return Received(profile * self.source, profile * self.mean, tuple(turned))
 
 
 def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
@@ -97,17 +96,17 @@ def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Recei
     for light in lights:
         if isinstance(light, PointLight):
             received = receive_point_light(cells, light, degree)
-            parts.append(Received(received.weighted(remaining_moments(cells)), received.mean))
+            parts.append(Received(weigh(received, remaining_moments(cells)), received[0]))
         for one in _confine(cells, light):
             parts.append(_receive_parallel(cells, [one.light], degree).across(one.profile))
     nothing = torch.zeros_like(cells.extinction.value)
-    return reduce(Received.plus, parts) if parts else Received(Moments(nothing), nothing)
+    return reduce(Received.plus, parts) if parts else Received(nothing[None], nothing)
 
 
 def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Received:
     if not has_backward_peak(cells):
         source = receive_beams(cells, lights, degree)
-        return Received(source, source.mean)
+        return Received(source, source[0])
     pairs = [follow_pair(cells, light) for light in lights]
     parts = (Received(one.source(cells), one.along + one.against, one.turned) for one in pairs)
     return reduce(Received.plus, parts)
@@ -132,8 +131,8 @@ def ambient_sky(radiance: Tensor) -> Sky:
     return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
 
-def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Moments | None:
-    """Light of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
+def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Tensor | None:
+    """phi of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
 
     Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
     and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
@@ -144,26 +143,28 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
         return None
     if medium.index != 1:
         parts = (
-            attenuate(medium, one.travel, moment_weights(one, degree)).scaled(*[profile] * 3)
+            profile * attenuate(medium, one.travel, moment_weights(one, degree))
             for sky in skies
             for one, profile in refract_sky(medium.grid, medium.index, sky)
         )
-        return reduce(Moments.plus, parts)
+        return reduce(torch.add, parts)
     weights = torch.cat([moment_weights(sky, degree) for sky in skies])
     return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
 
 def moment_weights(sky: Sky, degree: int) -> Tensor:
-    """What transmittance is multiplied by, [N, moments, C]: the moments of light outside."""
+    """What transmittance is multiplied by, [N, K, C]: the moments phi of light outside."""
     weights = [sky.irradiance[:, None]]
     if degree > 0:
-        weights.append(3 * sky.vector)
+        weights.append(3 * moments_of_flux(sky.vector.unbind(1)).transpose(0, 1))
     if degree > 1:
         weights.append(harmonics(sky.travel, degree)[4:].T[..., None] * sky.irradiance[:, None])
     return torch.cat(weights, 1) / (4 * math.pi)
 
 
-def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector, period: Unrolled) -> Tensor:
+def scatter_sky(
+    medium: Medium, skies: Sequence[Sky], towards: Sequence[Tensor], period: Unrolled
+) -> Tensor:
     """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
     That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
-from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient, for_channels
 from ddrecon.medium.phase_peak import SeenPhase
@@ -23,13 +22,13 @@ from ddrecon.numerics.third_order import ThirdOrder
 class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
-    `outside` [C, 1, 1, 1] is that; `received` are the mean and the flux of what cells receive of
-    beams, `kept` times which counts as `diffuse` light does. `backward` are, by face, the parts
-    [C, rows, columns] of light from there that are scattered into the camera's rays.
+    `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, z, y, x] of what cells
+    receive of beams, `kept` times which counts as `diffuse` light does. `backward` are, by face,
+    the parts [C, rows, columns] of light from there that are scattered into the camera's rays.
     """
 
     outside: Tensor
-    received: Moments
+    received: Tensor
     kept: Tensor
     backward: Sequence[Tensor]
 

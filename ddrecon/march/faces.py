@@ -18,6 +18,7 @@ from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
+from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import for_channels, thinness
@@ -77,6 +78,7 @@ def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | No
     if inflow is None:
         return [None] * len(FACES)
     extinction, diffusing, lacks = emission.extinction, emission.diffusing, list[Tensor | None]()
+    mean, *first = inflow.received.unbind()
     for (axis, side), is_so, backward in zip(FACES, is_line, inflow.backward, strict=True):
         if not is_so:
             lacks.append(None)
@@ -86,9 +88,10 @@ def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | No
             return field.select(1 + axis, -side)
 
         width, normal = grid.spacing[axis], 2 * side - 1
-        received = layer(inflow.received.mean)
-        if inflow.received.flux is not None:
-            received = received - 0.5 * normal * layer(inflow.received.flux[axis])
+        received = layer(mean)
+        if first:
+            flux = flux_along_axes([layer(moment) for moment in first])
+            received = received - 0.5 * normal * flux[axis]
         kept = inflow.kept.view(-1, 1, 1)
         light = layer(emission.diffuse) + kept * received
         lost = layer(extinction.scale) * layer(extinction.field)

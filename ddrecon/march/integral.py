@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.engine import current_engine
+from ddrecon.engine import has_kernels
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission
 from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
@@ -86,7 +86,7 @@ def _march_part(
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
     """As `march_rays`, by the engine in use, through all periods of a grid."""
     march_own = march_rays
-    if current_engine() == "warp":
+    if has_kernels("view rays"):
         from ddrecon.march.fused.integrate import march_rays as march_own
     if sampler.emission.period is not None:
         return march_periods(march_own, sampler, rays, crossing)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, Pane, Rays, cast_rays, subpixel_offsets
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import fill
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
@@ -106,7 +106,7 @@ def _open(rays: Rays, grid: Grid, index: float, settings: RenderSettings) -> tup
 def see_through(
     window: Window,
     emission: Emission,
-    light: Moments,
+    light: Tensor,
     medium: Medium,
     background: Tensor | None,
     settings: RenderSettings,
@@ -114,14 +114,14 @@ def see_through(
     """The radiance [C, R] that a camera sees of `medium` through `window`.
 
     `background` [C, R] is the radiance outside, where rays leave the box, None for black; `light`
-    is what the far face reflects.
+    is phi of what the far face reflects.
     """
     grid, degree = medium.grid, medium.degree
     places = [
         (2 * window.points[:, a] - grid.lower[a] - grid.upper[a]) / grid.extent[a]
         for a in (2, 1, 0)
     ]
-    moments = light.harmonics(degree)
+    moments = fill(light, degree)
     found = sample_volume(moments.flatten(0, 1), torch.stack(places, -1)[None])[:, 0]
     along = harmonics(-window.inside, degree)[:, None] * found.unflatten(0, moments.shape[:2])
     behind = window.reflected * along.sum(0).clamp(min=0)

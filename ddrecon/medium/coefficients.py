@@ -21,6 +21,7 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.records import bounded
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -50,7 +51,7 @@ class Volume(Displayed):
     support: Tensor | None = None
     emission: Tensor | None = None
     black_body: Tensor | None = None
-    index: float = 1.0
+    index: float = bounded(1.0, minimum=1)
 
     def __post_init__(self) -> None:
         if isinstance(self.phase, Tensor):

@@ -6,7 +6,9 @@ Every name of torch that is private, or not documented, stands in this file.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields, is_dataclass
+from types import CellType, FunctionType, MethodType
 from typing import Any, TypeVar
 
 import torch
@@ -170,11 +172,13 @@ class _Recomputation:
     """Numbers in place of the tensors that `function` saves for its backward pass.
 
     When the first is asked for, `function` runs again and saves the same tensors in the same order:
-    by the engine of then, and not in forward mode, as it did not before.
+    by the engine of then, and not in forward mode, as it did not before. Raises RuntimeError, as
+    autograd does, where a tensor that `function` holds was changed in place since.
     """
 
     def __init__(self, function: Callable[[], Any]):
         self.function, self.engine = function, current_engine()
+        self.versions = [(tensor, version_of(tensor)) for tensor in _tensors_in(function)]
         self.count = 0
         self.saved: dict[int, Tensor] = {}
 
@@ -190,6 +194,11 @@ class _Recomputation:
         return self.saved.pop(number)
 
     def _run(self) -> None:
+        if any(version_of(tensor) != version for tensor, version in self.versions):
+            raise RuntimeError(
+                "a tensor that light was computed from has been modified by an inplace operation "
+                "since: the gradient would be that of other numbers"
+            )
         saved: list[Tensor] = []
         level, engine = forward_ad._current_level, current_engine()
         try:
@@ -206,3 +215,27 @@ class _Recomputation:
             if engine != self.engine:
                 use_engine(engine)
         self.saved = dict(enumerate(saved))
+
+
+def _tensors_in(value: Any) -> Iterator[Tensor]:
+    """The tensors in `value`: records, lists, tuples, mappings, and what a function has bound."""
+    if isinstance(value, Tensor):
+        yield value
+        return
+    inner: Iterable[Any] = ()
+    if isinstance(value, list | tuple):
+        inner = value
+    elif isinstance(value, dict):
+        inner = value.values()
+    elif isinstance(value, functools.partial):
+        inner = (value.func, value.args, value.keywords)
+    elif is_dataclass(value):
+        inner = (getattr(value, key.name) for key in fields(value))
+    elif isinstance(value, FunctionType):
+        # An empty cell is that of a variable that has no value yet.
+        cells = [cell for cell in value.__closure__ or () if cell != CellType()]
+        inner = (*(cell.cell_contents for cell in cells), *(value.__defaults__ or ()))
+    elif isinstance(value, MethodType):
+        inner = (value.__self__,)
+    for entry in inner:
+        yield from _tensors_in(entry)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
 from ddrecon.pictures.srgb import display_slope
+from ddrecon.records import bounded
 
 LEAST = 1e-3
 """A picture errs by at least this part of its root mean square: nothing is known better."""
@@ -26,9 +27,9 @@ class Noise:
     0 that between neighboring sRGB-encoded values: 1/255 in a picture of 8 bits, 0 in a linear one.
     """
 
-    read: float
-    shot: float
-    step: float = 0.0
+    read: float = bounded(minimum=0)
+    shot: float = bounded(minimum=0)
+    step: float = bounded(0.0, minimum=0)
 
     def deviation(self, values: Tensor) -> Tensor:
         """The standard deviation of `values` of linear radiance; what is below black is as black.
@@ -59,8 +60,8 @@ def estimate_noise(image: Tensor, step: float) -> Noise:
     level = avg_pool2d(colors, 3, 1).flatten()
     order = level.argsort()
     count = min(BINS, max(1, len(order) // 64))
-    levels = torch.stack([level[part].mean() for part in order.tensor_split(count)])
-    medians = torch.stack([uneven[part].median() for part in order.tensor_split(count)])
+    levels = torch.stack([level[pixels].mean() for pixels in order.tensor_split(count)])
+    medians = torch.stack([uneven[pixels].median() for pixels in order.tensor_split(count)])
     variances = (medians / NORMAL) ** 2
     if step:  # which the differences have in them
         variances = (variances - (step / display_slope(levels)) ** 2 / 12).clamp(min=0)

@@ -64,12 +64,12 @@ class Stabilized(Scale):
         heights = torch.cat([places[:1], torch.cumulative_trapezoid(slopes, places)])
         at = ((radiance / top).clamp(min=0).sqrt() * (NODES - 1)).clamp(max=NODES - 1)
         below = at.long().clamp(max=NODES - 2)
-        part = (radiance - places[below]) / (places[below + 1] - places[below])
-        stabilized = heights[below] + part * (heights[below + 1] - heights[below])
+        fraction = (radiance - places[below]) / (places[below + 1] - places[below])
+        stabilized = heights[below] + fraction * (heights[below + 1] - heights[below])
         return stabilized.to(radiance.dtype)
 
     def slope(self, target: Tensor) -> Tensor:
-        # By the mean of neighbors: a weight that follows the noise would prefer what it darkens.
+        # Neighbors are averaged: a weight that follows the noise would prefer darkened pixels.
         level = avg_pool2d(target, 5, 1, 2, count_include_pad=False)
         return 1 / self.noise.deviation(level)
 

@@ -33,13 +33,13 @@ def explain_divergence(
 
     It names the largest value of each of the `parameters`, and advises to lower their rates.
     """
-    what, residual, advice = str(error), math.nan, ""
+    reason, residual, advice = str(error), math.nan, ""
     if isinstance(error, SolveError):
         residual = error.residual
         if math.isfinite(residual):
-            what, advice = what.partition(";")[0], f"{error.advice}, or "
+            reason, advice = reason.partition(";")[0], f"{error.advice}, or "
         else:
-            what = "the light is not finite"
+            reason = "the light is not finite"
     largest = list[str]()
     for parameter in parameters:
         values = parameter.value.detach()
@@ -51,7 +51,7 @@ def explain_divergence(
         for parameter in parameters
     )
     return DivergenceError(
-        iteration, f"{what}; at most, {'; '.join(largest)}", residual, f"{advice}lower {rates}"
+        iteration, f"{reason}; at most, {'; '.join(largest)}", residual, f"{advice}lower {rates}"
     )
 
 
@@ -71,6 +71,6 @@ def _name_entry(name: str, index: list[int], is_field: bool) -> str:
     """
     if not is_field and len(index) != 3:
         return f"{name}, entry {index}" if index else name
-    what, count = ("voxel", 3) if is_field else ("pixel", 2)
+    kind, count = ("voxel", 3) if is_field else ("pixel", 2)
     place, color = index[-count:][::-1], index[:-count]
-    return f"{name} at {what} {place}" + (f", color {color[0]}" if color else "")
+    return f"{name} at {kind} {place}" + (f", color {color[0]}" if color else "")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
+from ddrecon.reconstruct.shares import agree_on, own_views, sum_present
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
@@ -53,7 +53,7 @@ def differentiate(
     # Views share what is made of values: so that each has a graph of its own, it is made anew.
     worlds = ((with_values(scene, outside), name) for name in own_views(scene, names))
     images, loss, sums = _differentiate_views(worlds, light_field, inputs, loss_of)
-    (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
+    (total, *sums) = sum_present([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E3.2).
     pairs = zip(tensors, leaf_bars, strict=True)
@@ -86,14 +86,24 @@ def _differentiate_views(
     once; None is zero.
     """
     sums: list[Tensor | None] = [None] * len(inputs)
-    images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
+    owned = set[int]()
+    images, loss = list[Tensor](), light_field.diffuse.new_zeros(())
     for scene, name in worlds:
         view = scene.view(name)
         derivatives = scene.optimize.derivatives if scene.optimize else "all"
         image = view_picture(light_field, scene, view, derivatives)
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
-            sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
+            for i, bar in enumerate(torch.autograd.grad(view_loss, inputs, allow_unused=True)):
+                known = sums[i]
+                if known is None or bar is None:
+                    sums[i] = bar if known is None else known
+                elif i in owned:
+                    known += bar
+                else:
+                    # autograd may hand out one tensor for two inputs: what is added to is a sum
+                    sums[i] = known + bar
+                    owned.add(i)
         images.append(image.detach())
         loss = loss + view_loss.detach()
     return images, loss, sums
@@ -102,8 +112,8 @@ def _differentiate_views(
 def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
     """Entry by entry; None is zero."""
     return [
-        one if other is None else other if one is None else one + other
-        for one, other in zip(sums, more, strict=True)
+        total if addend is None else addend if total is None else total + addend
+        for total, addend in zip(sums, more, strict=True)
     ]
 
 
@@ -115,16 +125,16 @@ def _cut(record: Any, tensors: list[Tensor], leaves: list[Tensor]) -> Any:
     if isinstance(record, Tensor):
         if not record.requires_grad:
             return record
-        known = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
-        if not known:
+        existing = [leaf for tensor, leaf in zip(tensors, leaves, strict=True) if tensor is record]
+        if not existing:
             tensors.append(record)
             leaves.append(record.detach().requires_grad_())
-        return known[0] if known else leaves[-1]
+        return existing[0] if existing else leaves[-1]
     if isinstance(record, tuple):
         return tuple(_cut(entry, tensors, leaves) for entry in record)
     if is_dataclass(record) and not isinstance(record, type):
-        parts = {part.name: getattr(record, part.name) for part in fields(record)}
-        return replace(record, **{n: _cut(part, tensors, leaves) for n, part in parts.items()})
+        values = {field.name: getattr(record, field.name) for field in fields(record)}
+        return replace(record, **{n: _cut(field, tensors, leaves) for n, field in values.items()})
     return record
 
 

@@ -30,7 +30,8 @@ from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
-from ddrecon.variables.values import require_scene, with_values
+from ddrecon.variables.legal import require_legal
+from ddrecon.variables.values import with_values
 
 
 def optimize(
@@ -54,13 +55,13 @@ def optimize(
 class Reconstruction:
     """A run: its `problem`, which stays, and its state.
 
-    That is its `parameters`, the `level` of resolution, the sum of its log, `total`, and `misfit`,
-    the root of the last mean loss over the problem's power. `before_step` is the state before the
-    last step.
+    State: `parameters`; `level`, the current resolution; `total`, the running totals of the log;
+    `misfit` = sqrt(mean image loss / power of the targets) of the last iteration. `before_step` is
+    the state before the last step.
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
-        require_scene(scene)
+        require_legal(scene)
         forget_changed()
         self.problem = Problem.of(scene, iterations)
         settings, train = self.problem.settings, self.problem.train
@@ -88,7 +89,7 @@ class Reconstruction:
         """The log's row of one more iteration.
 
         Raises DivergenceError when the iteration fails. The state is then that before the last
-        step, since it was this step that led astray.
+        step, which caused the failure.
         """
         start = perf_counter()
         stage = self.schedule.stage(self.iteration)
@@ -132,10 +133,11 @@ class Reconstruction:
         # Judge: is there more to be done, here or at all?
         self.schedule.note(self.iteration, total)
         # Keep: in the end, a part of what fields began with.
-        if (part := self.problem.settings.keep_start) and self.schedule.is_over(self.iteration + 1):
+        fraction = self.problem.settings.keep_start
+        if fraction and self.schedule.is_over(self.iteration + 1):
             for p in self.parameters:
                 if p.is_field:
-                    p.keep_start(part)
+                    p.keep_start(fraction)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim = None, None
@@ -159,10 +161,10 @@ class Reconstruction:
             test_ssim=test_ssim,
         )
         # Sum: the solvers' iterations, and quality as last known.
-        known = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
+        unchanged = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
         counts = "forward_iterations", "adjoint_iterations"
         sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
-        self.total = replace(row, **known, **sums)
+        self.total = replace(row, **unchanged, **sums)
         return row
 
     def current_scene(self) -> Scene:
@@ -234,22 +236,23 @@ class Reconstruction:
                 p.step(gradients[p.name], rates[p.name], self.problem.power)
         due = [name for name, rate in rates.items() if rate]
         point = self._point(values)
-        self.numbers.step(self.numbers.hear(point, gradients, compared, due, self.iteration))
+        equations = self.numbers.find_equations(point, gradients, compared, due, self.iteration)
+        self.numbers.step(equations)
 
     def _point(self, values: Mapping[str, Tensor]) -> Point:
         """Where the numbers stand: at the `values` of all parameters."""
-        before = {name: value.detach() for name, value in values.items()}
-        return Point(self.level.train, before, self.memory.last)
+        detached = {name: value.detach() for name, value in values.items()}
+        return Point(self.level.train, detached, self.memory.last)
 
-    def changes_alone(self) -> dict[Parameter, Tensor]:
+    def undamped_changes(self) -> dict[Parameter, Tensor]:
         """The step, in units of rates, to what all pictures say of the numbers, undamped."""
         values = {parameter.name: parameter.value for parameter in self.parameters}
         compared = Comparison(self.level.train.views, self.level.targets)
         gradients = self._differentiate(values, compared).gradients
         self.numbers.curvatures = {}
         point = self._point(values)
-        said = self.numbers.hear(point, gradients, compared, values, self.iteration)
-        return self.numbers.changes([said], damping=0.0)
+        equations = self.numbers.find_equations(point, gradients, compared, values, self.iteration)
+        return self.numbers.changes([equations], damping=0.0)
 
     @property
     def _is_test_due(self) -> bool:

@@ -1,13 +1,13 @@
 """Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E10.2).
 
-They are few, and look alike: a camera's turn and its shift, a lamp and an exposure, and the level
-of a field. So they move all at once, by what pictures say of them as a matrix, J^T W J. The matrix
-decides how far a step goes, not where steps end: so J is made of differences of pictures, and found
-anew ever more rarely. The gradient is exact at every step.
+Numbers are few, and look alike in pictures: a camera's turn and its shift, a lamp and an exposure,
+and the level of a field. So all move at once, by the normal matrix J^T W J of the pictures. The
+matrix decides how far a step goes, not where steps end: J is made of differences of pictures, and
+renewed ever more rarely. The gradient is exact at every step.
 
-What is known of them without pictures are gauges, and how calibrations err. A gauge is a change of
-several parameters together that no picture shows, and that is not made: twice the exposure of all
-cameras is half the light; all cameras moved together move the volume.
+Gauges and the errors of calibrations are known without pictures. A gauge is a change of several
+parameters together that no picture shows, and that is not made: twice the exposure of all cameras
+is half the light; all cameras moved together move the volume.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Said:
-    """What the pictures of one volume say of those numbers that are `moved`, entry by entry.
+class NormalEquations:
+    """The normal equations of the `moved` numbers by the pictures of one volume, entry by entry.
 
-    That is `matrix`, J^T W J, and `right`, the derivative downhill, in units of the rates.
+    `matrix` is J^T W J, and `right` the derivative downhill, in units of the rates.
     """
 
     moved: Sequence[Parameter]
@@ -66,9 +66,9 @@ class NumberSteps:
     """The steps of the single numbers among `parameters`, which the views of `train` show.
 
     Fields take part by their level, one number a color, where numbers of the medium are optimized,
-    since pictures show their product. `curvatures` are J^T W J of each view that was looked at, by
-    name, and the iteration that it is of; `begun` is the first at this resolution. `sharing` are
-    several volumes that share numbers: a step is made when the pictures of all have been heard.
+    since pictures show their product. `curvatures` are J^T W J of each view, by name, and the
+    iteration that it is of; `begun` is the first at this resolution. `sharing` volumes share the
+    numbers: equations are `pending` until those of all volumes are there.
     """
 
     def __init__(self, train: Scene, parameters: Sequence[Parameter], sharing: int = 1):
@@ -82,65 +82,65 @@ class NumberSteps:
         calibrated = poses if len(poses) == len(cameras) > 1 else []
         self.priors = {p: calibration_prior(cameras[str(p.view)], p.grid).cpu() for p in calibrated}
         self.curvatures: dict[str, tuple[int, Tensor]] = {}
-        self.begun, self.sharing, self.heard = 0, sharing, list[Said]()
+        self.begun, self.sharing, self.pending = 0, sharing, list[NormalEquations]()
 
-    def step(self, said: Said) -> None:
-        """Moves the numbers by what the views that were compared have `said`."""
-        self.heard.append(said)
-        if len(self.heard) < self.sharing:
+    def step(self, equations: NormalEquations) -> None:
+        """Moves the numbers by `equations`, once those of all volumes are there."""
+        self.pending.append(equations)
+        if len(self.pending) < self.sharing:
             return
-        heard, self.heard[:] = [*self.heard], []
-        if not any(said.moved for said in heard):
+        all_equations, self.pending[:] = [*self.pending], []
+        if not any(equations.moved for equations in all_equations):
             return
-        for p, part in self.changes(heard).items():
-            part = part / (part.abs().max() / tuning.LARGEST_STEP).clamp(min=1)
-            p.move(part * units_of(p))
+        for p, change in self.changes(all_equations).items():
+            change = change / (change.abs().max() / tuning.LARGEST_STEP).clamp(min=1)
+            p.move(change * units_of(p))
         for gauge in self.gauges:
             gauge.hold()
 
-    def hear(
+    def find_equations(
         self,
         point: Point,
         gradients: Mapping[str, Tensor],
         compared: Comparison,
         due: Collection[str],
         iteration: int,
-    ) -> Said:
-        """What the views that were `compared` say of the numbers that are `due`, by name.
+    ) -> NormalEquations:
+        """The normal equations of the numbers that are `due`, by the views that were `compared`.
 
-        `gradients` are theirs, at `point`.
+        `gradients` are those of the views, at `point`.
         """
         shares = dict.fromkeys((view.name for view in compared.views), 0.0)
         for view in compared.views:
             shares[view.name] += compared.share(view)
         moved = [p for p in self.numbers if p.name in due and (p.view is None or p.view in shares)]
         if not moved:
-            return Said([], torch.zeros(0, 0).double(), torch.zeros(0).double())
+            return NormalEquations([], torch.zeros(0, 0).double(), torch.zeros(0).double())
         self._refresh(point, compared, iteration)
         unit = torch.cat([units_of(p) for p in moved])
-        known = {name: share * self.curvatures[name][1] for name, share in shares.items()}
-        matrix = _sum_between(moved, known, self.numbers) * unit * unit[:, None]
+        matrices = {name: share * self.curvatures[name][1] for name, share in shares.items()}
+        matrix = _sum_between(moved, matrices, self.numbers) * unit * unit[:, None]
         slopes = [_gradient(p, point.values[p.name], gradients[p.name]) for p in moved]
-        return Said(moved, matrix, -torch.cat(slopes) * unit)
+        return NormalEquations(moved, matrix, -torch.cat(slopes) * unit)
 
     def changes(
-        self, heard: Sequence[Said], damping: float = tuning.DAMPING
+        self, all_equations: Sequence[NormalEquations], damping: float = tuning.DAMPING
     ) -> dict[Parameter, Tensor]:
-        """The damped step of each number that all who were `heard` ask for, in units of rates."""
-        moved = list(dict.fromkeys(p for said in heard for p in said.moved))
+        """The damped step of each number by the sum of `all_equations`, in units of rates."""
+        moved = list(dict.fromkeys(p for equations in all_equations for p in equations.moved))
         places, size = _places(moved), sum(_count(p) for p in moved)
         matrix, right = torch.zeros(size, size).double(), torch.zeros(size).double()
-        for said in heard:
-            if said.moved:
-                at = torch.cat([places[p] for p in said.moved])
-                matrix[at[:, None], at] += said.matrix
-                right[at] += said.right
+        for equations in all_equations:
+            if equations.moved:
+                at = torch.cat([places[p] for p in equations.moved])
+                matrix[at[:, None], at] += equations.matrix
+                right[at] += equations.right
         for p in moved:
             at, unit = places[p], units_of(p)
             block = matrix[at[:, None], at]
             if p in self.priors:
                 # As strong as what one picture says of a shift in the image by `TRUST`.
-                count = sum(p in said.moved for said in heard)
+                count = sum(p in equations.moved for equations in all_equations)
                 of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2 / count
                 prior = self.priors[p] * of_shifts
                 prior = prior * unit * unit[:, None]
@@ -154,20 +154,22 @@ class NumberSteps:
         return {p: change[at] for p, at in places.items()}
 
     def _refresh(self, point: Point, compared: Comparison, iteration: int) -> None:
-        """Finds the curvatures anew of those views that were `compared` whose are too old."""
+        """Renews the curvatures of those `compared` views whose are too old."""
         if not self.curvatures:
             self.begun = iteration
         names = dict.fromkeys(view.name for view in compared.views)
-        made = {name: self.curvatures.get(name, (-math.inf,))[0] for name in names}
-        limits = {name: min(max(at - self.begun, 1), tuning.REFRESH) for name, at in made.items()}
-        old = [name for name in names if iteration - made[name] >= limits[name]]
+        computed_at = {name: self.curvatures.get(name, (-math.inf,))[0] for name in names}
+        limits = {
+            name: min(max(at - self.begun, 1), tuning.REFRESH) for name, at in computed_at.items()
+        }
+        stale = [name for name in names if iteration - computed_at[name] >= limits[name]]
         weights = {
             name: compared.targets[name].weights_at(picture)
             for name, picture in compared.pictures.items()
-            if name in old
+            if name in stale
         }
-        found = find_curvatures(point, self.numbers, old, weights)
-        self.curvatures = self.curvatures | {name: (iteration, m) for name, m in found.items()}
+        curvatures = find_curvatures(point, self.numbers, stale, weights)
+        self.curvatures = self.curvatures | {name: (iteration, m) for name, m in curvatures.items()}
 
 
 def find_curvatures(
@@ -184,7 +186,7 @@ def find_curvatures(
     """
     if not names:
         return {}
-    own = own_views(point.scene, names)
+    rank_names = own_views(point.scene, names)
     jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
     # Pictures differ by little: the light of each is solved closely, beginning where it is known.
     diffusion, values = point.scene.diffusion, point.values
@@ -193,20 +195,20 @@ def find_curvatures(
     with torch.no_grad():
         world = with_values(scene, values)
         light = solve_light(world, memory)
-        pictures = {name: view_picture(light, world, world.view(name)) for name in own}
+        pictures = {name: view_picture(light, world, world.view(name)) for name in rank_names}
         for p in numbers:
-            shown = [name for name in own if p.view in (None, name)]
+            shown = [name for name in rank_names if p.view in (None, name)]
             changes: dict[str, list[Tensor]] = {name: [] for name in shown}
-            ways, lengths = _ways(point, p)
-            for way in ways if shown else ():
-                world, lit = with_values(scene, {**values, p.name: values[p.name] + way}), light
+            steps, lengths = _small_changes(point, p)
+            for step in steps if shown else ():
+                world, lit = with_values(scene, {**values, p.name: values[p.name] + step}), light
                 if p.view is None:
                     lit = solve_light(world, SolveMemory(last=dict(memory.last)))
                 for name in shown:
-                    seen = view_picture(lit, world, world.view(name))
-                    changes[name].append(seen - pictures[name])
-            for name, found in changes.items():
-                columns = torch.stack(found)
+                    image = view_picture(lit, world, world.view(name))
+                    changes[name].append(image - pictures[name])
+            for name, differences in changes.items():
+                columns = torch.stack(differences)
                 if len(columns) < len(lengths):  # all colors have changed at once
                     columns = columns * torch.eye(len(lengths)).to(columns)[..., None, None]
                 jacobians[name].append(columns.flatten(1) / lengths[:, None])
@@ -214,7 +216,7 @@ def find_curvatures(
     for name in names:
         size = sum(_count(p) for p in _shown_by(name, numbers))
         matrix = torch.zeros(size, size, dtype=torch.float64)
-        if name in own and size:
+        if name in rank_names and size:
             # The square of J is taken of W^(1/2) J, whose numbers are nearer to each other.
             root = weights[name].sqrt().expand(3, *scene.view(name).camera.size).flatten()
             jacobian = (torch.cat(jacobians[name]) * root).double()
@@ -231,9 +233,9 @@ def _sum_between(
     size = sum(_count(p) for p in chosen)
     total = torch.zeros(size, size, dtype=torch.float64)
     for name, matrix in matrices.items():
-        seen = _places(_shown_by(name, numbers))
-        if known := [p for p in seen if p in places]:
-            rows, columns = (torch.cat([at[p] for p in known]) for at in (seen, places))
+        shown = _places(_shown_by(name, numbers))
+        if common := [p for p in shown if p in places]:
+            rows, columns = (torch.cat([at[p] for p in common]) for at in (shown, places))
             total[columns[:, None], columns] += matrix[rows[:, None], rows]
     return total
 
@@ -267,7 +269,7 @@ def _gradient(p: Parameter, value: Tensor, gradient: Tensor) -> Tensor:
     return gradient.flatten().double().cpu()
 
 
-def _ways(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
+def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
     """Small changes [m, *shape] of `p` at `point`, and how far each of its entries goes [n].
 
     They are parts of default rates, and go downwards at the upper bound. Colors do not mix, so that
@@ -313,13 +315,13 @@ class Gauge:
 
 def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:
     """The gauges of `parameters`, where those of every training view of several are among them."""
-    known = {parameter.name: parameter for parameter in parameters}
+    by_name = {parameter.name: parameter for parameter in parameters}
     gauges, views = list[Gauge](), train.views
 
     def of_all(key: str) -> list[Parameter]:
-        chosen = [known.get(f"views.{view.name}.{key}") for view in views]
-        found = [parameter for parameter in chosen if parameter is not None]
-        return found if len(found) == len(views) > 1 else []
+        chosen = [by_name.get(f"views.{view.name}.{key}") for view in views]
+        present = [parameter for parameter in chosen if parameter is not None]
+        return present if len(present) == len(views) > 1 else []
 
     if exposures := of_all("exposure"):
         # The same gain of all, of each color by itself where all have three.

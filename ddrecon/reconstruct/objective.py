@@ -1,4 +1,4 @@
-"""What a reconstruction makes small: the views' losses plus penalties; and its images' PSNR."""
+"""The objective of a reconstruction: the views' losses plus penalties; and its images' PSNR."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def target_of(view: View) -> Tensor:
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    With `has_similarity` by SSIM as well. `pictures` are this rank's images so far, by name,
-    `found` their numbers in that order, by kind.
+    With `has_similarity` by SSIM as well. `pictures` are this rank's images so far, by name, and
+    `metrics` their losses, PSNRs and SSIMs in that order, by kind.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Comparison:
     ):
         self.views, self.targets = views, targets
         kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]
-        self.found: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
+        self.metrics: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
         self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
@@ -49,10 +49,10 @@ class Comparison:
         target, seen = self.targets[view.name], image.detach()
         self.pictures[view.name] = seen
         value = self.share(view) * target.loss_of(image)
-        self.found["loss"].append(value.detach())
-        self.found["psnr"].append(target.psnr_of(seen))
-        if "ssim" in self.found:
-            self.found["ssim"].append(target.ssim_of(seen))
+        self.metrics["loss"].append(value.detach())
+        self.metrics["psnr"].append(target.psnr_of(seen))
+        if "ssim" in self.metrics:
+            self.metrics["ssim"].append(target.ssim_of(seen))
         return value
 
     def share(self, view: View) -> float:
@@ -61,8 +61,8 @@ class Comparison:
 
     def require_finite(self) -> None:
         """Raises NotFiniteError where the loss of a view of this rank's is not finite."""
-        own = [view.name for view in self.views if view.name in self.pictures]
-        for name, loss in zip(own, self.found["loss"], strict=False):
+        names = [view.name for view in self.views if view.name in self.pictures]
+        for name, loss in zip(names, self.metrics["loss"], strict=False):
             if not math.isfinite(loss):
                 raise NotFiniteError(f"the loss of view {name} is not finite")
 
@@ -75,19 +75,20 @@ class Comparison:
     ) -> tuple[float, float, float, float | None]:
         """The `loss` of an iteration, its part of the images, their mean PSNR [dB], and SSIM.
 
-        The last is None where it was not looked at. All are read at once, with the extremes of
+        SSIM is None where it was not computed. All are read at once, with the extremes of
         `gradients`. Raises NotFiniteError where a loss, or a derivative by one of the `parameters`,
         is not finite.
         """
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-        groups = [[loss, objective.loss], extremes, *self.found.values()]
+        groups = [[loss, objective.loss], extremes, *self.metrics.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
         (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
         if not all(map(math.isfinite, [total, *ends])):
             self.require_finite()
             require_finite(parameters, gradients)
             raise NotFiniteError("the loss is not finite")
-        psnr, *ssim = (one / len(self.views) for one in sum_numbers([sum(row) for row in rows[1:]]))
+        sums = sum_numbers([sum(row) for row in rows[1:]])
+        psnr, *ssim = (metric / len(self.views) for metric in sums)
         return total, of_images, psnr, ssim[0] if ssim else None
 
 
@@ -119,18 +120,18 @@ def render_quality(
     They are rendered with those `parameters` that the scene has, and with the exposure that fits
     each best where exposures are among them.
     """
-    known, names = variable_names(scene), [view.name for view in scene.views]
-    own, found = own_views(scene, names), {"psnr": list[Tensor](), "ssim": list[Tensor]()}
+    variables, names = variable_names(scene), [view.name for view in scene.views]
+    rank_names, sums = own_views(scene, names), {"psnr": list[Tensor](), "ssim": list[Tensor]()}
     with torch.no_grad():
-        values = {p.name: p.value for p in parameters if p.name in known}
+        values = {p.name: p.value for p in parameters if p.name in variables}
         rendered = with_values(scene, values)
-        views = [rendered.view(name) for name in own]
+        views = [rendered.view(name) for name in rank_names]
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
             target = targets[view.name]
             fitted, _ = fit_held_out(image, view, target, response_sizes(parameters))
-            found["psnr"].append(target.psnr_of(fitted))
-            found["ssim"].append(target.ssim_of(fitted))
-    psnr, ssim = sum_numbers([float(sum(row)) for row in found.values()])
+            sums["psnr"].append(target.psnr_of(fitted))
+            sums["ssim"].append(target.ssim_of(fitted))
+    psnr, ssim = sum_numbers([float(sum(row)) for row in sums.values()])
     return psnr / len(names), ssim / len(names)
 
 
@@ -144,34 +145,34 @@ def fit_held_out(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The `picture` [3, h, w] of a test `view` with the response that fits its own `target` best.
 
-    And what that is, by key: of exposure and offset those that `sizes` names, by `response_sizes`.
-    Least squares count errors in the dark more than PSNR does where pictures are displayed, and may
-    do harm to a picture that is far off: then the exposure alone is found, or none.
+    And that response by key: those of exposure and offset that `sizes` names, by `response_sizes`.
+    Least squares weigh errors in the dark more than the PSNR of displayed pictures does, and may
+    harm a picture that is far off: then the exposure alone is fitted, or nothing.
     """
-    known = {
+    response = {
         key: picture.new_full((1,), default) if getattr(view, key) is None else getattr(view, key)
         for key, default in RESPONSE.items()
     }
-    exposure, offset = (known[key].view(-1, 1, 1) for key in ("exposure", "offset"))
+    exposure, offset = (response[key].view(-1, 1, 1) for key in ("exposure", "offset"))
     # A background behind the volume counts as if it were exposed with it.
     light = (picture - offset) / exposure
     basis = {"exposure": light, "offset": torch.ones_like(light)}
     weight = target.slope if target.seen is None else target.slope * target.seen
-    tried = [(picture, {key: known[key].expand(size) for key, size in sizes.items()})]
+    tried = [(picture, {key: response[key].expand(size) for key, size in sizes.items()})]
     for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
         if not sizes.keys() >= set(keys):
             continue
-        # By least squares, weighed as the target's loss weighs small errors.
+        # Least squares, weighed as the target's loss weighs small errors.
         ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
         columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
-        rest = sum(known[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
+        fixed = sum(response[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
         matrix, right = (
-            (part * weight).double().cpu().flatten(-3) for part in (columns, target.image - rest)
+            (image * weight).double().cpu().flatten(-3) for image in (columns, target.image - fixed)
         )
-        # What a picture does not show, such as the exposure of black, is 0.
-        found = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
-        parts = found.to(light).split([sizes[key] for key in keys])
-        fit = known | dict(zip(keys, parts, strict=True))
+        # A response that a picture does not show, such as the exposure of black, is 0.
+        solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
+        values = solution.to(light).split([sizes[key] for key in keys])
+        fit = response | dict(zip(keys, values, strict=True))
         shown = fit["exposure"].view(-1, 1, 1) * light + fit["offset"].view(-1, 1, 1)
         tried.append((shown, {key: fit[key].expand(size) for key, size in sizes.items()}))
-    return max(tried, key=lambda each: float(target.psnr_of(each[0])))
+    return max(tried, key=lambda attempt: float(target.psnr_of(attempt[0])))

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.losses import KNEE, compress, total_variation
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.levels import resample
-from ddrecon.reconstruct.roughness import stiffness_diagonal
+from ddrecon.reconstruct.roughness import KNEE, stiffness_diagonal, total_variation
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -60,9 +59,7 @@ class Parameter:
         """
         if not self.tv:
             return self.value.new_zeros(())
-        value = self.value / self.unit
-        seen = value if self.knee is None else compress(value, self.knee)
-        return (power * self.tv) * total_variation(seen, self.grid)
+        return (power * self.tv) * total_variation(self.value / self.unit, self.grid, self.knee)
 
     @property
     def largest_rate(self) -> float:
@@ -77,22 +74,22 @@ class Parameter:
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
-        before, warm_up = self.value.detach(), min(self.steps / tuning.WARM_UP, 1.0)
+        old, warm_up = self.value.detach(), min(self.steps / tuning.WARM_UP, 1.0)
         rate *= warm_up**self.rise * self.largest_rate
-        keep, weights = tuning.BETAS, [1 - beta ** float(self.steps) for beta in tuning.BETAS]
+        decay, weights = tuning.BETAS, [1 - beta ** float(self.steps) for beta in tuning.BETAS]
         # The mean of the new second moments, before there are any; a tensor, so that no device has
         # to be waited for. Squares of less than the last term are none.
-        mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - keep[1])
+        mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - decay[1])
         smallest = (mean * (tuning.FLOOR**2 / weights[1])).sqrt()
         smallest = smallest + torch.finfo(gradient.dtype).tiny ** 0.5
         if self.tv and power:
-            stiffness = stiffness_diagonal(before / self.unit, self.grid, self.knee)
+            stiffness = stiffness_diagonal(old / self.unit, self.grid, self.knee)
             factor = tuning.STIFFNESS * rate * power * self.tv / self.unit**2
             smallest = torch.add(smallest, stiffness, alpha=factor)
-        first = self.moments[0].lerp(gradient, 1 - keep[0])
-        second = self.moments[1].mul(keep[1]).addcmul_(gradient, gradient, value=1 - keep[1])
+        first = self.moments[0].lerp(gradient, 1 - decay[0])
+        second = self.moments[1].mul(decay[1]).addcmul_(gradient, gradient, value=1 - decay[1])
         size = (second.sqrt() / weights[1] ** 0.5) + smallest
-        value = before - gradient.lerp(first, keep[0]) / size * (rate / weights[0])
+        value = old - gradient.lerp(first, decay[0]) / size * (rate / weights[0])
         value, self.moments = value.clamp_(self.low, self.high), [first, second]
         if self.support is not None:
             value.mul_(self.support)
@@ -103,19 +100,19 @@ class Parameter:
 
         A field by factors of 1 + `change`, one for each color; a direction keeps its length.
         """
-        before = self.value.detach()
-        change = change.to(before)
+        old = self.value.detach()
+        change = change.to(old)
         if self.is_field:
-            value = before * (1 + change.view_as(before[..., :1, :1, :1]))
+            value = old * (1 + change.view_as(old[..., :1, :1, :1]))
         else:
-            value = before + change.view_as(before)
+            value = old + change.view_as(old)
         if self.is_direction:
-            value = value * (before.norm() / value.norm())
+            value = value * (old.norm() / value.norm())
         self.value = value.clamp(self.low, self.high).requires_grad_()
 
-    def keep_start(self, part: float) -> None:
-        """Takes a field back by a `part` of its way from what it began with."""
-        value = self.value.detach().lerp(resample(self.start, self.grid), part)
+    def keep_start(self, fraction: float) -> None:
+        """Moves a field back towards its start, by a `fraction` of their difference."""
+        value = self.value.detach().lerp(resample(self.start, self.grid), fraction)
         self.value = (value if self.support is None else value * self.support).requires_grad_()
 
     def value_on(self, grid: Grid) -> Tensor:
@@ -126,14 +123,14 @@ class Parameter:
     def refine(self, grid: Grid) -> None:
         """Carries a field to `grid`, where its optimizer begins anew.
 
-        Interpolation blurs: finer cells also get what their means lack of the value before. The
-        sizes of derivatives that it remembers are those of an emptier volume, and would hinder it.
+        Interpolation blurs, so finer cells also get what their means lack of the old value. The
+        old moments are those of an emptier volume, and would hinder the steps.
         """
-        before, own, self.grid = self.value.detach(), self.grid, grid
+        old, old_grid, self.grid = self.value.detach(), self.grid, grid
         if self.is_field:
             value = self.value_on(grid)
-            if grid.cells > own.cells:
-                value += resample(before - resample(value, own), grid)
+            if grid.cells > old_grid.cells:
+                value += resample(old - resample(value, old_grid), grid)
             self.value = value.clamp_(self.low, self.high).requires_grad_()
             self.steps = 0
             self.moments = [torch.zeros_like(value)] * 2

@@ -1,4 +1,4 @@
-"""How stiff smoothing is: the quadratic that total variation lies under.
+"""How rough a field is, and how stiff smoothing is: the quadratic that total variation lies under.
 
 The length of a slope, |s|, lies below (|s|^2 / |s0| + |s0|) / 2, and touches it at the slope s0
 that the field has (lagged diffusivity: Vogel and Oman 1996, doi:10.1137/0917016). So about a
@@ -12,27 +12,62 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.losses import ROUNDING, compress, compressed_slope, rise_to_next
 
+ROUNDING = 1e-2
+"""Gradients below this, in units of one over the box's shortest side, are penalized quadratically
+rather than as total variation.
+"""
+KNEE = 1.2
+"""Total variation is that of densities far below it, and of the logarithm of those above (E11.3).
+
+It is in optical depths across the box's shortest side, whatever the unit of density is.
+"""
 AXES = (-3, -2, -1)
 
 
-def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
-    """The diagonal of R (E11.2) of the mean total variation, at `field` [..., z, y, x].
+def total_variation(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
+    """The mean length of the gradient of `field` [..., z, y, x] over the cells of `grid`.
 
-    With a `knee` that of the field compressed above it (E11.3): its slopes are those of the field
-    times the slope of the compression there.
+    The gradient is by position in units of the box's shortest side.
+
+    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the
+    same at every resolution and world scale, and rounded off at zero so that its derivative is
+    finite in flat regions. With a `knee` > 0, in the unit of `field` >= 0, it is that of
+    log(1 + field / knee) / 3 (E11.3).
     """
-    seen = field if knee is None else compress(field, knee)
-    factors = [min(grid.extent) / spacing for spacing in grid.spacing]
-    square, total = torch.full_like(field, ROUNDING**2), torch.zeros_like(field)
-    for axis, factor in zip(AXES, factors, strict=True):
-        square.add_((rise_to_next(seen, axis, grid) * factor).square_())
-    stiffness = 1 / (field.numel() * square.sqrt())
+    return (_find_length(field, grid, knee) - ROUNDING).mean()
+
+
+def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
+    """The diagonal of R (E11.2) of `total_variation` at `field` [..., z, y, x].
+
+    With a `knee` its slopes are those of the field times the slope of the compression there.
+    """
+    stiffness = 1 / (field.numel() * _find_length(field, grid, knee))
+    total = torch.zeros_like(field)
     # What holds neighbors together counts in both.
-    for axis, factor in zip(AXES, factors, strict=True):
-        between, count = stiffness * factor**2, field.shape[axis]
+    for axis, spacing in zip(AXES, grid.spacing, strict=True):
+        between, count = stiffness * (min(grid.extent) / spacing) ** 2, field.shape[axis]
         if count == 1 or axis % 3 not in grid.periodic:
             between.narrow(axis, count - 1, 1).zero_()
         total.add_(between).add_(between.roll(1, axis))
-    return total if knee is None else total.mul_(compressed_slope(field, knee).square_())
+    return total if knee is None else total.mul_((3 * (field + knee)).reciprocal().square_())
+
+
+def _find_length(field: Tensor, grid: Grid, knee: float | None) -> Tensor:
+    """The length of the gradient of `field`, compressed where there is a `knee`, rounded at 0."""
+    seen = field if knee is None else torch.log1p(field / knee) / 3
+    square = torch.full_like(field, ROUNDING**2)
+    for axis, spacing in zip(AXES, grid.spacing, strict=True):
+        square = square + (_rise_to_next(seen, axis, grid) * (min(grid.extent) / spacing)) ** 2
+    return square.sqrt()
+
+
+def _rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
+    """The rise of `field` [..., z, y, x] to the next cell along `axis`, -3 to -1.
+
+    After the last cell of a period comes its first; in a box the last has no next, and 0.
+    """
+    if axis % 3 in grid.periodic:
+        return field.roll(-1, axis) - field
+    return torch.cat([field.diff(dim=axis), torch.zeros_like(field.narrow(axis, 0, 1))], axis)

@@ -66,26 +66,27 @@ class Schedule:
         return rate_at(self.place(iteration), self.planned, begin, self.final_rate)
 
     def note(self, iteration: int, loss: float) -> None:
-        """Takes in the `loss` of `iteration`, counted from 0; may end its part."""
+        """Takes in the `loss` of `iteration`, counted from 0; may end its stage."""
         if not self.is_auto:
             return
-        now, made, size = self.progress, iteration + 1, self.window
+        progress, count, size = self.progress, iteration + 1, self.window
         ends = *self.refine_at, 1.0
-        part = stage_of(self.place(iteration), self.planned, ends)
-        now.recent = [*now.recent, loss][-2 * size :]
-        before, after = sum(now.recent[:-size]), sum(now.recent[-size:])
-        if made % size == 0 and len(now.recent) == 2 * size and after > (1 - tuning.FALL) * before:
-            now.is_at_rest = part == len(self.refine_at) + 1
-            if not now.is_at_rest:
-                now.skipped += max(round(ends[part] * self.planned) - self.place(made), 0)
-        # At another resolution, or at rates that fall no more, a fall before says nothing.
-        if stage_of(self.place(made), self.planned, ends) > part:
-            now.recent = []
+        stage = stage_of(self.place(iteration), self.planned, ends)
+        progress.recent = [*progress.recent, loss][-2 * size :]
+        older, newer = sum(progress.recent[:-size]), sum(progress.recent[-size:])
+        is_due = count % size == 0 and len(progress.recent) == 2 * size
+        if is_due and newer > (1 - tuning.FALL) * older:
+            progress.is_at_rest = stage == len(self.refine_at) + 1
+            if not progress.is_at_rest:
+                progress.skipped += max(round(ends[stage] * self.planned) - self.place(count), 0)
+        # At another resolution, or at rates that fall no more, earlier losses say nothing.
+        if stage_of(self.place(count), self.planned, ends) > stage:
+            progress.recent = []
 
-    def ending(self, made: int) -> dict[str, str]:
-        """Why a run that has `made` so many iterations ended: the kind, and in words."""
+    def ending(self, count: int) -> dict[str, str]:
+        """Why a run of `count` iterations ended: the kind, and in words."""
         if not self.is_auto:
-            kind, text = "iterations", f"{made} iterations were asked for"
+            kind, text = "iterations", f"{count} iterations were asked for"
         elif self.progress.is_at_rest:
             fall = f"it fell by less than {tuning.FALL:.0%} in {self.window} iterations"
             kind, text = "rest", f"the loss has come to rest: {fall}"

@@ -108,8 +108,8 @@ def select_views(scene: Scene, is_test: bool) -> Scene:
 def require_usable(train: Scene, settings: OptimizeSettings) -> None:
     """Raises SceneError where `settings` cannot be reconstructed from the views of `train`.
 
-    That is where there are none, nothing shines, a parameter does not touch them, or a target is
-    not finite. Raises FormatError where pictures are black, or masks leave no pixel.
+    Reasons are: no views, no light, a parameter that touches no view, or a target that is not
+    finite. Raises FormatError where pictures are black, or masks leave no pixel.
     """
     if not train.views:
         raise SceneError(
@@ -125,11 +125,11 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
             "lights: none shines, and none is optimized: give one a brightness above 0,"
             " or the volume an emission"
         )
-    known = variable_names(train)
+    variables = variable_names(train)
     problems = [
         f"optimize.parameters.{name}: there is no training view of this name with an image"
         for name in settings.parameters
-        if name not in known
+        if name not in variables
     ]
     for view in train.views:
         place = describe_flaw("the image", target_of(view), is_field=False)
@@ -154,31 +154,31 @@ def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
 
 
 def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
-    """The loss that `settings` ask for, or what the pictures of the views of `train` deserve.
+    """The loss that `settings` ask for, or that fits the pictures of the views of `train`.
 
-    That is `display` for pictures stored as sRGB values, `l2` for linear ones. Raises SceneError
-    where there are both.
+    `display` fits pictures stored as sRGB values, `l2` linear ones. Raises SceneError where there
+    are both.
     """
     if settings.loss is not None:
         return settings.loss
     encoded = [view.name for view in train.views if view.step]
     linear = [view.name for view in train.views if not view.step]
     if encoded and linear:
-        some, others = (
+        encoded_names, linear_names = (
             ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
             for names in (encoded, linear)
         )
         raise SceneError(
-            f"optimize.loss: some training pictures are sRGB files ({some}), others linear"
-            f" ({others}); say how to compare them, loss: display or loss: l2"
+            f"optimize.loss: some training pictures are sRGB files ({encoded_names}), others linear"
+            f" ({linear_names}); say how to compare them, loss: display or loss: l2"
         )
     return "display" if encoded else "l2"
 
 
 def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
     """The noise of the picture of `view`, as its scene says, by the view or for all."""
-    given = settings.noise
-    return view.noise or (Noise(given.read, given.shot, view.step) if given else None)
+    noise = settings.noise
+    return view.noise or (Noise(noise.read, noise.shot, view.step) if noise else None)
 
 
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
@@ -217,9 +217,9 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
     # with the lights (E10.2).
     has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
     for parameter in parameters:
-        others = [other for other in parameters if other.is_field and other is not parameter]
-        if has_levels or not others or (parameter.is_field and not scene.lights):
+        other_fields = [field for field in parameters if field.is_field and field is not parameter]
+        if has_levels or not other_fields or (parameter.is_field and not scene.lights):
             parameter.release = 0.0
-        if not others and settings.parameters[parameter.name].tv is None:
+        if not other_fields and settings.parameters[parameter.name].tv is None:
             parameter.tv *= kind_of(parameter.name).alone
     return parameters

@@ -18,9 +18,9 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     One that is named twice is rendered twice, by the same rank.
     """
     pixels = {name: math.prod(scene.view(name).camera.size) for name in names}
-    # By turns, those of most pixels first, so that all end at about one time.
-    own = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
-    return [name for name in names if name in own]
+    # Ranks take turns, largest views first, so that all end at about one time.
+    rank_names = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
+    return [name for name in names if name in rank_names]
 
 
 def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[str, Tensor]:
@@ -36,15 +36,15 @@ def share_pictures(scene: Scene, picture_of: Callable[[View], Tensor]) -> dict[s
     return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
-def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
-    """The sums over ranks of what was `found`; None is zero, and stays where all ranks have it.
+def sum_present(tensors: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
+    """The sums of `tensors` over ranks; None is zero, and stays where all ranks have it.
 
-    `likes` are of the shapes of `found`.
+    `likes` have the shapes of `tensors`.
     """
-    is_found = [count > 0 for count in sum_numbers([one is not None for one in found])]
+    is_found = [count > 0 for count in sum_numbers([tensor is not None for tensor in tensors])]
     chosen = [
-        torch.zeros_like(like) if one is None else one
-        for one, like, is_any in zip(found, likes, is_found, strict=True)
+        torch.zeros_like(like) if tensor is None else tensor
+        for tensor, like, is_any in zip(tensors, likes, is_found, strict=True)
         if is_any
     ]
     sums = iter(sum_over_ranks(chosen))

@@ -27,18 +27,17 @@ from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
 LOOKED_AT = 8192
-"""At most about so many pixels of a view are looked along to see what is cut off."""
+"""About the most pixels of a view that are traced to see what is cut off."""
 LOST = 0.002
-"""What a support cuts off is told from this part of a view's light on."""
+"""The part of a view's light that a support may cut off without a warning."""
 KEY = "optimize.parameters.density.support"
 
 
 @dataclass(frozen=True)
 class Support:
-    """What says where medium may be: `views` with what they show.
+    """Where medium may be, by what `views` show.
 
-    `shown` [h, w] of each view is whether a pixel shows something. `margin` is how many pixels what
-    they show is widened by.
+    `shown` [h, w] of each view is whether a pixel shows something, widened by `margin` pixels.
     """
 
     views: Sequence[View]
@@ -58,11 +57,11 @@ class Support:
         if doubt is not None and doubt.startswith(OUTSIDE):
             raise SceneError(f"volume.bounds: {doubt}")
         if not bool((hull & seen.any(0)).any()):
-            parts = hulls.float().mean((1, 2, 3)).tolist()
-            part, view = min(zip(parts, (view.name for view in self.views), strict=True))
+            shares = hulls.float().mean((1, 2, 3)).tolist()
+            share, view = min(zip(shares, (view.name for view in self.views), strict=True))
             raise SceneError(
                 f"{KEY}: no cell is left: of each that is seen, some training view shows nothing"
-                f" (view {view!r} alone leaves {100 * part:.2g} %); check the cameras and masks,"
+                f" (view {view!r} alone leaves {100 * share:.2g} %); check the cameras and masks,"
                 " or raise support_margin"
             )
         return hull
@@ -77,10 +76,10 @@ class Support:
         return torch.stack(may_hold), torch.stack(seen)
 
     def cut_pixels(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
-        """Of each view, which pixels show something where no cell of `grid` is left.
+        """The pixels of each view that show something where no cell of `grid` is left.
 
-        Their indices, among every n-th of the pixels that show something, n, and for each view how
-        many of these pixels it alone has left without a cell.
+        Yields their indices among every n-th of the pixels that show something, n, and for each
+        view how many of these pixels it alone has left without a cell.
         """
         may_hold, seen = self._hulls(grid)
         leaves_out = (~may_hold & seen).flatten(1)
@@ -108,7 +107,7 @@ def describe_support(
 ) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
-    That is the part of the cells of `grid` that any keeps, and what `doubt_support` says.
+    `cells` is the part of the cells of `grid` that any keeps; the rest is that of `doubt_support`.
     """
     if not supports:
         return None
@@ -175,7 +174,7 @@ def find_support(train: Scene, settings: OptimizeSettings) -> Support | None:
         raise SceneError(f"{KEY}: {error}") from None
     empty = [view.name for view, pixels in zip(train.views, shown, strict=True) if not pixels.any()]
     if empty:
-        known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
-        by = known[density.support]
+        criteria = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
+        by = criteria[density.support]
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {by}")
     return Support(train.views, shown, density.margin)

@@ -1,7 +1,7 @@
 """Several reconstructions that share their numbers: the frames of a film, one calibration.
 
-Each has fields of its own. What is no field is one and the same for all, and moves by what the
-pictures of all say together (E10.2): by the same step as that of a single reconstruction.
+Each has its own fields. All other parameters are shared, and move by the pictures of all (E10.2),
+by the same step as in a single reconstruction.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Together:
         for run in self.runs:
             run.parameters = [names.get(parameter.name, parameter) for parameter in run.parameters]
             run.numbers = NumberSteps(run.problem.train, run.parameters, len(scenes))
-            run.numbers.heard = first.numbers.heard
+            run.numbers.pending = first.numbers.pending
 
     @property
     def is_done(self) -> bool:
@@ -56,21 +56,21 @@ class Together:
 
         Raises DivergenceError when one fails. The state of all is then that before the last step.
         """
-        before = self.state()
+        old = self.state()
         try:
             rows = [run.step() for run in self.runs]
         except DivergenceError:
-            self.restore(self.before_step or before)
+            self.restore(self.before_step or old)
             raise
-        self.before_step = before
+        self.before_step = old
         return rows
 
     def spread(self) -> dict[str, Tensor]:
-        """By how much those who share a number disagree on it, entry by entry, by name.
+        """The disagreement of the runs on each shared number, entry by entry, by name.
 
-        That is the standard deviation, from one to another, of the step that each would make alone.
+        It is the standard deviation over runs of the step that each would make alone.
         """
-        alone = [run.changes_alone() for run in self.runs]
+        alone = [run.undamped_changes() for run in self.runs]
         if len(alone) < 2:
             return {}
         return {
@@ -87,4 +87,4 @@ class Together:
         """Takes up where those that made `state` stopped."""
         for run, of_run in zip(self.runs, state["runs"], strict=True):
             run.restore(of_run)
-        self.runs[0].numbers.heard.clear()
+        self.runs[0].numbers.pending.clear()

@@ -166,12 +166,13 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
     if isinstance(phase, Rayleigh):
         return {"type": "rayleigh"}
     if isinstance(phase, Mixture):
-        first, second = (_phase(part, grid) for part in phase.parts)
-        rest = 1 - (phase.weight if phase.cells is None else phase.cells).detach().cpu()
-        weight = rest.item() if phase.cells is None else _grid_volume(rest, grid)
+        first, second = (_phase(lobe, grid) for lobe in phase.parts)
+        complement = 1 - (phase.weight if phase.cells is None else phase.cells).detach().cpu()
+        weight = complement.item() if phase.cells is None else _grid_volume(complement, grid)
         return {"type": "blendphase", "weight": weight, "first": first, "second": second}
     cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
-    values = phase.kind(*(each.detach().cpu().double() for each in phase.numbers)).value(cosines)
+    numbers = (number.detach().cpu().double() for number in phase.numbers)
+    values = phase.kind(*numbers).value(cosines)
     return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
 
 

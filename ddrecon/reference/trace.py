@@ -37,9 +37,9 @@ class Tracer:
         """
         images = []
         for index, scene in enumerate(self.scenes):
-            (sensor,) = (each for each in scene.sensors() if each.id() == sensor_id(view))
-            own = len(self.scenes) * seed + index
-            image = self.module.render(scene, sensor=sensor, seed=own, spp=samples)
+            (sensor,) = (s for s in scene.sensors() if s.id() == sensor_id(view))
+            color_seed = len(self.scenes) * seed + index
+            image = self.module.render(scene, sensor=sensor, seed=color_seed, spp=samples)
             images.append(np.array(image, np.float64))
         return images[0] if len(images) == 1 else np.stack([image.mean(-1) for image in images], -1)
 
@@ -56,7 +56,7 @@ def open_tracer(
     module = load_mitsuba(threads)
     is_shared = is_gray(scene.volume) and scene.volume.phase.colors == 1
     scenes = [scene] if is_shared else [pick_color(scene, color) for color in range(3)]
-    described = (make_mitsuba_objects(module, mitsuba_scene(each, views, depth)) for each in scenes)
+    described = (make_mitsuba_objects(module, mitsuba_scene(s, views, depth)) for s in scenes)
     return Tracer(module, tuple(map(module.load_dict, described)))
 
 
@@ -93,8 +93,8 @@ def make_mitsuba_objects(module: ModuleType, value: Any) -> Any:
 class Traced:
     """The mean `image` [h, w] or [h, w, 3] of several passes, and its `noise`.
 
-    That is the standard error of its pixels (root mean square), relative to the root mean square of
-    the image; 0 for a black image.
+    `noise` is the standard error of the pixels (root mean square), relative to the root mean square
+    of the image; 0 for a black image.
     """
 
     image: np.ndarray
@@ -168,7 +168,7 @@ def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
     if phase.colors == 1:
         return phase
     if isinstance(phase, Blend):
-        first, second = (_pick_phase(part, color) for part in phase.parts)
+        first, second = (_pick_phase(lobe, color) for lobe in phase.parts)
         return replace(phase, first=first, second=second, weight=_pick_number(phase.weight, color))
     shared = "g" if isinstance(phase, TwoLobe) else ""
     names = [field.name for field in fields(phase) if field.name != shared]
@@ -176,7 +176,7 @@ def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
 
 
 def _pick_number(number: Tensor, color: int) -> Tensor:
-    """Of a `number` by color [3] or [3, z, y, x] that one's; else the number as it is."""
+    """The entry of `color` in a `number` [3] or [3, z, y, x]; other numbers as they are."""
     return number if number.ndim in (0, 3) else _pick(number, color)
 
 

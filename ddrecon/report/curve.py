@@ -46,19 +46,19 @@ def draw_curve(
     ys = [y for points in drawn.values() for _, y in points] or [0.0]
     left, right, across_at = _axis(xs, LEFT, WIDTH - RIGHT)
     low, high, up_at = _axis(ys, HEIGHT - BOTTOM, TOP)
-    parts = [_text(LEFT, 16, title, "start")]
+    elements = [_text(LEFT, 16, title, "start")]
     # A line across for every round value of y, a number below for every one of x.
     for value in (logarithmic_ticks if is_logarithmic else ticks)(low, high):
         y, label = up_at(value), f"{10**value if is_logarithmic else value:.4g}"
-        parts.append(_line(y, 0.2))
-        parts.append(_text(LEFT - 6, y + 4, label, "end"))
+        elements.append(_line(y, 0.2))
+        elements.append(_text(LEFT - 6, y + 4, label, "end"))
     for value in ticks(left, right):
-        parts.append(_text(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
+        elements.append(_text(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
     for x in map(across_at, steps):
         ends = f'x1="{x:.1f}" y1="{TOP}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM}"'
-        parts.append(f'<line {ends} stroke="currentColor" stroke-dasharray="4 4"/>')
-    parts.append(_line(HEIGHT - BOTTOM, 0.7))
-    parts.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
+        elements.append(f'<line {ends} stroke="currentColor" stroke-dasharray="4 4"/>')
+    elements.append(_line(HEIGHT - BOTTOM, 0.7))
+    elements.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
     # The curves, and their names in the legend.
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
@@ -66,11 +66,11 @@ def draw_curve(
         # A line of one point goes from there to there.
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in (places if places[1:] else 2 * places))
         style = f'fill="none" stroke="{color}" stroke-width="1.8" stroke-linecap="round"'
-        parts.append(f'<polyline points="{line}" {style}/>')
+        elements.append(f'<polyline points="{line}" {style}/>')
         end = WIDTH - RIGHT - LEGEND * (len(drawn) - 1 - index)
-        parts.append(_text(end, 16, name, "end", color=color))
+        elements.append(_text(end, 16, name, "end", color=color))
     label = f'role="img" aria-label="{escape(title)}"'
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(parts)}</svg>'
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(elements)}</svg>'
 
 
 def draw_bars(rows: Sequence[tuple[str, float, float]]) -> str:
@@ -78,21 +78,21 @@ def draw_bars(rows: Sequence[tuple[str, float, float]]) -> str:
 
     All have one axis, so that values can be compared.
     """
-    ends = [value + way * deviation for _, value, deviation in rows for way in (-2, 2)]
+    ends = [value + times * deviation for _, value, deviation in rows for times in (-2, 2)]
     low, high, at = _axis(ends, WIDTH / 2, WIDTH - RIGHT)
-    bottom, parts = ROW * len(rows), list[str]()
+    bottom, elements = ROW * len(rows), list[str]()
     for index, (name, value, deviation) in enumerate(rows):
         y = ROW * (index + 0.5)
-        parts.append(_text(WIDTH / 2 - 10, y + 4, name, "end"))
+        elements.append(_text(WIDTH / 2 - 10, y + 4, name, "end"))
         for times, width in ((2, 1.2), (1, 6)):
             x1, x2 = at(value - times * deviation), at(value + times * deviation)
             place = f'x1="{x1:.1f}" y1="{y}" x2="{x2:.1f}" y2="{y}"'
-            parts.append(f'<line {place} stroke="{COLORS[0]}" stroke-width="{width}"/>')
-        parts.append(f'<circle cx="{at(value):.1f}" cy="{y}" r="3.5" fill="{COLORS[1]}"/>')
+            elements.append(f'<line {place} stroke="{COLORS[0]}" stroke-width="{width}"/>')
+        elements.append(f'<circle cx="{at(value):.1f}" cy="{y}" r="3.5" fill="{COLORS[1]}"/>')
     for tick in ticks(low, high):
-        parts.append(_text(at(tick), bottom + 14, f"{tick:.6g}", "middle"))
+        elements.append(_text(at(tick), bottom + 14, f"{tick:.6g}", "middle"))
     label = f'role="img" aria-label="{escape(", ".join(name for name, _, _ in rows))}"'
-    return f'<svg viewBox="0 0 {WIDTH} {bottom + 20}" {label}>{"".join(parts)}</svg>'
+    return f'<svg viewBox="0 0 {WIDTH} {bottom + 20}" {label}>{"".join(elements)}</svg>'
 
 
 def _axis(

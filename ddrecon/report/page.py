@@ -78,31 +78,29 @@ def page_text(
     )
 
 
-def section(heading: str, *parts: str) -> str:
-    """The `parts` under `heading`."""
+def section(heading: str, *blocks: str) -> str:
+    """The `blocks` under `heading`."""
     name = heading.lower().replace(" ", "-")
     start = f'<section id="{escape(name)}"><h2>{escape(heading)}</h2>\n'
-    return start + "\n".join(parts) + "</section>"
+    return start + "\n".join(blocks) + "</section>"
 
 
 def paragraph(text: str) -> str:
-    """A paragraph."""
     return f"<p>{escape(text)}</p>"
 
 
 def items(lines: Sequence[str]) -> str:
-    """A list of `lines`."""
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
 def warnings(lines: Sequence[str]) -> str:
-    """A list of `lines` that is not overlooked."""
+    """A list of `lines` that stands out."""
     return f'<div class="doubts">{items(lines)}</div>'
 
 
-def side_by_side(*parts: str) -> str:
-    """The `parts` two in a row where there is room, else below each other."""
-    return f'<div class="row">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
+def side_by_side(*blocks: str) -> str:
+    """The `blocks` two in a row where there is room, else below each other."""
+    return f'<div class="row">{"".join(f"<div>{block}</div>" for block in blocks)}</div>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -114,7 +112,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def versions(environment: Mapping[str, Any]) -> str:
-    """A table of what took part."""
     lists = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     return table(["", ""], [(name, " ".join(map(str, values))) for name, values in lists])
 
@@ -137,15 +134,15 @@ def embed(image: bytes, text: str, attributes: str = "") -> str:
     return f'<img src="data:image/{kind};base64,{data}" alt="{escape(text)}" {attributes}>'
 
 
-def grid(parts: Sequence[str]) -> str:
-    """The `parts` in as many columns as there is room for."""
-    return f'<div class="views">{"".join(parts)}</div>'
+def grid(blocks: Sequence[str]) -> str:
+    """The `blocks` in as many columns as there is room for."""
+    return f'<div class="views">{"".join(blocks)}</div>'
 
 
-def unfolded(summary: str, part: str, *, is_open: bool) -> str:
-    """The `part` below `summary`, which folds it away."""
+def unfolded(summary: str, block: str, *, is_open: bool) -> str:
+    """The `block` below `summary`, which folds it away."""
     start = "<details open>" if is_open else "<details>"
-    return f"{start}<summary>{escape(summary)}</summary>{part}</details>"
+    return f"{start}<summary>{escape(summary)}</summary>{block}</details>"
 
 
 def scrub(figures: Sequence[str]) -> str:
@@ -154,7 +151,6 @@ def scrub(figures: Sequence[str]) -> str:
 
 
 def captioned(element: str, caption: str) -> str:
-    """The `element` above `caption`."""
     return f"<figure>{element}<figcaption>{escape(caption)}</figcaption></figure>"
 
 

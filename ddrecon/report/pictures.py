@@ -73,16 +73,16 @@ def projections(field: Tensor) -> np.ndarray:
     return _three_sides([_show(side, white) for side in means])
 
 
-def see_through(density: Tensor, parts: Tensor) -> np.ndarray:
+def see_through(density: Tensor, shares: Tensor) -> np.ndarray:
     """A volume seen along z, x and y, placed as `slices` are: opaque by `density` [z, y, x] >= 0.
 
-    Its color is blue where `parts` [z, y, x] are 0, white at a half, and red from 1 on.
+    Its color is blue where `shares` [z, y, x] are 0, white at a half, and red from 1 on.
     """
-    depth, part = (each.detach().double().cpu().numpy() for each in (density, parts))
-    colors, sides = diverge(2 * part - 1), list[np.ndarray]()
+    depth, share = (volume.detach().double().cpu().numpy() for volume in (density, shares))
+    colors, sides = diverge(2 * share - 1), list[np.ndarray]()
     for axis in (0, 2, 1):
         through = np.moveaxis(depth, axis, 0)
-        # Of z, what is nearest comes last.
+        # Along z, the nearest cell comes last.
         order = slice(None, None, -1 if axis == 0 else 1)
         through, color = through[order], np.moveaxis(colors, axis, 0)[order]
         through = through * (OPAQUE / max(float(through.sum(0).max()), 1e-30))
@@ -128,11 +128,11 @@ def diverging(image: Tensor) -> tuple[np.ndarray, float]:
     return diverge(values / full), full
 
 
-def diverge(parts: np.ndarray) -> np.ndarray:
+def diverge(numbers: np.ndarray) -> np.ndarray:
     """Colors [..., 3] of numbers between -1, which is blue, and 1, which is red; 0 is white."""
-    part = np.clip(parts, -1, 1)[..., None]
-    strong = np.where(part < 0, np.array(BLUE, np.float32), np.array(RED, np.float32))
-    return decode((1 - np.abs(part)) + np.abs(part) * strong)
+    number = np.clip(numbers, -1, 1)[..., None]
+    strong = np.where(number < 0, np.array(BLUE, np.float32), np.array(RED, np.float32))
+    return decode((1 - np.abs(number)) + np.abs(number) * strong)
 
 
 def place_beside(pictures: list[np.ndarray]) -> np.ndarray:

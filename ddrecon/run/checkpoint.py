@@ -112,8 +112,8 @@ def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
             path, f"a checkpoint of format {written}; this version reads {FORMAT}; {ANEW}"
         )
     if scene is not None:
-        what = f"{path}: belongs to another scene; use another output folder"
-        require_same(content["scene"], scene, what)
+        text = f"{path}: belongs to another scene; use another output folder"
+        require_same(content["scene"], scene, text)
     return dict(content["state"])
 
 
@@ -130,20 +130,20 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def require_same(old: Any, new: Any, what: str) -> None:
-    """Raises UsageError, of `what` is wrong, unless two trees of plain values are the same.
+def require_same(old: Any, new: Any, text: str) -> None:
+    """Raises UsageError, beginning with `text`, unless two trees of plain values are the same.
 
-    Its lines read `what: key.path is A there, B now`.
+    Its lines read `text: key.path is A there, B now`.
     """
-    one, other = _leaves(old, ""), _leaves(new, "")
-    pairs = {path: (one.get(path, ABSENT), other.get(path, ABSENT)) for path in one | other}
+    old, new = _leaves(old, ""), _leaves(new, "")
+    pairs = {path: (old.get(path, ABSENT), new.get(path, ABSENT)) for path in old | new}
     changes = [
-        f"{what}: {path[1:]} is {_shorten(there)} there, {_shorten(now)} now"
-        for path, (there, now) in pairs.items()
-        if there != now
+        f"{text}: {path[1:]} is {_shorten(then)} there, {_shorten(current)} now"
+        for path, (then, current) in pairs.items()
+        if then != current
     ]
     if len(changes) > MOST:
-        changes[MOST:] = [f"{what}: {len(changes) - MOST} more differ"]
+        changes[MOST:] = [f"{text}: {len(changes) - MOST} more differ"]
     if changes:
         raise UsageError(changes)
 
@@ -154,8 +154,8 @@ def _leaves(tree: Any, path: str) -> dict[str, Any]:
         tree = dict(enumerate(tree))
     if not isinstance(tree, Mapping) or not tree:
         return {path: tree}
-    leaves = [_leaves(branch, f"{path}.{key}") for key, branch in tree.items()]
-    return {at: leaf for part in leaves for at, leaf in part.items()}
+    branches = [_leaves(branch, f"{path}.{key}") for key, branch in tree.items()]
+    return {at: leaf for leaves in branches for at, leaf in leaves.items()}
 
 
 def _shorten(value: Any) -> str:

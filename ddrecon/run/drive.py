@@ -117,23 +117,23 @@ def drive_run(
         cells = row.cells
         if preview_every and row.iteration % preview_every == 0:
             folder.preview(run)
-        known = run.total.test_psnr
-        test = "" if known is None else f"/{known:.1f}"
+        test_psnr = run.total.test_psnr
+        test = "" if test_psnr is None else f"/{test_psnr:.1f}"
         return f"PSNR {row.psnr:.1f}{test} dB"
 
     advance(run, make_iteration, folder, is_quiet, title)
     # What is left the first rank does by itself.
     leave_ranks()
 
-    def show(views: Sequence[Any], what: str) -> Iterable[Any]:
-        return tqdm(views, desc=what, leave=False, **bar_settings(is_quiet))
+    def show(views: Sequence[Any], label: str) -> Iterable[Any]:
+        return tqdm(views, desc=label, leave=False, **bar_settings(is_quiet))
 
     try:
         with tell("rendering what was found, and writing it with its report", is_silent):
             return folder.finish(run, show)
     except KeyboardInterrupt:
-        made = f"after {run.iteration} iterations"
-        raise KeyboardInterrupt(f"{made}; write its results with --resume") from None
+        count_text = f"after {run.iteration} iterations"
+        raise KeyboardInterrupt(f"{count_text}; write its results with --resume") from None
 
 
 def advance(
@@ -152,7 +152,7 @@ def advance(
     total = None if run.schedule.is_auto else run.schedule.most
     form, settings = SHORT if total else None, bar_settings(is_quiet)
     bar = tqdm(total=total, initial=run.iteration, desc=title, bar_format=form, **settings)
-    # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
+    # Deferred: torchrun kills all ranks when one ends, and must not tear a checkpoint.
     with defer_interrupt() as asked:
         try:
             with bar:
@@ -162,8 +162,8 @@ def advance(
                     bar.update()
                     if is_any(bool(asked)):
                         folder.save(run)
-                        made = f"after {run.iteration} iterations"
-                        raise KeyboardInterrupt(f"{made}; go on with --resume")
+                        count_text = f"after {run.iteration} iterations"
+                        raise KeyboardInterrupt(f"{count_text}; go on with --resume")
         except (DivergenceError, RanksError) as error:
             folder.save(run)
             raise error.with_advice(
@@ -173,9 +173,9 @@ def advance(
 
 
 def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list[str]:
-    """The `summary` of a run that is done, in `folder`, as lines; all of it took so many `seconds`.
+    """The `summary` of a finished run in `folder`, as lines; this process took `seconds`.
 
-    Those of its iterations count what was done before it was resumed, too.
+    The seconds of iterations include those before a resume.
     """
     line = (
         f"{summary['iterations']} iterations in {summary['seconds']:.1f} s, and {seconds:.1f} s "

@@ -32,19 +32,19 @@ class LossLog:
         with refusals(self.path), self.path.open("a", newline="") as stream:
             csv.writer(stream).writerow(_cells(row))
 
-    def rows(self, made: int | None = None) -> list[Row]:
-        """What can be read; with `made` up to that iteration, and a warning if some are missing."""
+    def rows(self, count: int | None = None) -> list[Row]:
+        """The readable rows, up to iteration `count` if given; warns if some are missing."""
         try:
             _, *lines = self.path.read_text(errors="replace").splitlines() or [""]
         except OSError:
             lines = []
         rows = [row for row in map(_row, lines) if row is not None]
-        if made is None:
+        if count is None:
             return rows
-        rows = [row for row in rows if row.iteration <= made]
-        if len(rows) < made:
+        rows = [row for row in rows if row.iteration <= count]
+        if len(rows) < count:
             warnings.warn(
-                f"{self.path}: has {len(rows)} of the {made} iterations made", DataWarning, 2
+                f"{self.path}: has {len(rows)} of the {count} iterations made", DataWarning, 2
             )
         return rows
 

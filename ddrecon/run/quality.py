@@ -1,4 +1,4 @@
-"""What a run has found, and how good its pictures are, for its report, its page and its summary."""
+"""The reconstruction of a run, and how good its pictures are, for its report and its summary."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from ddrecon.variables.values import value_of
 
 @dataclass(frozen=True)
 class Findings:
-    """The `scene` as found, and of each view with a target its image and quality.
+    """The reconstructed `scene`, and the image and `quality` of each view with a target.
 
-    That is, by name, its split, PSNR and SSIM, and of a test view the exposure it was given to
-    compare it, and what it is `registered`. `given` are the fields of the scene file in whose place
-    others were found, by name.
+    `quality[view]` holds `split`, `psnr`, `ssim`; test views also have `fitted_exposure` or
+    `fitted_offset`, and `registered`. `truths` maps a field's name to the scene file's values where
+    the run started from others: usually the ground truth.
     """
 
     scene: Scene
-    given: Mapping[str, Tensor]
+    truths: Mapping[str, Tensor]
     images: Mapping[str, Tensor]
     quality: Mapping[str, Mapping[str, Any]]
 
 
 def find_results(run: Reconstruction, progress: Progress | None = None) -> Findings:
-    """What `run` has found so far, rendered; views held out are registered with a `progress`."""
+    """The current result of `run`, rendered; with a `progress`, held-out views are registered."""
     scene = run.current_scene()
     shown = [view for view in scene.views if view.image is not None]
     targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
@@ -64,21 +64,21 @@ def find_results(run: Reconstruction, progress: Progress | None = None) -> Findi
             target = targets[view.name]
             registered = register(light_field, scene, view, target, response_sizes(run.parameters))
             quality[view.name]["registered"] = registered
-    return Findings(scene, _given_fields(run.problem.scene), images, quality)
+    return Findings(scene, _find_truths(run.problem.scene), images, quality)
 
 
-def _given_fields(scene: Scene) -> dict[str, Tensor]:
-    """The fields of `scene` that are optimized but start from something else: the truth, perhaps.
+def _find_truths(scene: Scene) -> dict[str, Tensor]:
+    """The optimized fields of `scene` that start from other values: the truth, perhaps.
 
-    What is the same in every cell is left out.
+    Fields that are the same in every cell are left out.
     """
-    given = {}
+    truths = {}
     for name, start in scene.starts.items():
         if is_of_volume(name) and (value := value_of(scene, name)).ndim >= 3:
             is_start = start.shape == value.shape and torch.equal(start, value)
             if not is_start and bool((value != value.flatten()[0]).any()):
-                given[name] = value
-    return given
+                truths[name] = value
+    return truths
 
 
 def describe_loss(settings: OptimizeSettings, train: Scene) -> dict[str, Any]:

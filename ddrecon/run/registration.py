@@ -49,8 +49,8 @@ def register(
     change, sizes, best = torch.zeros_like(unit), {"exposure": 1, **sizes}, dict[str, Any]()
     moved, picture = see_by(change)
     camera = moved.camera
-    ways = (tuning.APART * unit).diag()
-    changes = torch.stack([see_by(way)[1] - picture for way in ways]) / tuning.APART
+    offsets = (tuning.APART * unit).diag()
+    changes = torch.stack([see_by(offset)[1] - picture for offset in offsets]) / tuning.APART
     for _ in range(STEPS):
         fitted, response = fit_held_out(picture, view, target, sizes)
         psnr = float(target.psnr_of(fitted))
@@ -58,8 +58,8 @@ def register(
             break
         best, camera = {"psnr": psnr, "ssim": float(target.ssim_of(fitted))}, moved.camera
         # Errors are those that PSNR counts, of values as they are compared.
-        given = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
-        slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / given
+        exposure = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
+        slope = target.on.slope(fitted) * response["exposure"].view(-1, 1, 1) / exposure
         error = target.compared - target.on.values(fitted)
         if target.seen is not None:
             slope, error = slope * target.seen, error * target.seen
@@ -74,8 +74,8 @@ def register(
     return best | {"shift": shift_between(view.camera, camera, scene.volume)}
 
 
-def shift_between(camera: Camera, other: Camera, volume: Volume) -> float:
-    """By how many pixels what is in `volume` lies elsewhere in the image of `other`: the mean.
+def shift_between(camera: Camera, other_camera: Camera, volume: Volume) -> float:
+    """By how many pixels, in the mean, what is in `volume` moves in the image of `other_camera`.
 
     Cells count by their extinction, all alike where there is none.
     """
@@ -83,7 +83,9 @@ def shift_between(camera: Camera, other: Camera, volume: Volume) -> float:
     weight = weight if bool(weight.any()) else torch.ones_like(weight)
     z, y, x = torch.broadcast_tensors(*volume.grid.centers(weight))
     centers = torch.stack([x, y, z], -1).flatten(0, 2)[weight > 0].to(camera.pose)
-    (one, _), (moved, _) = (project(each, centers) for each in (camera, other))
-    shift = (one - moved).norm(dim=1).to(weight)
+    (place, _), (moved, _) = (
+        project(view_camera, centers) for view_camera in (camera, other_camera)
+    )
+    shift = (place - moved).norm(dim=1).to(weight)
     weight = weight[weight > 0] * shift.isfinite()
     return float((weight * shift).nansum() / weight.sum())

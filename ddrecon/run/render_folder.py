@@ -34,7 +34,7 @@ GRADIENT = ".gradient"
 AT_REST = 0.01
 """Light that a transport round changes by a smaller part has come to rest."""
 FEW = 12
-"""Of more views only the first and the last are printed."""
+"""Where there are more views, only the first and the last are printed."""
 PARTS = (".reduced", ".single", ".multiple")
 
 
@@ -101,14 +101,14 @@ def _write_fluence(
     light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
 ) -> list[str]:
     """The names of files of these `kinds` in `folder`, which the first rank writes."""
-    found = resample(fluence_of(light_field, scene.diffusion), scene.volume.grid)
-    found = forward_ad.unpack_dual(found).primal
+    fluence = resample(fluence_of(light_field, scene.diffusion), scene.volume.grid)
+    fluence = forward_ad.unpack_dual(fluence).primal
     stem = folder / "volumes" / "fluence"
     if not is_first():
         return []
     stem.parent.mkdir(exist_ok=True)
     grid = scene.volume.grid
-    names = [write_values(stem, stem.name, found, grid, kind=kind) for kind in kinds]
+    names = [write_values(stem, stem.name, fluence, grid, kind=kind) for kind in kinds]
     return [f"{stem.parent.name}/{name}" for name in names]
 
 
@@ -136,19 +136,19 @@ def require_variation(scene: Scene, parameter: str) -> None:
         variation(scene, parameter)
     except UsageError as error:
         names = variable_names(scene)
-        parts = [
-            f"{name}.{part}"
+        components = [
+            f"{name}.{component}"
             for name in names
-            for part in component_names(name, value_of(scene, name))
+            for component in component_names(name, value_of(scene, name))
         ]
-        guess = "" if parameter in names else suggestion(parameter, [*names, *parts])
+        guess = "" if parameter in names else suggestion(parameter, [*names, *components])
         raise UsageError(f"--gradient {parameter}: {error}{guess}") from None
 
 
 def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[str]:
     """What `render` prints of its `report`: files, quality and time of each view.
 
-    Of more than a few views, and of several if it `is_quiet`, only the first and the last.
+    More than `FEW` views, or two if it `is_quiet`, are cut to the first and the last.
     """
     lines = []
     for name, files in report["files"].items():
@@ -172,7 +172,7 @@ def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[s
 def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
     """How many transport rounds there were, and whether light has come to rest in them (E7.3).
 
-    That is where the last one changed it by less than the `tolerance`, or `AT_REST`.
+    It has where the last round changed light by less than the `tolerance`, or `AT_REST`.
     """
     if residual < (tolerance or AT_REST):
         verdict = "at rest"
@@ -188,16 +188,16 @@ def _images(
     light_field: LightField, scene: Scene, view: View, names: Sequence[str]
 ) -> dict[str, Tensor]:
     picture = view_picture(light_field, scene, view)
-    found = {"": picture}
+    images = {"": picture}
     if PARTS[0] in names:
         # As the camera exposes them; its offset, and what is behind, count as reduced.
-        parts = view_components(light_field, scene, view.camera)
+        components = view_components(light_field, scene, view.camera)
         gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
-        single, multiple = gain * parts.single, gain * parts.multiple
+        single, multiple = gain * components.single, gain * components.multiple
         reduced = picture - single - multiple
-        images = reduced + single + multiple, reduced, single, multiple
-        found = dict(zip(("", *PARTS), images, strict=True))
-    pairs = {name: forward_ad.unpack_dual(image) for name, image in found.items()}
+        radiances = reduced + single + multiple, reduced, single, multiple
+        images = dict(zip(("", *PARTS), radiances, strict=True))
+    pairs = {name: forward_ad.unpack_dual(image) for name, image in images.items()}
     plain = {name: pair.primal for name, pair in pairs.items()}
     derived = {
         GRADIENT + name: torch.zeros_like(pair.primal) if pair.tangent is None else pair.tangent
@@ -227,7 +227,7 @@ def _render_in_turns(
         for place, view in enumerate(turn):
             if ranks > 1:
                 nothing = view.camera.pose.new_zeros(3, *view.camera.size)
-                parts = [images[name] if place == rank else nothing for name in names]
-                yield view, dict(zip(names, sum_over_ranks(parts), strict=True)), seconds
+                contributions = [images[name] if place == rank else nothing for name in names]
+                yield view, dict(zip(names, sum_over_ranks(contributions), strict=True)), seconds
             else:
                 yield view, images, seconds

@@ -48,9 +48,9 @@ from ddrecon.variables.values import fields_of
 SHOWN = 24
 """Views whose pictures are on the page; all are in the folder."""
 PIXELS = 1_200_000
-"""So many pixels all pictures of views have together, at most."""
+"""The most pixels that all pictures of views have together."""
 GOES_ON = {"kind": "running", "text": "goes on"}
-"""How a run has `ended` that has not."""
+"""The `ended` of a run that still goes on."""
 LISTED = 12
 """More numbers of one parameter are not listed."""
 FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"
@@ -73,7 +73,7 @@ def write_run_report(
     """
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene))
-    known = {key: value for key, value in environment.items() if key != "engines"}
+    package_versions = {key: value for key, value in environment.items() if key != "engines"}
     settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     sections = [
@@ -84,7 +84,7 @@ def write_run_report(
         *([section("Numbers found", table(["", "start", "found"], numbers))] if numbers else []),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", settings)),
-        section("Versions", versions(known)),
+        section("Versions", versions(package_versions)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
     goes_on = summary["ended"]["kind"] == GOES_ON["kind"]
@@ -92,17 +92,17 @@ def write_run_report(
 
 
 def list_numbers(
-    parameters: Iterable[Parameter], before: Scene, scene: Scene
+    parameters: Iterable[Parameter], old_scene: Scene, scene: Scene
 ) -> list[tuple[str, str, str]]:
     """Names, starts and values of those of `parameters` that are neither fields nor maps.
 
-    Of a pose the value is by how much the camera of `scene` is moved and turned from that `before`.
+    The value of a pose is how far the camera of `scene` is moved and turned from `old_scene`.
     """
     rows = []
     for parameter in parameters:
         start, value = (x.detach().flatten() for x in (parameter.start, parameter.value))
         if parameter.key == "camera" and parameter.view is not None:
-            old, new = (world.view(parameter.view).camera for world in (before, scene))
+            old, new = (world.view(parameter.view).camera for world in (old_scene, scene))
             moved = shift_between(old, new, scene.volume)
             apart = float((new.pose - old.pose)[:, :3].norm())  # sqrt(8) sin(angle / 2)
             turned = math.degrees(2 * math.asin(min(1.0, apart / math.sqrt(8))))
@@ -136,12 +136,12 @@ def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
     """
     scene = findings.scene
     named = fields_of(scene)
-    both = (*named.items(), *findings.given.items())
+    both = (*named.items(), *findings.truths.items())
     whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
     z, y, x = scene.volume.grid.extent
     fields = [
         Shown(name, of, value, (x, y, z), whites[name])
-        for of, values in (("result", named), ("truth", findings.given))
+        for of, values in (("result", named), ("truth", findings.truths))
         for name, value in values.items()
     ]
     pose = scene.views[0].camera.pose
@@ -156,7 +156,7 @@ def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
 
 
 def _stills(fields: dict[str, Tensor]) -> str:
-    parts = [
+    blocks = [
         paragraph(
             "Across z, x and y from left to right; y, or z, is up. The largest value is white;"
             " where some are below 0, these are blue, 0 is white, and above is red."
@@ -168,8 +168,8 @@ def _stills(fields: dict[str, Tensor]) -> str:
             largest = f"(values from {float(value.min()):.4g} to {float(value.max()):.4g})"
         cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
         means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
-        parts.append(side_by_side(cut, means))
-    return "\n".join(parts)
+        blocks.append(side_by_side(cut, means))
+    return "\n".join(blocks)
 
 
 def curves(rows: Sequence[Row]) -> list[str]:
@@ -191,7 +191,7 @@ def curves(rows: Sequence[Row]) -> list[str]:
 
 def _steps(rows: Sequence[Row]) -> list[Row]:
     """The first row of each resolution but the first."""
-    return [row for before, row in pairwise(rows) if row.cells != before.cells]
+    return [row for previous, row in pairwise(rows) if row.cells != previous.cells]
 
 
 def _explain_steps(rows: Sequence[Row]) -> list[str]:
@@ -209,7 +209,7 @@ def view_section(findings: Findings) -> list[str]:
     shown = sorted(views, key=lambda view: not view.is_test)[:SHOWN]
     white = median(find_white(pixels(target_of(view))) for view in shown)
     most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
-    parts = [
+    blocks = [
         paragraph(
             f"The picture on the left, its render on the right, as displayed (sRGB; radiance "
             f"{white:.3g} is white). Move over a picture to shift the line between them; "
@@ -220,10 +220,10 @@ def view_section(findings: Findings) -> list[str]:
         group = [view for view in shown if view.is_test == is_test]
         if group:
             figures = [_figure(findings, view, white, most) for view in group]
-            parts.append(unfolded(f"{label}: {len(group)}", grid(figures), is_open=True))
+            blocks.append(unfolded(f"{label}: {len(group)}", grid(figures), is_open=True))
     if len(views) > SHOWN:
-        parts.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
-    return [*parts, unfolded("All views", _view_table(findings), is_open=False)]
+        blocks.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
+    return [*blocks, unfolded("All views", _view_table(findings), is_open=False)]
 
 
 def _figure(findings: Findings, view: View, white: float, most: int) -> str:

@@ -33,7 +33,7 @@ from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import GOES_ON, list_numbers, write_run_report
-from ddrecon.run.result import RESULT, describe_result, plain, result_names
+from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
     SceneFile,
@@ -60,9 +60,9 @@ CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
 PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
-"""Its report is written about this often, and takes at most this part of its time."""
+"""The report is written about this often, and takes at most this part of the run's time."""
 REPORT, SUMMARY = "report.html", "summary.json"
-"""Its page, and what is written last of all: a run that has it is finished."""
+"""The page of a run, and the file that is written last: a run that has it is finished."""
 
 
 def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
@@ -87,7 +87,7 @@ def require_run(folder: Path) -> Path:
 
 
 class Checkpoints:
-    """Those in the folder `path` of a run, or of several together, written now and then.
+    """The checkpoints in the folder `path` of a run, or of several together, written now and then.
 
     `result_of` describes what the result depends on.
     """
@@ -147,27 +147,27 @@ class RunFolder(Checkpoints):
         self.note_saved(run, 0.0)
 
     def save(self, run: Reconstruction | Together) -> None:
-        """Writes a checkpoint, after the log, which so never lacks rows that it counts."""
+        """Writes a checkpoint after the log, which therefore has all rows that it counts."""
         flush(self.log.path)
         super().save(run)
 
     def save_in_time(self, run: Reconstruction | Together) -> None:
-        """As of all checkpoints; and has the report say how far the run is, unless that is new."""
+        """Writes a checkpoint if the last is old, and likewise the report of the run so far."""
         super().save_in_time(run)
         if isinstance(run, Reconstruction) and run.iteration:
             start = monotonic()
             if start >= self.next_page:
-                found = find_results(run)
+                findings = find_results(run)
                 summary = _summary(run) | {"ended": GOES_ON}
-                self._report(run, found, summary | {"views": found.quality, "diagnoses": []})
+                self._report(run, findings, summary | {"views": findings.quality, "diagnoses": []})
                 seconds = monotonic() - start
                 self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
 
-    def _report(self, run: Reconstruction, found: Findings, summary: Mapping[str, Any]) -> None:
+    def _report(self, run: Reconstruction, findings: Findings, summary: Mapping[str, Any]) -> None:
         rows = self.log.rows(run.iteration)
-        numbers = list_numbers(run.parameters, run.problem.scene, found.scene)
+        numbers = list_numbers(run.parameters, run.problem.scene, findings.scene)
         path = self.path / REPORT
-        write_run_report(path, found, rows, summary, self.environment, numbers)
+        write_run_report(path, findings, rows, summary, self.environment, numbers)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -176,22 +176,22 @@ class RunFolder(Checkpoints):
     def finish(self, run: Reconstruction, progress: Progress) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
-        found = find_results(run, progress)
-        scene = found.scene
+        findings = find_results(run, progress)
+        scene = findings.scene
         names = result_names([parameter.name for parameter in run.parameters])
         stored = dict.fromkeys([*density_names(scene), *names])
         values = {name: self._store(scene, name) for name in stored}
         dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
-        self._pictures(found, "")
+        self._pictures(findings, "")
         rows = self.log.rows(run.iteration)
-        summary, support = _summary(run) | {"views": found.quality}, run.problem.support
-        results = scene, found.images, found.quality, rows
+        summary, support = _summary(run) | {"views": findings.quality}, run.problem.support
+        results = scene, findings.images, findings.quality, rows
         summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
-        seen = [one["registered"] for one in found.quality.values() if "registered" in one]
+        seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
-            summary["registered"] = {key: mean(one[key] for one in seen) for key in seen[0]}
-        self._report(run, found, summary)
+            summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
+        self._report(run, findings, summary)
         write_json(self.path / SUMMARY, summary)
         return summary
 
@@ -219,21 +219,20 @@ class RunFolder(Checkpoints):
                 is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
             ):
                 parameters[name] = value.tolist()
+        parameters |= poses_of(scene, [f"views.{view.name}.camera" for view in scene.views])
         for view in scene.views:
-            matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
-            parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
             for key in RESPONSE:
                 if (value := getattr(view, key)) is not None:
                     parameters[f"views.{view.name}.{key}"] = value.tolist()
         return parameters
 
-    def _pictures(self, found: Findings, mark: str) -> None:
+    def _pictures(self, findings: Findings, mark: str) -> None:
         folder = self.path / "previews"
-        for name, value in fields_of(found.scene).items():
+        for name, value in fields_of(findings.scene).items():
             write_preview(folder / f"{name}.slices{mark}.png", slices(value))
-        for view in found.scene.views:
+        for view in findings.scene.views:
             if view.image is not None:
-                shown = comparison(view.image, found.images[view.name])
+                shown = comparison(view.image, findings.images[view.name])
                 write_preview(folder / f"{view.name}{mark}.png", shown)
 
 

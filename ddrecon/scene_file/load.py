@@ -17,12 +17,13 @@ from ddrecon.errors import FormatError, Problems, SceneError, UsageError, sugges
 from ddrecon.grid import Triple
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import require_stored
+from ddrecon.records import Violation
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import node_of
 from ddrecon.scene_file.view_sources import name_listed, views_of
-from ddrecon.settings import AUTO, ParameterSettings, Violation
+from ddrecon.settings import AUTO, ParameterSettings
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -75,7 +76,9 @@ def read_scene(
     """
     if not isinstance(path, str | os.PathLike):
         raise UsageError(f"path: expected that of a scene file, found {type(path).__name__}")
-    if isinstance(overrides, str) or not isinstance(overrides, Iterable):
+    is_list = isinstance(overrides, Iterable) and not isinstance(overrides, str)
+    changes: list[Any] = [*overrides] if is_list else [None]
+    if not all(isinstance(text, str) for text in changes):
         raise UsageError(f'overrides: expected a list, ["key.path=value"], found {overrides!r}')
     path, problems = Path(path), Problems()
     found = None
@@ -83,7 +86,7 @@ def read_scene(
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
         if root.value is None:
             raise root.refused("is empty")
-        for text in overrides:
+        for text in changes:
             with problems.collecting():
                 override(root, text, problems, options.get(text, f"-D {text}"))
         found = _scene_of(root, path)

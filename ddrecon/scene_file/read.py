@@ -9,18 +9,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
-from functools import cache, reduce
+from functools import reduce
 from operator import or_
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from ddrecon.errors import Problems, suggestion
+from ddrecon.records import LIMITS, alternatives, type_hints
 from ddrecon.scene_file.nodes import Node, describe_found
-from ddrecon.settings import LIMITS, FieldFile
+from ddrecon.settings import FieldFile
 
 R = TypeVar("R")
-type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 
 LARGEST = 3e38
 """The largest magnitude that single precision holds, roughly."""
@@ -50,12 +50,6 @@ class Rule(NamedTuple):
 def read_as(node: Node, hint: Any, folder: Path, **limits: float) -> Any:
     """The value of `node`, of the type `hint` within `limits`."""
     return read_value(node, Rule(hint, folder, limits, {}))
-
-
-@cache
-def alternatives(hint: Any) -> tuple[Any, ...]:
-    """The types that `hint` allows."""
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def describe_type(hint: Any) -> str:
@@ -129,8 +123,6 @@ def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
 
 def _check_choice(node: Node, choices: Sequence[Any], rule: Rule) -> None:
     if choices and node.value not in choices:
-        if what := rule.limits.get("retired", {}).get(str(node.value)):
-            raise node.refused(f"{node.value} went: {what}")
         words = list(map(str, choices))
         near = suggestion(str(node.value), words) if len(words) > 1 else ""
         raise node.refused(
@@ -227,18 +219,15 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
     entries, hints = node.entries(), type_hints(kind)
     declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
-    retired = getattr(kind, "RETIRED", {})
     problems, values = Problems(), {}
     for what in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
             if name not in known:
-                raise child.key_refused(
-                    retired.get(name) or f"unknown key{suggestion(name, known)}"
-                )
+                raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
-                limits = {**declared[name].metadata, "retired": retired}
+                limits = declared[name].metadata
                 hint = reduce(or_, limits.get("also", ()), hints[name])
                 values[name] = read_value(child, rule._replace(hint=hint, limits=limits))
         if problems.are_many:

@@ -19,15 +19,13 @@ from typing import Any, ClassVar, Literal
 
 from ddrecon.grid import Triple
 from ddrecon.io.images.films import FILMS
+from ddrecon.records import Violation, bounded, one_of
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
     NoiseSettings,
     OptimizeSettings,
     RenderSettings,
-    Violation,
-    bounded,
-    one_of,
 )
 from ddrecon.variables.kinds import PAIRS, PHASE, split_name
 
@@ -143,12 +141,6 @@ class MediumSection:
     """One of the two media of a mixture; its phase function is the same in all cells."""
 
     ALTERNATIVES: ClassVar = PAIRS
-    RETIRED: ClassVar = {
-        "draine": "write type: table with its values over the angle, or type: two_lobe",
-        "legendre": "write type: table with the series' values over the angle",
-        "blend": "write two media, volume.media: each has a density and a phase function of its "
-        "own",
-    }
 
     density: Density = bounded(minimum=0)
     sigma_a: Quantity | None = bounded(None, minimum=0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import BeamLight, DirectionalLight
-from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.moments import add, beam_moments
 from ddrecon.light.refracted import Confined, enter_faces
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
@@ -95,12 +95,12 @@ def _pass(value: Tensor, course: Course, ends: dict[int, Tensor]) -> tuple[Tenso
     return course.lift(arriving * decay_mean(depth)), gone
 
 
-def reflected_light(cells: Medium, lights: Sequence[Source], degree: int) -> Moments:
-    """The moments up to `degree` of beams' light, not yet scattered, once faces have reflected it.
+def reflected_light(cells: Medium, lights: Sequence[Source], degree: int) -> Tensor:
+    """phi up to `degree` of beams' light, not yet scattered, once faces have reflected it.
 
     Of `lights` in `cells`; skies' light is not followed beyond the faces it comes to.
     """
-    found = [Moments(torch.zeros_like(cells.extinction.value))]
+    found = [torch.zeros_like(cells.extinction.value)[None]]
     for light in lights:
         if isinstance(light, DirectionalLight | BeamLight):
             for beam in enter_faces(cells.grid, cells.index, light):
@@ -108,4 +108,4 @@ def reflected_light(cells: Medium, lights: Sequence[Source], degree: int) -> Mom
                     if one.turns:
                         mean = one.irradiance / (4 * math.pi)
                         found.append(beam_moments(mean, one.direction, degree))
-    return functools.reduce(Moments.plus, found)
+    return functools.reduce(add, found)

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
-from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.diffusion.operator import Operator
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments, Vector, add_vectors
+from ddrecon.light.moments import Cut, add, cut, mean_and_first
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
@@ -39,39 +39,40 @@ DAMPING = 0.7
 
 def run_rounds(
     problem: DiffusionProblem,
-    light: Moments,
+    higher: Tensor,
+    phi: Tensor,
     solve: SolverWithMemory,
     rounds: int,
     degree: int,
     tolerance: float = 0.0,
-) -> Moments:
-    """Light after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
+) -> Tensor:
+    """phi after `rounds` of sweeps, its angles kept to `degree` (E2.10, E2.8).
 
-    `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
-    the quadrature. Only the mean is kept where light's direction does not matter. With a
-    `tolerance` rounds end where one changes light by less of it (E7.3). What the last one changes
-    is recorded.
+    `phi`: the solution of `problem` by `solve`, where the first round begins; `higher`: moments of
+    the source that follow those of `problem`; `degree`: that of the quadrature. Only the mean is
+    kept where light's direction does not matter. With a `tolerance` rounds end where one changes
+    light by less of it (E7.3). What the last one changes is recorded.
     """
     if rounds == 0:
-        return light
+        return phi
     medium, directions = problem.medium, count_directions(degree, rounds)
     emitted, glow = None, face_mirror(medium, directions)
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
     mirror = face_mirror(medium, directions, None if emitted is None else glow)
-    began, is_open = perf_counter(), tolerance > 0
+    began, is_open, light = perf_counter(), tolerance > 0, cut(phi)
     factors = [None] * rounds if is_open else _blending(medium, rounds)
     for round_index, factor in enumerate(factors, 1):
-        is_last, before = round_index == rounds, light.mean
+        is_last, before = round_index == rounds, light[0][0]
         cosine = _flux_factor(medium, is_last and not is_open)
         given = round_index, cosine, factor, mirror
-        light = _round(problem, light, emitted, solve, directions, *given)
-        residual = _residual(light.mean, before) if is_open or is_last else 1.0
+        light = _round(problem, higher, light, emitted, solve, directions, *given)
+        residual = _residual(light[0][0], before) if is_open or is_last else 1.0
         if is_last or residual < tolerance:
             break
     record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
     solve.memory.records.append(record)
-    return light
+    return torch.cat(light)
 
 
 @torch.no_grad()
@@ -90,50 +91,61 @@ def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) 
     return Mirror(medium.grid, medium.index, courses, values, besides)
 
 
-def sweep_emission(medium: Medium, directions: int, mirror: Mirror | None = None) -> Moments:
+def sweep_emission(medium: Medium, directions: int, mirror: Mirror | None = None) -> Cut:
     """The moments of the light that cells emit, before any of it is scattered (E2.9, E2.11).
 
     It is the same in all rounds, and swept once. Like kappa_a, j is even within cells.
     """
     emitting = medium.emitting
     nothing = torch.zeros_like(medium.extinction.value.detach() * emitting.remaining.value.detach())
-    even = Moments(torch.ones_like(nothing))
-    return sweep_change(emitting, Moments(nothing), even, None, directions, mirror)
+    dark, even = cut(nothing[None]), cut(torch.ones_like(nothing)[None])
+    return sweep_change(emitting, dark, even, None, directions, mirror)
 
 
 def _round(
     problem: DiffusionProblem,
-    light: Moments,
-    emitted: Moments | None,
+    higher: Tensor,
+    light: Cut,
+    emitted: Cut | None,
     solve: SolverWithMemory,
     directions: int,
     round_index: int,
     cosine: Tensor,
     factor: Tensor | None,
     mirror: Mirror | None,
-) -> Moments:
+) -> Cut:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `emitted`: light as of `sweep_emission`; `cosine`: as of `_flux_factor`.
+    `higher`: as of `run_rounds`; `emitted`: light as of `sweep_emission`; `cosine`: as of
+    `_flux_factor`.
     """
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    change = sweep_change(medium, light, problem.source, inflow, directions, mirror)
-    change = change if emitted is None else change.plus(emitted)
+    low, high = sweep_change(medium, light, (problem.source, higher), inflow, directions, mirror)
+    if emitted is not None:
+        low, high = add(low, emitted[0]), high + emitted[1]
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
+    mean, first = mean_and_first(light[0])
     off = None
     if round_index > 1:
-        imbalance = _imbalance(operator, right, light.mean)
-        off = Moments(imbalance, problem.flux(light.mean, begun=light.flux, sign=-1))
-    gain, source, turned = _gain(medium, change, off, directions, cosine)
-    solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
-    mean = problem.solved(solve_round, problem.right_side(source, turned))
+        off = _imbalance(operator, right, mean), problem.flux(mean, begun=first, sign=-1)
+    gain, source, turned = _gain(medium, low, off, directions, cosine)
+    solve_round = replace(solve, round_index=round_index, start=mean.detach())
+    u = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux), change.higher)
-    return new if factor is None else light.toward(new, factor)
+    gained, gained_first = mean_and_first(gain)
+    first = problem.flux(u, turned, gained_first)
+    new = (u + gained)[None]
+    new = new if first is None else torch.cat([new, first])
+    if factor is None:
+        return new, high
+    # In the first round light has no moments of higher degree: it begins with diffusion's.
+    return torch.lerp(light[0], new, factor), (
+        torch.lerp(light[1], high, factor) if len(light[1]) else factor * high
+    )
 
 
 def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
@@ -163,13 +175,17 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
 
 def _gain(
-    medium: Medium, change: Moments, off: Moments | None, directions: int, cosine: Tensor
-) -> tuple[Moments, Tensor, Vector | None]:
+    medium: Medium,
+    change: Tensor,
+    off: tuple[Tensor, Tensor | None] | None,
+    directions: int,
+    cosine: Tensor,
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """theta (L0' - L0) and theta (L1' - L1) + L1 - 3 F(L0) of E2.10, and what they add to S.
 
     That is kappa_s theta (L0' - L0) - (S - A L0). And c = theta `cosine` (L1' - L1), by how much
-    the flux that scatters changes (E2.8). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and L1 -
-    3 F(L0), None for zero.
+    the flux that scatters changes (E2.8). `change` [1 or 4, C, z, y, x]: L0' - L0 and L1' - L1, as
+    moments; `off`: S - A L0, and the moments of L1 - 3 F(L0); None for zero.
     """
     step = _mean_step(medium.grid, directions)
     if is_fused() and not medium.is_cellwise:
@@ -177,12 +193,15 @@ def _gain(
 
         return gain_fused(medium, change, off, cosine, DAMPING, step)
     share = recompute(_transport_share, medium, step)
-    gain = Moments(change.mean, change.flux).scaled(share, share)
-    source = medium.remaining_scattering * gain.mean
-    turned = None if gain.flux is None else Moments(source, gain.flux).scaled(1.0, cosine).flux
+    gain = share * change
+    mean, first = mean_and_first(gain)
+    source, turned = medium.remaining_scattering * mean, None if first is None else cosine * first
     if off is None:
         return gain, source, turned
-    return Moments(gain.mean, add_vectors(gain.flux, off.flux)), source - off.mean, turned
+    imbalance, off_first = off
+    if first is not None and off_first is not None:
+        gain = torch.cat([mean[None], first + off_first])
+    return gain, source - imbalance, turned
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
@@ -191,12 +210,7 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 
 
 def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
-    imbalance = right - operator.loss * mean
-    for axis, conductance in zip(AXES, operator.conductances, strict=True):
-        imbalance = imbalance - accumulate(
-            conductance * difference(mean, conductance, axis), mean, axis
-        )
-    return imbalance
+    return right - operator.apply(mean)
 
 
 def _transport_share(medium: Medium, step: tuple[float, float]) -> Tensor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES
 from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Cut, add, cut, fill, weigh
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -75,38 +74,40 @@ def sweep(
 
 def sweep_change(
     medium: Medium,
-    light: Moments,
-    source: Moments,
+    light: Cut,
+    source: Cut,
     inflow: Tensor | None,
     directions: int,
     mirror: Mirror | None = None,
-) -> Moments:
-    """By how much the first two moments of light change in a sweep, and those of higher degree.
+) -> Cut:
+    """By how much moments of degree 0 and 1 change in a sweep, and all those of higher degree.
 
-    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8). What follows is as of `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E2.8), of which moments that are missing are
+    zero. What follows is as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = steep_gradient(medium, light.mean + source.mean, directions)
-    is_apart = mirror is None and not medium.grid.periodic
-    if is_apart and is_fused() and has_kernels("transport rounds", light.mean.is_cuda):
+    gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
+    traits = {"periodic": bool(medium.grid.periodic), "refracting": mirror is not None}
+    if has_kernels("transport rounds", gpu=light[0].is_cuda, **traits):
         from ddrecon.transport.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
             # the kernels' factors are the same everywhere: what scatters is summed before
-            source = light.weighted(factors).plus(source)
+            source = cut(add(weigh(torch.cat(light), factors), torch.cat(source)))
             factors = torch.zeros_like(factors[..., :1, :1, :1])
         return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
-    scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
+    phi = torch.cat(light)
+    scatters = fill(add(weigh(phi, factors), torch.cat(source)), medium.degree)
     if mirror is not None:
-        mirror.begin(_without(light.harmonics(medium.degree), inflow))
+        mirror.begin(_without(fill(phi, medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
     if mirror is not None:
         mirror.end(_without(swept, inflow))
-    change = Moments.of_harmonics(swept)
-    return change.plus(replace(light, higher=None).scaled(-1.0, -1.0))
+    low, high = cut(swept)
+    return add(low, -light[0]), high
 
 
 def _without(light: Tensor, inflow: Tensor | None) -> Tensor:

@@ -60,17 +60,17 @@ class Curvature:
         """How many entries a vector has."""
         return sum(value.numel() for value in self.values.values())
 
-    def join(self, parts: Mapping[str, Tensor]) -> Tensor:
-        """`parts` by name as one vector; what is missing is 0."""
+    def join(self, tensors: Mapping[str, Tensor]) -> Tensor:
+        """`tensors` by name as one vector; what is missing is 0."""
         like = self.values.items()
-        joined = [parts.get(name, torch.zeros_like(value)).reshape(-1) for name, value in like]
+        joined = [tensors.get(name, torch.zeros_like(value)).reshape(-1) for name, value in like]
         return torch.cat(joined)
 
     def split(self, vector: Tensor) -> dict[str, Tensor]:
         """The parts of `vector` by name, each in the shape of its parameter."""
-        parts = vector.split([value.numel() for value in self.values.values()])
-        named = zip(self.values.items(), parts, strict=True)
-        return {name: part.view(value.shape) for (name, value), part in named}
+        chunks = vector.split([value.numel() for value in self.values.values()])
+        named = zip(self.values.items(), chunks, strict=True)
+        return {name: chunk.view(value.shape) for (name, value), chunk in named}
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

@@ -21,10 +21,10 @@ from ddrecon.variables.kinds import split_name
 from ddrecon.variables.values import component_names
 
 WITHIN = 0.68
-"""The part of cells that is to be within one deviation."""
+"""The share of cells within one deviation."""
 SHORT = 1.55
-"""How many times as large errors are as in experiments, whose volumes lack what no reconstruction
-shows: as measured where the truth was known (docs/uncertainty.md)."""
+"""The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
+lack what no reconstruction shows (docs/uncertainty.md)."""
 EMPTY = 0.02
 """Cells of less than this part of the largest are empty."""
 WIDTH = 3
@@ -34,23 +34,23 @@ WIDE = 9
 
 
 class Field:
-    """What is known of the field, or map, of `parameter`, by the experiments of `found`.
+    """The deviations of the field, or map, of `parameter`, by `experiments`.
 
     `power` is the mean square of its cells that are not empty: what a cell varies by if no picture
     tells of it. `classes` are cells by class, [..., z, y, x].
     """
 
-    def __init__(self, found: Uncertainty, parameter: Parameter):
+    def __init__(self, experiments: Uncertainty, parameter: Parameter):
         self.parameter, name = parameter, parameter.name
-        self.value = found.values[name].cpu().double()
-        self.errors = [each[name].cpu().double() for each in found.errors]
+        self.value = experiments.values[name].cpu().double()
+        self.errors = [errors[name].cpu().double() for errors in experiments.errors]
         self.squares = [mean_around(error.square(), WIDTH) for error in self.errors]
         is_empty = self.value.abs() <= EMPTY * self.value.abs().max()
         self.is_smoke = ~is_empty
         inside = self.value[self.is_smoke]
         self.power = float(inside.square().mean() if len(inside) else parameter.unit**2)
         # What pictures leave of that by noise alone, of cells that change with those around.
-        around = WIDTH**3 * mean_around(found.information[name].cpu().double(), WIDTH)
+        around = WIDTH**3 * mean_around(experiments.information[name].cpu().double(), WIDTH)
         # Where nothing may be, that is known.
         allowed = 1.0 if parameter.support is None else parameter.support.cpu().double()
         self.left = allowed * self.power / (1 + self.power * around)
@@ -64,15 +64,16 @@ class Field:
 
     def spread(self, but: int | None = None) -> Tensor:
         """The root mean square error around each cell, of all experiments `but` one."""
-        chosen = [each for at, each in enumerate(self.squares) if at != but] or self.squares
+        chosen = [square for at, square in enumerate(self.squares) if at != but] or self.squares
         tiny = torch.finfo(torch.float32).eps * self.power**0.5
         return torch.stack(chosen).mean(0).sqrt().clamp(min=tiny)
 
     @cached_property
     def factors(self) -> dict[str, float]:
-        """Of each class how large, in spreads, two thirds of the experiments' errors are."""
+        """The size, in spreads, that two thirds of the experiments' errors keep, by class."""
         sizes = torch.stack(self.errors).abs() / self.spread()
-        return {n: _find_within(sizes[:, own & self.is_smoke]) for n, own in self.classes.items()}
+        smoke = self.is_smoke
+        return {n: _find_within(sizes[:, cells & smoke]) for n, cells in self.classes.items()}
 
     @cached_property
     def deviation(self) -> Tensor:
@@ -80,13 +81,13 @@ class Field:
         return self.deviation_but(None) if self.errors else self.left.sqrt()
 
     def deviation_but(self, but: int | None) -> Tensor:
-        """It by all experiments `but` one. Where pictures tell nothing, it is what they leave."""
+        """The deviation by all experiments `but` one; unseen cells have at least that of noise."""
         spread, deviation = self.spread(but), self.left.sqrt()
-        for name, own in self.classes.items():
+        for name, cells in self.classes.items():
             by_errors = SHORT * self.factors[name] * spread
             if name == "unseen":
                 by_errors = torch.maximum(by_errors, deviation)
-            deviation = torch.where(own, by_errors, deviation)
+            deviation = torch.where(cells, by_errors, deviation)
         return deviation
 
     @property
@@ -107,10 +108,10 @@ class Field:
             "deviation": deviation**0.5,
             "explained": explained,
             "classes": {
-                name: {"share": float(own[smoke].double().mean())}
-                | self._coverage(name, own & smoke)
-                for name, own in self.classes.items()
-                if bool((own & smoke).any())
+                name: {"share": float(cells[smoke].double().mean())}
+                | self._coverage(name, cells & smoke)
+                for name, cells in self.classes.items()
+                if bool((cells & smoke).any())
             },
         }
 
@@ -122,8 +123,8 @@ class Field:
         factors = [SHORT * _find_within(error / self.spread(at)[where]) for at, error in errors]
         sizes = torch.cat([error / self.deviation_but(at)[where] for at, error in errors])
         within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
-        found = {"factor": SHORT * self.factors[name], "factors": factors}
-        return found | (within if len(errors) > 1 else {})
+        factors_of_class = {"factor": SHORT * self.factors[name], "factors": factors}
+        return factors_of_class | (within if len(errors) > 1 else {})
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """A change as likely as any: the experiments' errors, each times a smooth random field."""
@@ -134,19 +135,21 @@ class Field:
 
 
 class Deviations:
-    """The deviations of all that `found` is about, by its experiments so far."""
+    """The deviations of all parameters of `experiments`, by those made so far."""
 
-    def __init__(self, found: Uncertainty):
-        self.found = found
-        self.fields = {p.name: Field(found, p) for p in found.parameters if not is_tabled(p)}
-        self.tabled = [p for p in found.parameters if is_tabled(p)]
+    def __init__(self, experiments: Uncertainty):
+        self.experiments = experiments
+        self.fields = {
+            p.name: Field(experiments, p) for p in experiments.parameters if not is_tabled(p)
+        }
+        self.tabled = [p for p in experiments.parameters if is_tabled(p)]
 
     def numbers(self) -> dict[str, dict[str, float | None]]:
         """The value and the deviation of each number, and of the mass of each density, by name.
 
         A deviation is None where there were no experiments.
         """
-        numbers, errors = dict[str, dict[str, float | None]](), self.found.errors
+        numbers, errors = dict[str, dict[str, float | None]](), self.experiments.errors
         for name, field in self.fields.items():
             if split_name(name)[1] == "density":
                 cell = math.prod(field.parameter.grid.spacing)
@@ -154,25 +157,28 @@ class Deviations:
                 value = cell * float(field.value.sum())
                 numbers[f"mass of {name}"] = _with_deviation(value, cell * sums)
         for p in self.tabled:
-            # Of one kind, all views' numbers err alike, and so do all entries of any other.
+            # All views' numbers of one kind err alike, and so do all entries of other numbers.
             alike = [q for q in self.tabled if q.view is not None and q.key == p.key]
-            found = [torch.stack([e[q.name].flatten() for q in alike or [p]]) for e in errors]
+            stacked = [torch.stack([e[q.name].flatten() for q in alike or [p]]) for e in errors]
             for at, name in enumerate(_entry_names(p)):
-                own = [e[:, at] if alike else e.square().mean(1).sqrt() for e in found]
+                entry_errors = [e[:, at] if alike else e.square().mean(1).sqrt() for e in stacked]
                 value = float(p.value.detach().flatten()[at])
-                numbers[name] = _with_deviation(value, torch.cat(own) if own else torch.empty(0))
+                errors_of_entry = torch.cat(entry_errors) if entry_errors else torch.empty(0)
+                numbers[name] = _with_deviation(value, errors_of_entry)
         return numbers
 
     def draw(self, number: int) -> Tensor:
         """The sample of this `number`: a change of all values, in one vector of the curvature."""
-        generator = torch.Generator().manual_seed((self.found.seed % 2**31) * 1_000_003 + number)
-        parts = {name: field.draw(generator) for name, field in self.fields.items()}
-        values, numbers = self.found.values, self.numbers()
+        seed = (self.experiments.seed % 2**31) * 1_000_003 + number
+        generator = torch.Generator().manual_seed(seed)
+        changes = {name: field.draw(generator) for name, field in self.fields.items()}
+        values, numbers = self.experiments.values, self.numbers()
         for p in self.tabled:
             sizes = torch.tensor([numbers[n]["deviation"] or 0.0 for n in _entry_names(p)]).double()
             random = torch.randn(len(sizes), generator=generator, dtype=torch.float64)
-            parts[p.name] = (sizes * random).view(p.value.shape)
-        return self.found.curvature.join({n: part.to(values[n]) for n, part in parts.items()})
+            changes[p.name] = (sizes * random).view(p.value.shape)
+        changes = {name: change.to(values[name]) for name, change in changes.items()}
+        return self.experiments.curvature.join(changes)
 
 
 def _with_deviation(value: float, errors: Tensor) -> dict[str, float | None]:
@@ -187,8 +193,8 @@ def _entry_names(parameter: Parameter) -> Sequence[str]:
     name, value = parameter.name, parameter.value
     if value.numel() == 1:
         return [name]
-    parts = component_names(name, value) if value.ndim else ()
-    return [f"{name}.{part}" for part in parts or range(value.numel())]
+    components = component_names(name, value) if value.ndim else ()
+    return [f"{name}.{component}" for component in components or range(value.numel())]
 
 
 def _find_within(sizes: Tensor) -> float:

@@ -20,7 +20,7 @@ from ddrecon.run.checkpoint import continue_from, load_checkpoint, save_checkpoi
 from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS
 from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
-from ddrecon.uncertainty.folder import write_found
+from ddrecon.uncertainty.folder import write_deviations
 from ddrecon.uncertainty.next_view import rank_views
 
 
@@ -58,56 +58,58 @@ def drive_uncertainty(
         claimed.clear()
     for folder in (path / "volumes", checkpoints):
         folder.mkdir(exist_ok=True)
-    found = _begin(run, from_first(state), request)
+    experiments = _begin(run, from_first(state), request)
 
     def keep() -> None:
-        save_checkpoint(checkpoints, found.state() | {"seconds": perf_counter() - began}, described)
+        state = experiments.state() | {"seconds": perf_counter() - began}
+        save_checkpoint(checkpoints, state, described)
 
     try:
-        _experiment(found, request.experiments, keep, is_quiet)
+        _experiment(experiments, request.experiments, keep, is_quiet)
     except RanksError as error:
         raise error.with_advice("what was done is kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
     seconds = perf_counter() - began
-    return write_found(Deviations(found), views, request.samples, path, seconds)
+    return write_deviations(Deviations(experiments), views, request.samples, path, seconds)
 
 
 def follow_uncertainty(run: Reconstruction, request: Request) -> None:
     """Does this rank's part of what `drive_uncertainty` does on the first, which alone writes."""
-    found = _begin(run, from_first(None), request)
-    _experiment(found, request.experiments, lambda: None, is_quiet=True)
+    experiments = _begin(run, from_first(None), request)
+    _experiment(experiments, request.experiments, lambda: None, is_quiet=True)
 
 
 def _begin(run: Reconstruction, state: dict[str, Any] | None, request: Request) -> Uncertainty:
-    found = Uncertainty(run, request.seed, request.noise)
+    experiments = Uncertainty(run, request.seed, request.noise)
     if state is not None:
-        found.restore(state)
-    return found
+        experiments.restore(state)
+    return experiments
 
 
 def _experiment(
-    found: Uncertainty, experiments: int, keep: Callable[[], None], is_quiet: bool
+    experiments: Uncertainty, count: int, keep: Callable[[], None], is_quiet: bool
 ) -> None:
-    """Makes the missing `experiments`; `keep` is called now and then, and where it ends."""
-    total, due = experiments * found.run.iteration, perf_counter() + CHECKPOINT_SECONDS
-    bar = tqdm(total=total, initial=found.iteration, desc="uncertainty", **bar_settings(is_quiet))
+    """Makes the missing of `count` experiments; calls `keep` now and then, and at the end."""
+    total, due = count * experiments.run.iteration, perf_counter() + CHECKPOINT_SECONDS
+    settings, begun = bar_settings(is_quiet), experiments.iteration
+    bar = tqdm(total=total, initial=begun, desc="uncertainty", **settings)
     keep()
     with defer_interrupt() as asked, bar:
-        while found.count < experiments:
+        while experiments.count < count:
             try:
-                found.step()
+                experiments.step()
             except RanksError:
                 keep()
                 raise
             bar.update()
             is_asked = is_any(bool(asked))
-            if is_asked or found.trial is None or perf_counter() > due:
+            if is_asked or experiments.trial is None or perf_counter() > due:
                 keep()
                 due = perf_counter() + CHECKPOINT_SECONDS
             if is_asked:
-                made = f"after {found.iteration} of {total} iterations"
-                raise KeyboardInterrupt(f"{made}; go on with --resume")
+                count_text = f"after {experiments.iteration} of {total} iterations"
+                raise KeyboardInterrupt(f"{count_text}; go on with --resume")
 
 
 def _describe(run: Reconstruction, request: Request) -> dict[str, Any]:

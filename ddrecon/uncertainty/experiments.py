@@ -46,26 +46,26 @@ class Uncertainty:
     def __init__(self, run: Reconstruction, seed: int, noise: Noise | None = None):
         self.run, self.parameters, self.seed = run, run.parameters, seed
         level, settings = run.level, run.problem.settings
-        about = level.train, run.parameters, level.targets, run.memory.last
-        self.curvature = Curvature(*about)
+        self.curvature = Curvature(level.train, run.parameters, level.targets, run.memory.last)
         self.values = self.curvature.values
         images = self.curvature.images
         self.residuals = {v.name: target_of(v) - images[v.name] for v in level.train.views}
-        said = {v.name: noise or given_noise(v, settings) for v in level.train.views}
-        self.is_noise_known = None not in said.values()
+        noises = {v.name: noise or given_noise(v, settings) for v in level.train.views}
+        self.is_noise_known = None not in noises.values()
         # Nothing is known better than a part of all pictures.
         powers = [target_of(view).square().mean() for view in level.train.views]
         least = float(torch.stack(powers).mean()) * LEAST**2 + torch.finfo(torch.float32).tiny
         squares = dict[str, Tensor]()
         for view in level.train.views:
-            name, known = view.name, said[view.name]
+            name, view_noise = view.name, noises[view.name]
             seen = torch.ones(view.camera.size) if view.mask is None else view.mask
-            left = (self.residuals[name] * seen.to(images[name])).square().mean()
-            square = left if known is None else known.deviation(images[name]).square().mean()
+            residual = (self.residuals[name] * seen.to(images[name])).square().mean()
+            square = residual
+            if view_noise is not None:
+                # Pictures err as they are known to; the fit has taken up some of their noise.
+                square = view_noise.deviation(images[name]).square().mean()
+                self.residuals[name] *= (square / residual.clamp(min=least)).sqrt().clamp(min=1)
             squares[name] = square.clamp(min=least)
-            if known is not None:
-                # Pictures err as they are known to; the fit has taken up a part of that.
-                self.residuals[name] *= (square / left.clamp(min=least)).sqrt().clamp(min=1)
             weight = seen.to(images[name]) / squares[name]
             self.curvature.weights[name] = weight.expand_as(images[name])
         self.deviation = float(torch.stack(list(squares.values())).mean().sqrt())
@@ -85,13 +85,13 @@ class Uncertainty:
         trial.step()
         if not trial.is_done and trial.iteration < self.run.iteration:
             return
-        found = {p.name: p.value.detach() for p in trial.parameters}
-        self.errors.append({name: found[name] - self.truth[name] for name in found})
+        values = {p.name: p.value.detach() for p in trial.parameters}
+        self.errors.append({name: values[name] - self.truth[name] for name in values})
         self.count, self.trial = self.count + 1, None
         for p in self.parameters:
             if not is_tabled(p):
                 # What the reconstruction lacks of its truth is what the run lacks of it, too.
-                truth = self.truth[p.name] + self.values[p.name] - found[p.name]
+                truth = self.truth[p.name] + self.values[p.name] - values[p.name]
                 truth = truth.clamp(p.low, p.high)
                 self.truth[p.name] = truth if p.support is None else truth * p.support
 
@@ -104,7 +104,7 @@ class Uncertainty:
         """Takes up where `state` was."""
         like = next(iter(self.values.values()))
         self.count = state["count"]
-        self.errors = [{n: e.to(like) for n, e in each.items()} for each in state["errors"]]
+        self.errors = [{n: e.to(like) for n, e in entries.items()} for entries in state["errors"]]
         for name in ("truth", "information"):
             setattr(self, name, {n: value.to(like) for n, value in state[name].items()})
         if state["trial"] is not None:
@@ -149,9 +149,8 @@ class Uncertainty:
                 name: weight.sqrt().cpu() * torch.randn(weight.shape, generator=generator)
                 for name, weight in curvature.weights.items()
             }
-            probe = curvature.adjoint(
-                {n: each.to(curvature.images[n]) for n, each in random.items()}
-            )
+            random = {name: noise.to(curvature.images[name]) for name, noise in random.items()}
+            probe = curvature.adjoint(random)
             total = total.to(probe) + probe.square() / PROBES
         return curvature.split(total)
 

@@ -21,18 +21,17 @@ from ddrecon.variables.kinds import kind_of
 
 RECORD = "uncertainty.json"
 ASSUMED = (
-    "Deviations are those of experiments: what was found was photographed, by more transport rounds"
-    " than the run had, with the errors that its pictures had, and reconstructed by the same"
-    f" settings. They are taken {SHORT} times, which is what experiments lacked where the truth was"
-    " known. What no experiment changes (cameras, lights and optics that were given) is taken for"
-    " true."
+    "Deviations come from experiments: the reconstruction was photographed, with more transport"
+    " rounds than the run had and the errors of its pictures, and reconstructed by the same"
+    f" settings. They are scaled by {SHORT}, the ratio of true to simulated errors on four volumes"
+    " of known truth. Cameras, lights and optics that were not optimized are taken for true."
 )
 CAVEAT = (
     "Not calibrated (--calibrate 0): deviations know noise alone, and are several times too small."
 )
 
 
-def write_found(
+def write_deviations(
     deviations: Deviations,
     views: Sequence[Mapping[str, Any]],
     samples: int,
@@ -43,29 +42,29 @@ def write_found(
 
     `views` are those that may come next.
     """
-    found, fields = deviations.found, deviations.fields
+    experiments, fields = deviations.experiments, deviations.fields
     for name, field in fields.items():
         stated = {"std": field.deviation, "mean": field.value}
-        if found.count:
+        if experiments.count:
             stated["explained"] = field.explained
         for kind, values in stated.items():
             _write(field, path / "volumes" / f"{name}_{kind}", name, values)
     for number in range(samples):
         folder = path / "samples" / f"{number:04d}"
         folder.mkdir(parents=True, exist_ok=True)
-        changes = found.curvature.split(deviations.draw(number))
+        changes = experiments.curvature.split(deviations.draw(number))
         for name, field in fields.items():
             p, sample = field.parameter, field.value + changes[name].cpu()
             _write(field, folder / name, name, sample.clamp(p.low, p.high))
     record = {
-        "experiments": found.count,
+        "experiments": experiments.count,
         "seconds": seconds,
-        "iterations": found.iteration,
+        "iterations": experiments.iteration,
         "noise": {
-            "deviation": found.deviation,
-            "from": "the scene" if found.is_noise_known else "residuals",
+            "deviation": experiments.deviation,
+            "from": "the scene" if experiments.is_noise_known else "residuals",
         },
-        "assumed": ASSUMED if found.count else CAVEAT,
+        "assumed": ASSUMED if experiments.count else CAVEAT,
         "fields": {name: field.describe() for name, field in fields.items()},
         "numbers": deviations.numbers(),
         "next_views": list(views),
@@ -95,7 +94,10 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
         *(
             line
             for name, field in record["fields"].items()
-            for line in (f"{name}: {_about(field)}", *(f"  {each}" for each in _classes(field)))
+            for line in (
+                f"{name}: {_about(field)}",
+                *(f"  {text}" for text in _classes(field)),
+            )
         ),
         *(f"{name}: {_number(number)}" for name, number in record["numbers"].items()),
         *(
@@ -108,31 +110,33 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
 
 
 def _about(field: Mapping[str, Any]) -> str:
-    deviation, of, part = (field[n] for n in ("deviation", "root_mean_square", "explained"))
+    deviation, of, explained = (field[n] for n in ("deviation", "root_mean_square", "explained"))
     size = f"deviation {deviation:.3g} of {of:.3g} (root mean squares over the smoke)"
-    if part is None:
+    if explained is None:
         return f"{size} by noise alone, which is several times too small"
-    return f"{size}; pictures explain {100 * part:.0f} % of the variance"
+    return f"{size}; pictures explain {100 * explained:.0f} % of the variance"
 
 
 def _classes(field: Mapping[str, Any]) -> list[str]:
     """A line for each class of the cells of a `field`: how many, and how often experiments held."""
     lines = []
     for name, of in field["classes"].items():
-        what = ", where pictures tell nothing" if name == "unseen" else ""
-        line = f"{name}{what}: {100 * of['share']:.0f} % of the smoke"
+        remark = ", where pictures tell nothing" if name == "unseen" else ""
+        line = f"{name}{remark}: {100 * of['share']:.0f} % of the smoke"
         if "within_1" in of:
-            each, (one, two) = of["factors"], (100 * of[f"within_{k}"] for k in (1, 2))
-            line += f"; errors around times {of['factor']:.2f} ({min(each):.2f} to {max(each):.2f})"
-            line += f"; in experiments {one:.0f} % lay within one deviation, {two:.0f} % within two"
+            low, high = min(of["factors"]), max(of["factors"])
+            shares = [100 * of[f"within_{k}"] for k in (1, 2)]
+            line += f"; a deviation is {of['factor']:.2f} ({low:.2f} to {high:.2f}) errors around"
+            line += "; in experiments {:.0f} % of errors lay within one, {:.0f} % within two"
+            line = line.format(*shares)
         lines.append(line)
     return lines
 
 
 def _number(number: Mapping[str, float | None]) -> str:
     deviation = number["deviation"]
-    known = "unknown without experiments" if deviation is None else f"{deviation:.2g}"
-    return f"{number['value']:.5g} +- {known}"
+    spread = "unknown without experiments" if deviation is None else f"{deviation:.2g}"
+    return f"{number['value']:.5g} +- {spread}"
 
 
 def _describe_angle(view: Mapping[str, Any], place: int) -> str:
@@ -154,8 +158,8 @@ def write_uncertainty_report(
         sections.append(section("Numbers", *_bars(record["numbers"]), table(["", ""], rows)))
     if record["next_views"]:
         rows = [
-            (each["name"], _describe_angle(each, at))
-            for at, each in enumerate(record["next_views"])
+            (view["name"], _describe_angle(view, at))
+            for at, view in enumerate(record["next_views"])
         ]
         sections.append(section("Next picture", table(["picture", ""], rows)))
     sections.append(section("How", paragraph(record["assumed"])))
@@ -177,7 +181,7 @@ def _field(name: str, field: Field, described: Mapping[str, Any]) -> list[str]:
         pictures.append((slices(field.explained, 1.0), caption))
     if field.parameter.is_field and field.errors:
         size, off = (
-            each.reshape(-1, *each.shape[-3:]).abs().mean(0) for each in (value, deviation)
+            volume.reshape(-1, *volume.shape[-3:]).abs().mean(0) for volume in (value, deviation)
         )
         seen = see_through(size, off / size.clamp(min=1e-3 * float(size.max())))
         caption = "opaque by what was found; blue is sure, white off by half, red by all of it"

@@ -5,9 +5,8 @@ all of them at once.
 
 Where the scene's density is the same everywhere, and above all where it is empty, the check is made
 at a random density, half of whose cells are empty: an empty volume would hide all but density from
-the camera. Directions of lights are turned a little at random: light along a lattice direction
-meets cell centers exactly, where the slope of interpolation is a mean of two sides and differences
-converge slowly.
+the camera. What moves rays or beams is moved a little at random: along the axes of the lattice they
+meet centers of cells, where interpolation has a slope to each side, and differences a mean of both.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from ddrecon.losses import Target
 from ddrecon.progress import Progress
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene
-from ddrecon.variables.kinds import kind_of
+from ddrecon.variables.kinds import SHORT_STEPS, is_of_volume, kind_of
 from ddrecon.variables.values import (
     component_names,
     density_names,
@@ -252,8 +251,6 @@ def _difference(loss: Loss, values: Values, direction: Values, step: float) -> t
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
-NUDGE = 1e-2
-"""The most that a component of a light's direction is changed by, as a part of the largest."""
 
 
 def starting_point(
@@ -261,6 +258,7 @@ def starting_point(
 ) -> dict[str, Tensor]:
     """The value of each optimized parameter, of each of `names`, and of density.
 
+    What moves rays or beams is changed by a random part of the variable's rate.
     Density is the scene's own; where that is the same everywhere, what it starts from; where that
     is, too, random numbers of which half are empty.
     """
@@ -277,10 +275,10 @@ def starting_point(
             if bool((density != density.flatten()[0]).any())
         )
     for name, value in point.items():
-        if kind_of(name).is_direction:
-            point[name] = value + NUDGE * value.abs().max() * (
-                2 * random_like(value, generator) - 1
-            )
+        kind = kind_of(name)
+        if kind.difference_steps == SHORT_STEPS and not is_of_volume(name):
+            step = kind.rate(scene, name, value)
+            point[name] = value + step * random_like(value, generator)
     return point
 
 

@@ -24,6 +24,7 @@ from ddrecon.diffusion.operator import AXES, boundary_loss, face_fluxes
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.light.moments import cut, flux_along_axes, mean_and_first
 from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -56,7 +57,7 @@ def layer(shape: Shape) -> Tensor:
 
 @dataclass(frozen=True)
 class HardCase:
-    """A scene in words: a medium in a box about the origin, a beam, and a camera of 16 x 16 pixels.
+    """A scene in words: a medium in a box about the origin, a sun, and a camera.
 
     The box has `shape` cells and `sides` [u].
 
@@ -76,6 +77,7 @@ class HardCase:
     target: Triple = (0.0, 0.0, 0.0)
     half_width: float = 0.35
     is_perspective: bool = True
+    pixels: int = 16
 
     def scene(self, dtype: torch.dtype, device: torch.device) -> Scene:
         """The scene in `dtype` on `device`, to be solved as closely as `TOLERANCE` says."""
@@ -97,7 +99,8 @@ class HardCase:
         if self.ambient:
             lights.append(AmbientLight(tensor([self.ambient])))
         pose = look_at(tensor(self.eye), tensor(self.target), tensor((0.0, 1.0, 0.0)))
-        views = [View("view", Camera(pose, (16, 16), self.half_width, self.is_perspective))]
+        size = self.pixels, self.pixels
+        views = [View("view", Camera(pose, size, self.half_width, self.is_perspective))]
         diffusion = DiffusionSettings(
             tolerance=TOLERANCE[dtype], transport_rounds=1, degree=3, refine=1
         )
@@ -309,7 +312,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     problem = DiffusionProblem(
         medium,
         Closure(settings.closure, grid, settings.floor),
-        receive_light(medium, lights, medium.degree).source,
+        cut(receive_light(medium, lights, medium.degree).source)[0],
         ambient_radiance(lights, solution),
         medium.degree > 0,
     )
@@ -318,7 +321,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
         return Balance()
     # What Q1 takes out of one cell it brings to the next, so it is no part of what is injected.
     escape = boundary_loss(problem.diffusion, grid)
-    injected = medium.remaining_scattering * problem.source.mean + escape * problem.outside
+    injected = medium.remaining_scattering * problem.source[0] + escape * problem.outside
     total = injected.double().sum()
     absorbed = (medium.absorption.value.double() * solution.double()).sum()
     energy = float((total - (absorbed + _leak(problem, solution))).abs() / total)
@@ -334,7 +337,9 @@ def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
     """What flows out through the faces of the box (E2.6), as for dark surroundings."""
     grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
     leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
-    for axis, flux in zip(AXES, problem.source.flux or (None,) * 3, strict=True):
+    _, first = mean_and_first(problem.source)
+    fluxes = [None] * 3 if first is None else flux_along_axes(first)
+    for axis, flux in zip(AXES, fluxes, strict=True):
         scattered = None if flux is None else scattering * flux
         faces = face_fluxes(solution, scattered, problem.diffusion, grid, axis).double()
         outflow = (faces.select(axis, -1) - faces.select(axis, 0)).sum()

@@ -8,30 +8,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from numbers import Integral
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, twist
+from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.settings import LENSES
+from ddrecon.variables.forms import require_form, shapes_in_place
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
     RESPONSE,
-    STEEPEST_G,
-    XYZ,
     is_of_volume,
     kind_of,
     split_name,
@@ -39,8 +35,6 @@ from ddrecon.variables.kinds import (
 
 EVERY = "views.*."
 """How names for all training views at once begin: `views.*.exposure`."""
-RIGID = 0.01
-"""How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
 Settings = TypeVar("Settings")
 
 
@@ -53,18 +47,18 @@ def variable_names(scene: Scene) -> list[str]:
     ]
     views = [f"views.{view.name}.{part}" for view in scene.views for part in _view_parts(view)]
     ground = [] if scene.ground is None else ["ground.albedo"]
-    return [*_volume_names(scene.volume), *lights, *ground, *views]
+    return [*volume_names(scene.volume), *lights, *ground, *views]
 
 
 def density_names(scene: Scene) -> list[str]:
     """The names of the density of `scene`, or of those of its two media."""
-    return [name for name in _volume_names(scene.volume) if split_name(name)[1] == "density"]
+    return [name for name in volume_names(scene.volume) if split_name(name)[1] == "density"]
 
 
 def fields_of(scene: Scene) -> dict[str, Tensor]:
     """The variables that differ from cell to cell, [z, y, x] or of colors [C, z, y, x], by name."""
-    names = [name for name in _volume_names(scene.volume) if kind_of(name).is_cellwise]
-    values = {name: _volume_value(scene.volume, name) for name in names}
+    names = [name for name in volume_names(scene.volume) if kind_of(name).is_cellwise]
+    values = {name: volume_value(scene.volume, name) for name in names}
     return {name: value for name, value in values.items() if value.ndim >= 3}
 
 
@@ -79,7 +73,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         raise _unknown(scene, name)
     if is_of_volume(known):
-        return _volume_value(scene.volume, known)
+        return volume_value(scene.volume, known)
     if known == "ground.albedo":
         assert scene.ground is not None
         return scene.ground.albedo
@@ -121,116 +115,6 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     return replace(scene, volume=volume, lights=lights, views=views, ground=ground)
 
 
-def require_scene(scene: object) -> None:
-    """Raises UsageError unless `scene` is one."""
-    if not isinstance(scene, Scene):
-        kind = type(scene).__name__
-        raise UsageError(f"expected a Scene, found {kind}; ddrecon.load_scene(path) reads one")
-
-
-def require_legal(scene: Scene, view: str | None = None, *, waits: bool = False) -> None:
-    """Raises UsageError where a number of `scene` is none that a scene file may have.
-
-    That is one of its volume, its lights or its views (of the one named `view`, or all) of a wrong
-    shape, precision or device, one that is not finite, or out of range, such as a density below 0.
-    Of those on a GPU it looks at the range only if it `waits` for it.
-    """
-    cells, density = scene.volume.grid.shape, scene.volume.density
-    if isinstance(density, Tensor) and density.is_meta:
-        raise UsageError("density: has no numbers on the device meta")
-    numbers = {
-        name: _volume_value(scene.volume, name)
-        for name in _volume_names(scene.volume)
-        if split_name(name)[1] not in EXTINCTION_AND_ALBEDO
-    }
-    for index, light in enumerate(scene.lights):
-        numbers |= {
-            f"lights.{index}.{field.name}": getattr(light, field.name)
-            for field in fields(light)
-            if field.type == "Tensor"
-        }
-    if scene.ground is not None:
-        numbers["ground.albedo"] = scene.ground.albedo
-        if not math.isfinite(height := scene.ground.plane.height):
-            raise UsageError(f"ground.height: must be finite, found {height:g}")
-    for item in scene.views if view is None else [scene.view(view)]:
-        numbers |= _view_numbers(item, waits)
-    for name, value in numbers.items():
-        require_form(name, value, value, density, cells)
-        if waits or value.is_cpu:
-            require_range(name, value)
-
-
-def _view_numbers(view: View, waits: bool) -> dict[str, Tensor]:
-    """What is varied of `view`, by name; raises UsageError where the rest of it is none."""
-    owner, camera, behind = f"views.{view.name}.", view.camera, view.background
-    pose, half = camera.pose, torch.as_tensor(camera.half_width).detach()
-    if not isinstance(pose, Tensor) or pose.shape != (3, 4):
-        raise UsageError(f"{owner}camera: expected a pose [3, 4], found {_shape_of(pose)}")
-    if len(camera.size) != 2 or not all(isinstance(n, Integral) and n > 0 for n in camera.size):
-        raise UsageError(f"{owner}camera: expected a size (height, width), found {camera.size}")
-    if (waits or half.is_cpu) and not 0 < float(half) < math.inf:
-        what = "half_width, 1 / (2 focal), must be above 0 and finite"
-        raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
-    if (waits or pose.is_cpu) and not _is_rigid(pose.detach()):
-        what = "the first three columns of its pose must be of unit length and perpendicular"
-        raise UsageError(f"{owner}camera: {what}, and not mirror")
-    if not 0 < camera.pixel_aspect < math.inf:
-        what = f"pixel_aspect must be above 0 and finite, found {camera.pixel_aspect:g}"
-        raise UsageError(f"{owner}camera: {what}")
-    if camera.lens is not None or camera.distortion is not None:
-        _require_lens(f"{owner}distortion", camera)
-    if not 0 < view.weight < math.inf:
-        raise UsageError(f"{owner}weight: must be above 0 and finite, found {view.weight:g}")
-    if behind is not None:
-        _require_background(f"{owner}background", behind, camera.size, waits)
-    middle = camera.principal_point
-    if not isinstance(middle, Tensor) and (len(middle) != 2 or not all(map(math.isfinite, middle))):
-        what = "must be two finite numbers"
-        raise UsageError(f"{owner}principal_point: {what}, found {middle}")
-    parts = {part: getattr(view, part) for part in RESPONSE}
-    parts |= {"camera": pose, "distortion": camera.distortion}
-    parts["principal_point"] = middle if isinstance(middle, Tensor) else None
-    return {owner + part: value for part, value in parts.items() if value is not None}
-
-
-def _is_rigid(pose: Tensor) -> bool:
-    """Whether `pose` turns and shifts; NaN is for others to tell."""
-    axes = pose[:, :3]
-    off = (axes.T @ axes - torch.eye(3).to(pose)).abs().max()
-    return not (float(off) > RIGID or float(axes.det()) < 0)
-
-
-def _require_lens(name: str, camera: Camera) -> None:
-    """Raises UsageError unless the lens of `camera` is known, with as many coefficients."""
-    if camera.lens not in LENSES:
-        raise UsageError(f"{name}: expected a lens among {', '.join(LENSES)}, found {camera.lens}")
-    count = len(LENSES[camera.lens])
-    if _shape_of(camera.distortion) != str([count]):
-        found = _shape_of(camera.distortion)
-        raise UsageError(f"{name}: lens {camera.lens} takes [{count}], found {found}")
-
-
-def _require_background(name: str, behind: Tensor, size: tuple[int, int], waits: bool) -> None:
-    """Raises UsageError unless `behind` can be what is behind a picture of this `size`."""
-    if not isinstance(behind, Tensor) or tuple(behind.shape) not in (
-        (colors, *tail) for colors in (1, 3) for tail in ((1, 1), tuple(size))
-    ):
-        what = f"expected a tensor [C, 1, 1] or [C, {size[0]}, {size[1]}]"
-        raise UsageError(f"{name}: {what}, found {_shape_of(behind)}")
-    if (waits or behind.is_cpu) and not bool(behind.isfinite().all()):
-        raise UsageError(f"{name}: must be finite")
-
-
-def _shape_of(value: object) -> str:
-    return str(list(value.shape)) if isinstance(value, Tensor) else type(value).__name__
-
-
-def is_real(value: object) -> bool:
-    """Whether `value` is a tensor of real numbers, each in its place."""
-    return isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex()
-
-
 def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict[str, Settings]:
     """`parameters` with each name of all training views replaced by those of each of `views`.
 
@@ -248,65 +132,11 @@ def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict
     return named
 
 
-def require_form(
-    name: str, value: Tensor, now: Tensor, like: Tensor, cells: tuple[int, ...]
-) -> None:
-    """Raises UsageError unless `value` can be the variable `name`, which is `now`, on `cells`.
-
-    Its precision and device are to be those of `like`. Nothing is read from a GPU.
-    """
-    if not isinstance(value, Tensor):
-        raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
-    if not is_real(value):
-        raise UsageError(f"{name}: is {value.dtype}, {value.layout}; expected real and strided")
-    if (value.dtype, value.device) != (like.dtype, like.device):
-        raise UsageError(
-            f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
-            f"{like.device}; convert it by .to(...)"
-        )
-    shapes = _shapes(name, tuple(now.shape), cells)
-    if tuple(value.shape) not in shapes:
-        expected = " or ".join(str(list(shape)) for shape in shapes)
-        raise UsageError(f"{name}: has shape {list(value.shape)}; expected {expected}")
-
-
-def require_range(name: str, value: Tensor) -> None:
-    """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
-    kind = kind_of(name)
-    least, most = (float(end) for end in value.detach().aminmax())
-    found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
-    if not math.isfinite(least + most):
-        raise UsageError(f"{name}: must be finite, {found}")
-    if kind.high == STEEPEST_G and not -1 < least <= most < 1:
-        # A scene may scatter further forward than a run makes it.
-        raise UsageError(f"{name}: must be above -1 and below 1, {found}")
-    if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
-        bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
-        raise UsageError(f"{name}: must be {bounds}, {found}")
-    if kind.is_direction and least == most == 0:
-        raise UsageError(f"{name}: must not be zero")
-
-
 def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
     """Those that the variable `name` of `scene` may have; raises as `value_of`."""
     is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
     now = () if is_pair else tuple(value_of(scene, name).shape)
-    return _shapes(_own_name(scene.volume, name), now, scene.volume.grid.shape)
-
-
-def _shapes(name: str, now: tuple[int, ...], cells: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """Those that the variable `name` may have in place of the one it has `now`."""
-    kind, last = kind_of(name), split_name(name)[1]
-    if last == "density":
-        return [cells]
-    if last.startswith(PHASE):
-        return [now, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
-    if kind.is_color:
-        tails = [(), cells] if kind.is_cellwise else [now[1:]]
-        return [(color, *tail) for tail in tails for color in (1, 3)]
-    if kind.is_cellwise:
-        return [(), cells, (1, *cells)]
-    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [now]
+    return shapes_in_place(_own_name(scene.volume, name), now, scene.volume.grid.shape)
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
@@ -356,13 +186,13 @@ def _tensors(light: Light) -> list[str]:
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
-def _volume_names(volume: Volume) -> list[str]:
+def volume_names(volume: Volume) -> list[str]:
     """The variables of `volume`: its phase function has its own numbers, or g alone."""
     if volume.media is not None:
         return [
             f"media.{medium}.{name}"
             for medium, part in volume.media.items()
-            for name in _volume_names(part)
+            for name in volume_names(part)
         ]
     known = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
     known += ["emission"] if volume.emission is not None else []
@@ -380,10 +210,10 @@ def _own_name(volume: Volume, name: str) -> str:
     return f"{medium}g" if isinstance(part.phase, HenyeyGreenstein) else name
 
 
-def _volume_value(volume: Volume, name: str) -> Tensor:
+def volume_value(volume: Volume, name: str) -> Tensor:
     if volume.media is not None:
         _, medium, rest = name.split(".", 2)
-        return _volume_value(volume.media[medium], rest)
+        return volume_value(volume.media[medium], rest)
     if name.startswith(PHASE):
         return volume.phase.variables[name.removeprefix(PHASE)]
     if name not in EXTINCTION_AND_ALBEDO:
@@ -409,12 +239,12 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if isinstance(density, Tensor) and density.ndim == 0:
         values = {**values, "density": density.expand(cells)}
     for name, value in values.items():
-        now = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else _volume_value(volume, name)
+        now = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else volume_value(volume, name)
         require_form(name, value, now, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
         sigma_t, albedo = (
-            values[name] if name in values else _volume_value(volume, name)
+            values[name] if name in values else volume_value(volume, name)
             for name in EXTINCTION_AND_ALBEDO
         )
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ import pytest
 from click.testing import Result
 from media import half_empty, make_scene
 
-from ddrecon import engine, terms
+from ddrecon import engine
 from ddrecon.cli import check
 from ddrecon.cli.session import Session
-from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.scene import Scene
+from ddrecon.terms import engine_of_scene
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -35,7 +36,7 @@ def test_a_run_records_its_engine(succeed: Run) -> None:
     succeed("optimize", "scene.yaml", "-o", "out", "-q", "--engine", "torch", "--iterations", "1")
     environment = json.loads(Path("out/environment.json").read_text())
     assert environment["engine"] == "torch" and "warp-lang" not in environment
-    assert environment["engines"] == dict.fromkeys(engine.PARTS, "torch")
+    assert environment["engines"] == dict.fromkeys(engine.TORCH_ALONE, "torch")
     assert "<td>engine</td><td>torch</td>" in Path("out/report.html").read_text()
 
 
@@ -62,32 +63,30 @@ WARP = "engine: warp (view rays, light, diffusion, transport rounds)"
 def test_check_names_it(succeed: Run, name: str, line: str) -> None:
     assert line in succeed("check", "scene.yaml", "--engine", name).stdout.splitlines()
     report = json.loads(succeed("check", "scene.yaml", "--engine", name, "--json").stdout)
-    assert report["engine"] == dict.fromkeys(engine.PARTS, "torch" if name == "torch" else "warp")
+    assert report["engine"] == dict.fromkeys(
+        engine.TORCH_ALONE, "torch" if name == "torch" else "warp"
+    )
 
 
-DENSITY = half_empty(3, 4, 5)
-PLACE, POWER = DENSITY.new_tensor([0.9, 0.7, 0.2]), DENSITY.new_tensor([1.0])
-LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
-    ({"transport_rounds": 1}, [], False, ()),
-    ({"transport_rounds": 1}, [], True, ("diffusion", "transport rounds")),
-    ({"model": "flux_limited"}, [PointLight(PLACE, POWER)], False, ("diffusion", "point lights")),
-    ({"scheme": "printed"}, [], False, ("diffusion",)),
-    ({"g": -0.6, "degree": 3, "transport_rounds": 2}, [], False, ("pairs of beams",)),
-    ({"g": -0.6, "degree": 3, "transport_rounds": 2, "directional": None}, [], False, ()),
-    ({"g": 0.4, "ambient": (0.3,), "model": "none"}, [], False, ("skies towards cameras",)),
-]
-"""Scenes, more lights, whether on a GPU, and what of them torch runs."""
+@pytest.mark.parametrize(
+    ("settings", "parts"),
+    [
+        ({"transport_rounds": 1}, set()),
+        ({"model": "flux_limited"}, {"diffusion"}),
+        ({"scheme": "printed"}, {"diffusion"}),
+    ],
+)
+def test_what_torch_runs_depends_on_the_scene(settings: dict[str, Any], parts: set[str]) -> None:
+    scene = make_scene(half_empty(3, 4, 5), **settings)
+    assert torch_parts(scene) == parts
+    repeated = replace(scene.volume, grid=replace(scene.volume.grid, periodic=(0,)))
+    assert torch_parts(replace(scene, volume=repeated)) == parts | {"transport rounds"}
+    refracting = replace(scene, volume=replace(scene.volume, index=1.4))
+    assert torch_parts(refracting) == parts | {"transport rounds"}
 
 
-@pytest.mark.parametrize(("settings", "lights", "is_on_gpu", "parts"), LEFT)
-def test_what_is_left_to_torch_depends_on_scene_and_device(
-    settings: dict[str, Any], lights: list[Any], is_on_gpu: bool, parts: tuple[str, ...]
-) -> None:
-    scene = make_scene(DENSITY, **settings)
-    scene.lights += lights
-    assert terms.parts_in_torch(scene, is_on_gpu) == parts
-    scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
-    assert "phases by cell" in terms.parts_in_torch(scene, is_on_gpu)
+def torch_parts(scene: Scene) -> set[str]:
+    return {part for part, run_by in engine_of_scene(scene).items() if run_by == "torch"}
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

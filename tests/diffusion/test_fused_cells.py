@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.engine import use_engine
-from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -47,20 +46,20 @@ def make_problem(
 ) -> tuple[DiffusionProblem, list[Tensor]]:
     """A problem in `medium` with a random source, and the leaves of that."""
     shape = medium.grid.shape
-    mean, *flux = (
-        random_values(*shape, colors, seed=s, dtype=dtype).movedim(-1, 0) for s in range(11, 15)
-    )
+    count = 4 if is_directed else 1
+    source = random_values(count, *shape, colors, seed=11, dtype=dtype).movedim(-1, 1)
     outside = random_values(colors, 1, 1, 1, seed=3, dtype=dtype)
-    leaves = [outside, mean, *(flux if is_directed else [])]
+    leaves = [outside, source]
     for leaf in leaves:
         leaf.requires_grad_()
-    source = Moments(mean, (flux[0], flux[1], flux[2]) if is_directed else None)
     return DiffusionProblem(medium, lambda k: 1 / (3 * k + 0.5), source, outside, True), leaves
 
 
 def bar_of(result: Tensor, seed: int) -> Tensor:
     """A random cotangent of `result`, as a view of what has its colors last."""
-    return random_values(*result.shape[1:], len(result), seed=seed).to(result).movedim(-1, 0)
+    colors = result.shape[-4]
+    shape = *result.shape[:-4], *result.shape[-3:], colors
+    return random_values(*shape, seed=seed).to(result).movedim(-1, -4)
 
 
 def weigh(results: list[Tensor], leaves: list[Tensor]) -> Found:
@@ -80,11 +79,10 @@ def problem_of(
     mean = random_values(*right.shape, seed=5, dtype=dtype).requires_grad_()
     flux = problem.flux(mean)
     assert flux is not None
-    z, y, x = flux
-    off = problem.flux(mean, more=(y, x, z), begun=(x, z, y), sign=-1)
+    off = problem.flux(mean, more=flux.roll(1, 0), begun=flux.roll(2, 0), sign=-1)
     assert off is not None
     side = problem.right_side(mean, flux)
-    results = [*operator.conductances, operator.loss, right, *flux, *off, side]
+    results = [*operator.conductances, operator.loss, right, flux, off, side]
     return weigh(results, [*leaves, *more, mean])
 
 
@@ -113,7 +111,9 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     system = RowFunction(
         faces.HEADER, "Flow<SYSTEM, 1, 0, 1>", ((),) * 5, 1, faces.PLACE, faces.GIVEN
     )
-    flux = RowFunction(faces.HEADER, "Flow<FLUX, 2, 3, 0>", ((),) * 3, 1, faces.PLACE, faces.GIVEN)
+    flux = RowFunction(
+        faces.HEADER, "Flow<FLUX, 2, 3, 0>", ((3, 1, 1, 1, 1),), 1, faces.PLACE, faces.GIVEN
+    )
     kernels = [
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),

@@ -9,7 +9,7 @@ from media import box_grid, make_operator, make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.renderer import solve_light, view_components

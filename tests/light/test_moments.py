@@ -4,7 +4,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.light.moments import MARGIN, Moments
+from ddrecon.light.moments import (
+    MARGIN,
+    add,
+    beam_moments,
+    fill,
+    flux_along_axes,
+    moments_of_flux,
+    radiance_along,
+    weigh,
+)
+from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.quadrature import sphere_quadrature
 
 DTYPES = [torch.float32, torch.float64]
 
@@ -13,7 +24,8 @@ def along_z(mean: Tensor, flux: Tensor) -> Tensor:
     """What `mean` and `flux` along z send along z."""
     nothing = torch.zeros_like(flux)
     one = torch.ones((), dtype=mean.dtype)
-    return Moments(mean, (flux, nothing, nothing)).positive_along((one, one, one))
+    phi = torch.cat([mean[None], moments_of_flux((flux, nothing, nothing))])
+    return radiance_along(phi, (one, one * 0, one * 0))
 
 
 def fluxes(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -22,7 +34,7 @@ def fluxes(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
 
 def test_radiance_above_its_margin_is_left_as_it_is():
     flux = fluxes(-0.97, -0.5, 0.0, 0.5, 3.0)
-    assert torch.equal(along_z(torch.ones_like(flux), flux), 1 + flux)
+    torch.testing.assert_close(along_z(torch.ones_like(flux), flux), 1 + flux, rtol=1e-14, atol=0)
 
 
 def test_radiance_far_below_zero_is_zero():
@@ -32,7 +44,7 @@ def test_radiance_far_below_zero_is_zero():
 def test_without_a_flux_only_what_is_below_zero_is_changed():
     """At zero itself, as in empty space, derivatives pass."""
     mean = fluxes(-1.0, 0.0, 2.0).requires_grad_()
-    held = Moments(mean).positive_along((torch.ones(()),) * 3)
+    held = radiance_along(mean[None], (torch.ones(()),) * 3)
     assert held.flatten().tolist() == [0.0, 0.0, 2.0]
     assert torch.autograd.grad(held.sum(), mean)[0].flatten().tolist() == [0.0, 1.0, 1.0]
 
@@ -77,22 +89,37 @@ def test_both_modes_agree_with_differences_within_the_bend():
     assert torch.autograd.gradcheck(along_z, (mean, flux), **how)
 
 
-def test_higher_moments_of_one_color_are_those_of_all():
-    """As of a white beam in colored ambient light."""
-    color = torch.ones(3, 1, 2, 1)
-    light = Moments(color, (color,) * 3, torch.ones(12, 1, 1, 2, 1))
-    assert light.harmonics(3)[4:].equal(torch.ones(12, 3, 1, 2, 1))
+def test_moments_are_the_integrals_over_the_sphere():
+    """phi_k is the mean of Y_k L, and L1 three times that of L times its direction."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), 86)
+    radiance = torch.exp(points @ points.new_tensor([0.3, -0.2, 0.5]))
+    phi = (harmonics(points, 3) * weights * radiance).sum(1).view(-1, 1, 1, 1, 1)
+    flux = 3 * (weights * radiance) @ points
+    assert phi[0].item() == pytest.approx(float(weights @ radiance), rel=1e-13)
+    found = torch.stack(flux_along_axes(phi[1:4]))
+    torch.testing.assert_close(found.flatten(), flux, rtol=1e-13, atol=0)
+    torch.testing.assert_close(moments_of_flux(found), phi[1:4], rtol=1e-13, atol=0)
 
 
-def test_a_part_of_the_way_to_other_light_is_linear_in_that_part():
-    """By all moments; higher ones that light lacks are zero."""
+def test_light_of_a_beam_is_sharpest_along_it():
+    """Of degree L it is (L + 1)^2 times its mean there, by the addition theorem."""
+    way = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
+    mean = fluxes(0.7, 1.3)
+    for degree in (0, 1, 3, 5):
+        phi = beam_moments(mean, way, degree)
+        cells = beam_moments(mean, way.expand(1, 1, 2, 3), degree)
+        torch.testing.assert_close(cells, phi, rtol=1e-14, atol=1e-15)
+        along = radiance_along(phi, way.view(3, 1, 1, 1).unbind())
+        torch.testing.assert_close(along, (degree + 1) ** 2 * mean, rtol=1e-13, atol=0)
+
+
+def test_sums_and_weights_are_those_of_radiance():
+    """Of light that is known to different degrees and in different colors, along any direction."""
     fields = torch.arange(72, dtype=torch.float64).view(2, 9, 1, 1, 2, 2).sin()
-    one, other = (Moments.of_harmonics(each) for each in fields)
-    part = torch.tensor(1.7, dtype=torch.float64, requires_grad=True)
-    for start in (one, Moments(one.mean, one.flux)):
-        begin = start.harmonics(2)
-        way = other.harmonics(2) - begin
-        found = start.toward(other, part).harmonics(2)
-        torch.testing.assert_close(found, begin + 1.7 * way, rtol=1e-14, atol=1e-14)
-        (slope,) = torch.autograd.grad(found.sum(), part)
-        torch.testing.assert_close(slope, way.sum(), rtol=1e-13, atol=1e-13)
+    few, many = fields[0, :4] + fields.new_tensor([2.0, 3.0]).view(2, 1, 1, 1), 9 + fields[1]
+    total = add(few, many)
+    assert total.shape == (9, 2, 1, 2, 2)
+    assert total.equal(fill(few, 2) + many) and total.equal(add(many, few))
+    factors = torch.tensor([1.0, 0.5, 0.2], dtype=torch.float64).view(3, 1, 1, 1, 1)
+    assert weigh(many, factors)[[0, 2, 7]].equal(many[[0, 2, 7]] * factors)
+    assert weigh(few, factors).equal(fill(few, 2)[:4] * factors[[0, 1, 1, 1]])

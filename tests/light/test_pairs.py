@@ -62,7 +62,7 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     beams = 4 * math.pi * (pair.along + pair.against)
     volume = medium.grid.extent[0] / 9
     received = (medium.absorption.value * beams).sum() * volume
-    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium).mean).sum()
+    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium)[0]).sum()
     # what leaves, by the closed form of E8.11 for all the depth
     beta = float(backward_fraction(medium)) * 6.0 / 6.5
     rate, depth = math.sqrt(1 - beta**2), 6.5 * float(density.mean())

@@ -10,7 +10,6 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
-from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission, Inflow
@@ -105,7 +104,7 @@ def test_extended_fields_have_both_derivatives(axis: int | None):
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
         emission = emission_of(diffuse, *masses)
-        coming = Inflow(0.2 * depth, Moments(rest[5], (rest[5],) * 3), 0.9 * depth, backward)
+        coming = Inflow(0.2 * depth, rest[5].expand(4, -1, -1, -1, -1), 0.9 * depth, backward)
         matter = replace(emission.extinction, scale=depth)
         emission = replace(emission, extinction=matter, scattering=matter, inflow=coming)
         beam, point = emission.beams

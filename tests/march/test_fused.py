@@ -196,7 +196,7 @@ def test_packets_read_and_write_whole_rows(
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
 def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
-    """There slopes are the mean of both sides; from all sides, by packets of rows or columns."""
+    """There slopes are those beyond centers; from all sides, by packets of rows or columns."""
     camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=False)
     if eye[1]:
         camera = make_camera(size=(9, 7), half_width=0.3, eye=eye)

@@ -1,4 +1,4 @@
-"""Products with J^T W J against the matrix itself, column by column; stiffness of smoothing."""
+"""Products with J^T W J against the matrix itself, column by column."""
 
 from dataclasses import replace
 
@@ -7,9 +7,8 @@ import torch
 from media import data_product, half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.losses import LOSSES, Target, compress, total_variation
+from ddrecon.losses import LOSSES, Target
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import stiffness_diagonal
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import ParameterSettings
@@ -84,49 +83,6 @@ def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it
         other = target.image + part * (image.detach() - target.image)
         parabola = (weights * ((other - target.image) ** 2 - (image - target.image) ** 2)).sum() / 2
         assert target.loss_of(other) <= target.loss_of(image) + parabola + 1e-12
-
-
-@pytest.mark.parametrize("periodic", [(), (0, 2)])
-def test_stiffness_is_of_a_parabola_that_touches_total_variation_from_above(
-    periodic: tuple[int, ...],
-) -> None:
-    """In each cell by itself."""
-    field = random_values(4, 3, 5)
-    grid = replace(make_scene(field).volume.grid, periodic=periodic)
-    stiffness = stiffness_diagonal(field, grid).flatten()
-    field.requires_grad_()
-    variation = total_variation(field, grid)
-    (slope,) = torch.autograd.grad(variation, field)
-    for cell in range(field.numel()):
-        for size in (-1.0, 0.3, 2.0):
-            step = torch.zeros_like(field).flatten()
-            step[cell] = size
-            parabola = variation + size * slope.flatten()[cell] + size**2 * stiffness[cell] / 2
-            assert total_variation(field + step.view_as(field), grid) <= parabola + 1e-12
-
-
-def test_smoothing_does_not_depend_on_where_a_period_begins() -> None:
-    field, shift = random_values(4, 3, 5), (1, 2)
-    grid = replace(make_scene(field).volume.grid, periodic=(0, 2))
-    moved = field.roll(shift, (0, 2))
-    torch.testing.assert_close(total_variation(moved, grid), total_variation(field, grid))
-    stiff = stiffness_diagonal(field, grid, 0.1)
-    torch.testing.assert_close(stiffness_diagonal(moved, grid, 0.1), stiff.roll(shift, (0, 2)))
-
-
-@pytest.mark.parametrize("density", [0.0, 0.05, 2.0])
-def test_stiffness_is_the_curvature_of_an_even_density(density: float) -> None:
-    field = torch.full((3, 4, 5), density, dtype=torch.float64)
-    grid, entries = make_scene(field).volume.grid, torch.eye(60).double().view(-1, 3, 4, 5)
-    # From an even field outward, so that the kink of densities below 0 is not met.
-    curved = [
-        torch.autograd.functional.hvp(
-            lambda x: total_variation(compress(x, 0.1), grid), field, entry
-        )[1]
-        for entry in entries
-    ]
-    diagonal = (torch.stack(curved) * entries).sum(0)
-    torch.testing.assert_close(stiffness_diagonal(field, grid, 0.1), diagonal)
 
 
 def test_products_are_those_of_a_symmetric_matrix() -> None:

@@ -58,10 +58,10 @@ def test_equal_colors_are_one_channel_and_give_the_same_image(write: Write):
     names = [*COLORS, "lights.3.radiance"]
     gray = {name: value_of(scene, name) for name in names}
     light = solve_light(scene, SolveMemory())
-    assert len(light.diffuse.mean) == 1 and all(gray[name].numel() == 1 for name in COLORS)
+    assert len(light.diffuse[0]) == 1 and all(gray[name].numel() == 1 for name in COLORS)
     three = {name: torch.cat([torch.atleast_1d(one)] * 3) for name, one in gray.items()}
     colored = with_values(scene, three)
-    assert len(solve_light(colored, SolveMemory()).diffuse.mean) == 3
+    assert len(solve_light(colored, SolveMemory()).diffuse[0]) == 3
     torch.testing.assert_close(render(scene), render(colored), rtol=1e-10, atol=0)
 
 

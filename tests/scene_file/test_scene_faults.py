@@ -55,7 +55,6 @@ volume.phase={{type: rayleigh}} => volume.phase: g is short for a phase function
 volume={{density: 1, sigma_t: {{meters: 1}}, albedo: 1}} => volume.sigma_t: meters are for droplets
 volume.effective_radius=1 => volume.effective_radius: is that of droplets, phase: {{type: mie, ...}}
 volume.phase={{type: two_lobes}} => did you mean 'two_lobe'?
-volume.phase={{type: blend}} => blend went: write two media, volume.media
 {MEDIA}{{cloud: {MEDIUM}}}}} => volume.media: expected two media, found 1
 {MEDIA}{{cloud: {MEDIUM}, the air: {MEDIUM}}}}} => volume.media: 'the air' is no name
 {MEDIA}{{cloud: {MEDIUM}, air: {{density: 1}}}}}} => volume.media.air: missing sigma_a and sigma_s
@@ -106,7 +105,6 @@ render.background=yes => render.background: expected true or false, found 'yes'
 render={{background: true, background: true}} => render.background: repeated key
 diffusion.model=p2 => diffusion.model: expected one of none, p1, flux_limited, found 'p2'
 diffusion={{model: flux_limited, scheme: printed}} => 'printed' is for diffusion.model p1
-diffusion.transport_directions=50 => directions follow from diffusion.transport_rounds and degree
 diffusion.degree=4 => diffusion.degree: expected one of 1, 3, 5, 7, found 4
 diffusion={{model: flux_limited, transport_rounds: 1}} => rounds begin at model p1 with scheme
 diffusion={{scheme: printed, transport_rounds: 1}} => rounds begin at model p1 with scheme
@@ -123,7 +121,6 @@ optimize.parameters.media.cloud.g={{field: true}} => it is not a field, so it ha
 optimize.parameters.phase.g={{}} => parameters.phase.g is called g here
 optimize.parameters.density.support=0.1 => density.support: expected one of masks, auto
 optimize.parameters.g.support=auto => g.support: 'auto' is for density alone
-optimize.parameters.density.even_until=0.3 => even_until: cells are free from the start
 optimize.parameters.density={{min: 2, max: 1}} => density.max: 1 is not above min, 2
 optimize.parameters.density={{init: 3, max: 1}} => density.init: 3 is not between min and max
 optimize.parameters.density={{init: {{file: gone.npz}}}} => init.file: gone.npz does not exist
@@ -146,7 +143,7 @@ volume..g=3 => -D volume..g=3: expected key.path=value
 volume.g.x=3 => -D volume.g.x=3: volume.g.x: volume.g is 0.3, not a mapping or list
 lights.x=3 => lights.x: no such entry: lights is a list of 2, counted from 0
 volume.g=[1 => -D volume.g=[1: not YAML: while parsing a flow sequence, did not find
-volume.g=*x => -D volume.g=*x: volume.g: *x stands for nothing: no &x before
+volume.g=*x => -D volume.g=*x: not YAML: found undefined alias
 """
 """Overrides of the small scene, and what its one line says: the user mends the scene."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import fill
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -170,13 +170,14 @@ def factors_by_formula(g: float, rounds: int) -> list[float]:
 
 def round_by_loops(
     problem: DiffusionProblem,
+    source: Tensor,
     swept: Medium,
-    light: Moments,
+    light: Tensor,
     g: float,
     degree: int,
     directions: int,
     is_last: bool,
-) -> Moments:
+) -> Tensor:
     """One round of E2.10 from `light`, gray, by `sweep_by_loops` and dense solves.
 
     `swept` is the problem's medium with the means of cells.
@@ -185,32 +186,21 @@ def round_by_loops(
     angles = degree if problem.has_flux else 0
     matrix, theta = dense_matrix(operator)[0], share_by_loops(swept, directions)
     p = remaining_by_formula(g, angles)
-    each = light.mean.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
-    source = each.view(-1, 1, 1, 1, 1) * light.harmonics(angles) + problem.source.harmonics(angles)
-    new = Moments.of_harmonics(
-        sweep_by_loops(swept, source, source[0, 0], float(problem.outside), directions)
-    )
-    gain = theta * (new.mean - light.mean)
-    imbalance = right - (matrix @ light.mean.flatten()).view_as(right)
+    each = light.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
+    source = each.view(-1, 1, 1, 1, 1) * fill(light, angles) + source
+    new = sweep_by_loops(swept, source, source[0, 0], float(problem.outside), directions)
+    gain = theta * (new[0] - light[0])
+    imbalance = right - (matrix @ light[0].flatten()).view_as(right)
     total = right + swept.remaining_scattering * gain - imbalance
-    if light.flux is None or new.flux is None or new.higher is None:
-        return Moments(torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)
+    if not problem.has_flux:
+        return (torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)[None]
     part = 1.0 if is_last else (1 - p[1]) / (2 - p[1])
-    changes = [theta * (after - was) for after, was in zip(new.flux, light.flux, strict=True)]
-    turned = tuple(part * p[1] * change for change in changes)
+    change = theta * (new[1:4] - light[1:4])
     # the same problem with this flux as its only source: what E2.4 adds to the right side
-    alone = replace(
-        problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside
-    )
+    turned = torch.cat([torch.zeros_like(gain)[None], part * p[1] * change])
+    alone = replace(problem, source=turned, outside=0 * problem.outside)
     total = total + alone.system[1]
     u = torch.linalg.solve(matrix, total.flatten()).view_as(right)
-    parts = zip(
-        problem.flux(u),
-        alone.flux(0 * u),
-        changes,
-        light.flux,
-        problem.flux(light.mean),
-        strict=True,
-    )
-    z, y, x = (flux + more + change + was - old for flux, more, change, was, old in parts)
-    return Moments(u + gain, (z, y, x), new.higher)
+    flux, more, was = problem.flux(u), alone.flux(0 * u), problem.flux(light[0])
+    first = flux + more + change + light[1:4] - was
+    return torch.cat([(u + gain)[None], first, new[4:]])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import cut
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.transport.sweep import sweep_change
 
@@ -30,7 +30,7 @@ class Case:
     """What is swept: `depth` is that of the densest cells; fields `vary` by cell and color.
 
     `moments`: of what scatters; `known`: of light before; `directions`: how many. An island
-    has a medium in a few cells amid empty ones; of a beam all moments of the source are parts.
+    has a medium in a few cells amid empty ones.
     """
 
     shape: tuple[int, int, int] = (5, 7, 6)
@@ -44,7 +44,6 @@ class Case:
     depth: float = 3.0
     dtype: torch.dtype = torch.float64
     is_island: bool = False
-    is_beam: bool = False
 
     @property
     def grid(self) -> Grid:
@@ -71,8 +70,6 @@ class Case:
             moments = random(min(count, self.moments), self.colors, *self.shape, seed=3 + seed)
             moments[0] += 1.5
             found[name] = moments - 0.5
-        if self.is_beam:
-            found["along"] = random(self.moments, self.colors, seed=8)
         if self.is_lit:
             found["inflow"] = random(self.colors, 1, 1, 1, seed=7)
         return found
@@ -83,22 +80,12 @@ class Case:
         volume = Volume(self.grid, density, sigma_a, sigma_s, g)
         return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
 
-    def source(self, values: dict[str, Tensor]) -> Moments:
-        """What scatters besides light: if it is a beam, one field times factors of moments."""
-        source = Moments.of_harmonics(values["source"])
-        if not self.is_beam:
-            return source
-        beam, factors = source.mean, values["along"]
-        whole = Moments.of_harmonics(factors[:, :, None, None, None] * beam)
-        return replace(whole, higher=None, beam=(beam, factors))
-
 
 def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> Tensor:
     use_engine(engine)
     medium = case.medium(values)
-    light, source = Moments.of_harmonics(values["light"]), case.source(values)
-    swept = sweep_change(medium, light, source, values.get("inflow"), case.directions)
-    return swept.harmonics(medium.degree)
+    lights = cut(values["light"]), cut(values["source"])
+    return torch.cat(sweep_change(medium, *lights, values.get("inflow"), case.directions))
 
 
 def gradients(
@@ -127,7 +114,6 @@ def assert_same(one: tuple, other: tuple, error: float) -> None:
 CASES = {
     "color": Case(),
     "begun": Case(known=4),
-    "beam": Case(known=4, is_beam=True),
     "cubes": Case(spacing=CUBES, directions=50),
     "thin": Case(spacing=THIN),
     "gray": Case(colors=1, moments=1, is_lit=False),

@@ -24,11 +24,15 @@ INLINE Dual<F> conducted(const Dual<F>& here, const Dual<F>& there, F h, bool in
     return here.chain(c.value, c.by_here, there, c.by_there);
 }
 
+// Which moment of degree 1 is along z, y and x; and how many times that a flux is (`moments.py`).
+constexpr int MOMENT[3] = {1, 0, 2};
+constexpr double ROOT = 1.7320508075688772;
+
 enum { GAIN, FLUX, SYSTEM };
 // What cells gain from Q1, -div(D kappa_s Q1), or L1 (E2.5), or all of E2.7. Given are fields: D,
 // kappa_s but for its scale; then, unless it is a gain, L0 or Q0; kappa_a, unless it has the field
-// of kappa_s (SHARED); Q1 along z, y and x, as a sum of so many FLUXES; and as many as are BEGUN,
-// to which what is found is added. And numbers: the scale of kappa_s, the radiance outside, the
+// of kappa_s (SHARED); the moments of Q1, as a sum of so many FLUXES; and as many as are BEGUN, to
+// which what is found is added. And numbers: the scale of kappa_s, the radiance outside, the
 // scale of kappa_a.
 template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     static constexpr bool HAS_MEAN = WHAT != GAIN, IS_SYSTEM = WHAT == SYSTEM;
@@ -44,22 +48,17 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     enum { S, OUTSIDE, A, NUMBERS = 1 + WHAT };
 
     // The row in what is found, or in its cotangents; loss and conductances have `own` colors.
-    template <class F, class P> INLINE static void rows_of(
-        const Row& row, const Mesh<F>& mesh, P* const* arrays, P** found, int own) {
+    template <class P>
+    INLINE static void rows_of(const Row& row, P* const* arrays, P** found, int own) {
         UNROLLED
-        for (int k = 0; k < OUTS; ++k) found[k] = arrays[k] + row.at;
-        if constexpr (IS_SYSTEM) {
-            const int color = own > 1 ? row.color : 0;
-            found[1] = arrays[1] + (own > 1 ? row.at : row.start);
-            UNROLLED
-            for (int a = 0; a < 3; ++a) found[2 + a] = mesh.at_faces(arrays[2 + a], a, color);
-        }
+        for (int k = 0; k < OUTS; ++k)
+            found[k] = arrays[k] + (k == 0 || WHAT == FLUX || own > 1 ? row.at : row.start);
     }
     // Q1 along an axis, where `at` reads: in this cell or beyond its face.
     template <class In, class At> INLINE static auto flux(const In* in, int axis, At at) {
-        auto q = at(in[Q + axis]);
+        auto q = at(in[Q + MOMENT[axis]]);
         UNROLLED
-        for (int k = 1; k < FLUXES; ++k) q += at(in[Q + 3 * k + axis]);
+        for (int k = 1; k < FLUXES; ++k) q += at(in[Q + 3 * k + MOMENT[axis]]);
         return q;
     }
     // What drives light out of a cell through a face, which then conducts it.
@@ -67,7 +66,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     INLINE static N drive(const M& mesh, const In* in, const N* number, int axis, int side, int i) {
         const bool inside = mesh.inside(axis, side, i);
         typedef typename M::Number F;
-        const F h = mesh.h[axis], half = side ? F(0.5) : F(-0.5);
+        const F h = mesh.h[axis], half = F(side ? 0.5 * ROOT : -0.5 * ROOT);
         N driven = F(0);
         if constexpr (FLUXES > 0) {
             const N here =
@@ -86,7 +85,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
         return driven;
     }
 
-    // Out: L1 along each axis; or the right side, and of `is_own` loss and conductances.
+    // Out: moments of L1; or the right side, and of `is_own` loss and conductances.
     template <class N, class M, class In, class F> INLINE static void find(
         const Row& row, const M& mesh, const In* in, const N* number, F* const* out, bool is_own,
         F times) {
@@ -105,17 +104,16 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                     along[a] = side ? flow - along[a] : flow;
                     lost += per_h * flow;
                     escape += pick(inside, N(F(0)), N(per_h * c));
-                    above[a] = per_h * per_h * c;
+                    above[a] = pick(inside && mesh.conducts[a], N(per_h * per_h * c), N(F(0)));
                 }
             }
             if constexpr (WHAT == FLUX) {
                 UNROLLED
                 for (int a = 0; a < 3; ++a) {
-                    along[a] = F(1.5) * times * along[a];
-                    if constexpr (BEGUN > 0) along[a] += in[GIVEN + a][i];
+                    N moment = F(1.5 / ROOT) * times * along[a];
+                    if constexpr (BEGUN > 0) moment += in[GIVEN + MOMENT[a]][i];
+                    out[MOMENT[a]][i] = change_of(moment);
                 }
-                UNROLLED
-                for (int a = 0; a < 3; ++a) out[a][i] = change_of(along[a]);
             } else {
                 N right = -lost;
                 UNROLLED
@@ -126,7 +124,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                     if (is_own) out[1][i] = change_of(loss);
                     UNROLLED
                     for (int a = 0; a < 3; ++a)
-                        if (is_own && mesh.inside(a, 1, i)) out[2 + a][i] = change_of(above[a]);
+                        if (is_own) out[2 + a][i] = change_of(above[a]);
                 }
                 out[0][i] = change_of(right);
             }
@@ -148,7 +146,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
             UNROLLED
             for (int a = 0; a < 3; ++a) {
                 const F h = mesh.h[a], per_h = 1 / h;
-                const F* const r = bar[WHAT == FLUX ? a : 0];
+                const F* const r = bar[WHAT == FLUX ? MOMENT[a] : 0];
                 F p_bar = 0;
                 UNROLLED
                 for (int side = 0; side < 2; ++side) {
@@ -157,22 +155,25 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                         conduct(in[D][i], mesh.beyond(in[D], a, side, i), h, inside);
                     const F there = inside ? mesh.beyond(r, a, side, i) : F(0);
                     // Of what flows out through this face, and of what it conducts.
-                    const F flow_bar = WHAT == FLUX ? F(side ? 1.5 : -1.5) * times * (r[i] + there)
-                                                    : (there - r[i]) * per_h;
+                    const F flow_bar = WHAT == FLUX
+                                           ? F((side ? 1.5 : -1.5) / ROOT) * times * (r[i] + there)
+                                           : (there - r[i]) * per_h;
                     F c_bar = flow_bar * drive(mesh, in, number, a, side, i);
                     if constexpr (IS_SYSTEM) {
-                        const F face_bar = is_own ? mesh.at_face(bar[2 + a], a, side, i) : F(0);
+                        const F face_bar = is_own && mesh.conducts[a]
+                                               ? mesh.at_face(bar[2 + a], a, side, i)
+                                               : F(0);
                         c_bar += inside ? per_h * per_h * face_bar : per_h * loss_bar;
                     }
                     const F drive_bar = c.value * flow_bar;
                     d_bar += c.by_here * c_bar;
-                    p_bar += (inside ? F(1) : h) * (side ? F(0.5) : F(-0.5)) * drive_bar;
+                    p_bar += (inside ? F(1) : h) * F(side ? 0.5 * ROOT : -0.5 * ROOT) * drive_bar;
                     u_bar += (inside ? per_h : F(1)) * drive_bar;
                     of_outside -= inside ? F(0) : drive_bar;
                 }
                 if constexpr (FLUXES > 0)
                     s_bar += p_bar * flux(in, a, [&](const F* f) HERE { return f[i]; });
-                q_bar[a] = s * p_bar;
+                q_bar[MOMENT[a]] = s * p_bar;
             }
             if constexpr (IS_SYSTEM) {
                 s_bar += in[MEAN][i] * bar[0][i];
@@ -202,7 +203,7 @@ template <class Flow, class N, class F> INLINE void find_values(
     const Inputs<N, Flow::INS, Flow::NUMBERS, F> given(
         row, channels, fields, d_fields, numbers, d_numbers);
     F* out[Flow::OUTS];
-    Flow::rows_of(row, mesh, made, out, own);
+    Flow::rows_of(row, made, out, own);
     mesh.visit([&](const auto& mesh) HERE {
         Flow::find(row, mesh, given.in, given.number, out, row.color < own, times);
     });
@@ -215,7 +216,7 @@ template <class Flow, class F> INLINE void find_cotangents(
     row.in_all<Flow::GIVEN>(fields, channels, in);
     row.of_color<Flow::NUMBERS>(numbers, number);
     row.in_all<Flow::MADE>(made, out);
-    Flow::rows_of(row, mesh, bars, bar, own);
+    Flow::rows_of(row, bars, bar, own);
     mesh.visit([&](const auto& mesh) HERE {
         Flow::find_back(row, mesh, in, number, bar, out, sum, row.color < own, times);
     });

@@ -32,8 +32,8 @@ def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
         kind = "Python objects" if dtype.hasobject else f"values of type {dtype}"
         raise FormatError(path, f"{name} holds {kind}; save it as float32")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
-        said = f"its header says {list(shape)} of {dtype}, which is not the size of its data"
-        raise FormatError(path, f"{name} is damaged: {said}")
+        text = f"its header says {list(shape)} of {dtype}, which is not the size of its data"
+        raise FormatError(path, f"{name} is damaged: {text}")
     stream.seek(0)
     return npy.read_array(stream, allow_pickle=False)
 

@@ -64,14 +64,14 @@ class Folder:
         with (self.path / MANIFEST).open("a", **TEXT) as stream:
             stream.write(f"{name}\n")
 
-    def clear(self, kept: Iterable[Path] = (), parts: Sequence[str] = ("",)) -> None:
+    def clear(self, kept: Iterable[Path] = (), beginnings: Sequence[str] = ("",)) -> None:
         """Removes the files that the manifest names, but for those `kept`, and emptied folders.
 
-        `parts` are beginnings of names. Raises UsageError, before anything is removed, where
+        Names have one of the `beginnings`. Raises UsageError, before anything is removed, where
         another process writes to a folder within; FormatError where the system refuses.
         """
         stay = {path.resolve() for path in kept}
-        chosen = [self.path / name for name in self.names if name.startswith(tuple(parts))]
+        chosen = [self.path / name for name in self.names if name.startswith(tuple(beginnings))]
         within = [path for path in chosen if path.is_dir() and (path / MANIFEST).is_file()]
         for path in within:
             with hold(path / LOCK):
@@ -179,10 +179,10 @@ def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None
     that is told and waited for.
     """
     # No soft locks: what they leave behind would have to be judged stale or not.
-    own = FileLock(lock, fallback_to_soft=False)
+    file_lock = FileLock(lock, fallback_to_soft=False)
     try:
         try:
-            own.acquire(timeout=0 if tell is None else PATIENCE)
+            file_lock.acquire(timeout=0 if tell is None else PATIENCE)
         except Timeout:
             holder = ""
             with suppress(OSError):  # it may be gone by now; some releases of filelock empty it
@@ -193,7 +193,7 @@ def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None
                 advice = "wait for it, or choose another folder"
                 raise UsageError(f"{busy}; {advice}") from None
             tell(f"{busy}; waiting for it")
-            own.acquire()
+            file_lock.acquire()
     except OSError as error:
         raise UsageError(f"{lock}: cannot be locked: {error.strerror or error}") from error
     try:
@@ -203,7 +203,7 @@ def hold(lock: Path, tell: Callable[[str], None] | None = None) -> Iterator[None
     finally:
         # Before the lock goes: whoever waits for a file without a name has to begin again.
         lock.unlink(missing_ok=True)
-        own.release()
+        file_lock.release()
 
 
 def kind_of_folder(path: Path) -> str | None:

@@ -20,7 +20,7 @@ CICP = re.compile(rb"\x00\x00\x00\x04cICP(....)", re.DOTALL)
 CICP_LINEAR, CICP_SRGB = 8, (1, 6, 13, 14, 15)
 """Curves of ITU-T H.273: of films and their frames, BT.709's is shown as sRGB's is."""
 GAMMAS_SRGB = (0.45455, 0.50994)
-"""Of gAMA: sRGB's, and BT.709's as older ffmpeg wrote it."""
+"""gAMA of sRGB, and of BT.709 as older ffmpeg wrote it."""
 CHROMATICITIES = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 """x and y of sRGB's white, red, green and blue."""
 ORIENTATION, INTEROPERABILITY = 0x112, 0xA005
@@ -28,9 +28,9 @@ TOP_LEFT = 1
 MUTED = ((200, 100, 100), (100, 200, 100), (100, 100, 200))
 """Colors within every gamut: those at its corners would be clipped."""
 UNABRIDGED: Any = 0x100
-"""To LittleCMS: no tables in place of curves, which are coarse in the dark."""
+"""Asks LittleCMS for curves; its tables are coarse in the dark."""
 NEAR = 3
-"""Of 255, how far a profile's colors may be off. A gamma of 2.2 is off by 9 from sRGB."""
+"""Largest error of a profile's colors, of 255. A gamma of 2.2 is off by 9 from sRGB."""
 
 
 class Encoding(NamedTuple):
@@ -49,17 +49,17 @@ def has_linear_samples(path: Path) -> bool:
     from PIL import Image
 
     with Image.open(path) as picture:
-        found = _find_encoding(path, picture)
-    if found.is_linear is None:
-        what = f"is encoded by another curve than sRGB's, by its {found.source}"
-        raise FormatError(path, f"{what}; convert it to sRGB, or save it linear as .exr")
-    if not found.has_srgb_primaries:
-        doubt_primaries(path, found.source)
-    return found.is_linear
+        encoding = _find_encoding(path, picture)
+    if encoding.is_linear is None:
+        text = f"is encoded by another curve than sRGB's, by its {encoding.source}"
+        raise FormatError(path, f"{text}; convert it to sRGB, or save it linear as .exr")
+    if not encoding.has_srgb_primaries:
+        doubt_primaries(path, encoding.source)
+    return encoding.is_linear
 
 
 def _find_encoding(path: Path, picture: Any) -> Encoding:
-    """In the order of the PNG specification (third edition, section 4.3)."""
+    """The encoding, looked for in the order of the PNG specification (third edition, 4.3)."""
     info, header = picture.info, b""
     if picture.format == "PNG":
         with path.open("rb") as stream:
@@ -77,7 +77,7 @@ def _find_encoding(path: Path, picture: Any) -> Encoding:
         if picture.format != "PNG" and picture.getexif().get_ifd(INTEROPERABILITY)[1] == "R03":
             return Encoding("EXIF (R03, Adobe RGB)", None, False)
     gamma = info.get("gamma", GAMMAS_SRGB[0])
-    if gamma != 1 and min(abs(gamma - known) for known in GAMMAS_SRGB) > 0.01:
+    if gamma != 1 and min(abs(gamma - srgb_gamma) for srgb_gamma in GAMMAS_SRGB) > 0.01:
         return Encoding(f"gAMA {gamma:g}", None, False)
     return Encoding("cHRM", gamma == 1, _are_srgb(info.get("chromaticity", CHROMATICITIES)))
 
@@ -120,13 +120,13 @@ def doubt_primaries(path: Path, source: str) -> None:
 def doubt_orientation(path: Path, orientation: int) -> None:
     """Warns where viewers turn a picture of this EXIF `orientation`."""
     if orientation in range(2, 9):
-        what = f"EXIF orientation {orientation} is not applied; cameras must be those of pictures"
-        _doubt(path, f"{what} as they are stored, not as viewers turn them")
+        text = f"EXIF orientation {orientation} is not applied; cameras must be those of pictures"
+        _doubt(path, f"{text} as they are stored, not as viewers turn them")
 
 
-def _doubt(path: Path, what: str) -> None:
+def _doubt(path: Path, text: str) -> None:
     """Warns of pictures like that at `path`, in words that are the same for all of them."""
-    warnings.warn(f"{path.with_name(f'*{path.suffix}')}: {what}", DataWarning, 3)
+    warnings.warn(f"{path.with_name(f'*{path.suffix}')}: {text}", DataWarning, 3)
 
 
 def _are_srgb(chromaticities: Sequence[float]) -> bool:

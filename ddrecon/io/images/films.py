@@ -73,11 +73,11 @@ def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | N
     chosen = [*STREAM, "-vf", f"trim=start={low - start:.6f}{end},setpts=0", "-frames:v", "1"]
     try:
         frames = read(path, input_params=options, output_params=chosen)
-        about = next(frames)
-        width, height = about["size"]
-        if curve := OTHER_CURVES.search(about["pix_fmt"]):
-            what = f"is encoded by {curve[0]}, not by a curve near sRGB's"
-            raise FormatError(path, f"{what}; convert it to SDR (BT.709) first")
+        properties = next(frames)
+        width, height = properties["size"]
+        if curve := OTHER_CURVES.search(properties["pix_fmt"]):
+            text = f"is encoded by {curve[0]}, not by a curve near sRGB's"
+            raise FormatError(path, f"{text}; convert it to SDR (BT.709) first")
         check_size(4 * width * height, path, f"a film of {width} x {height} pixels")
         decoded = list(frames)
     except (OSError, RuntimeError):
@@ -96,17 +96,17 @@ def frame_times(path: Path) -> tuple[float, ...]:
 
 @lru_cache(maxsize=256)
 def _frame_times(path: Path, *_: int) -> tuple[float, ...]:
-    """By the packets of the film, none of which is decoded."""
+    """Times of all frames [s], from the film's packets, without decoding."""
     program = load_for_file("imageio_ffmpeg", path).get_ffmpeg_exe()
     film = [program, "-nostdin", "-f", FILMS[path.suffix.lower()], "-i", str(path), *STREAM]
-    done = subprocess.run([*film, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
-    listed = done.stdout.decode(errors="replace")
+    process = subprocess.run([*film, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
+    listed = process.stdout.decode(errors="replace")
     base = re.search(r"^#tb 0: (\d+)/(\d+)$", listed, re.MULTILINE)
     # Packets before 0 are cut off; hidden ones have the time of the next that is shown.
     ticks = {int(word) for word in re.findall(r"^0, *-?\d+, *(\d+),", listed, re.MULTILINE)}
-    if done.returncode or base is None or not ticks:
+    if process.returncode or base is None or not ticks:
         raise FormatError(path, "is damaged, or no film")
-    if ALPHA.search(done.stderr.decode(errors="replace")):
-        what = "has alpha, and does not say whether its colors are multiplied by it"
-        raise FormatError(path, f"{what}; save its frames as .png or .exr, or without alpha")
+    if ALPHA.search(process.stderr.decode(errors="replace")):
+        text = "has alpha, and does not say whether its colors are multiplied by it"
+        raise FormatError(path, f"{text}; save its frames as .png or .exr, or without alpha")
     return tuple(tick * int(base[1]) / int(base[2]) for tick in sorted(ticks))

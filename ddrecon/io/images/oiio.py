@@ -45,8 +45,8 @@ STACK_MARK = "bounds="
 def read_exr(path: Path) -> np.ndarray:
     """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4].
 
-    Of several parts, those of the one with R, G and B. Raises FormatError where it is cropped, or
-    has other channels.
+    The part with R, G and B is taken of several. Raises FormatError where it is cropped, or has
+    other channels.
     """
     with opened(path, "EXR") as (file, spec):
         window = spec.x, spec.y, spec.width, spec.height
@@ -55,8 +55,8 @@ def read_exr(path: Path) -> np.ndarray:
         places = [*map(spec.channelindex, _channels_of_picture(spec))]
         kinds = {str(spec.channelformat(place)) for place in places}
         if kinds - {*FLOATS}:
-            told = ", ".join(sorted(kinds))
-            raise FormatError(path, f"holds samples of type {told}; save it as half floats")
+            kinds_text = ", ".join(sorted(kinds))
+            raise FormatError(path, f"holds samples of type {kinds_text}; save it as half floats")
         doubt_chromaticities(path, spec.getattribute("chromaticities"))
         pixels = read_pixels(path, file, "float")[..., places]
     return pixels[..., 0] if len(places) == 1 else pixels
@@ -109,8 +109,8 @@ def read_tiff(path: Path) -> np.ndarray:
         raise FormatError(path, "is a volume (several pages); an image is a single page")
     with opened(path, "TIFF") as (file, spec):
         kind = spec.getattribute("tiff:PhotometricInterpretation")
-        kept, profile = _channels_of_picture(spec), spec.getattribute("ICCProfile")
-        said = None if profile is None else read_profile(bytes(profile))
+        channels, profile = _channels_of_picture(spec), spec.getattribute("ICCProfile")
+        profile_encoding = None if profile is None else read_profile(bytes(profile))
         reason = None
         if spec.get_int_attribute("Orientation", TOP_LEFT) != TOP_LEFT:
             reason = "has turned rows"
@@ -118,17 +118,17 @@ def read_tiff(path: Path) -> np.ndarray:
             reason = f"holds samples of type {spec.format}"
         elif kind not in (BLACK_IS_ZERO, RGB):
             reason = f"has photometric interpretation {kind}"
-        elif {*kept} != {*spec.channelnames}:
+        elif {*channels} != {*spec.channelnames}:
             reason = "has samples that are neither colors nor marked as alpha (ExtraSamples)"
-        elif said and not said.is_linear:
-            reason = f"is not linear by its {said.source}"
+        elif profile_encoding and not profile_encoding.is_linear:
+            reason = f"is not linear by its {profile_encoding.source}"
         if reason:
             only = "only float TIFF, linear, gray or RGB, is read: save it so, or as .exr"
             raise FormatError(path, f"{reason}; {only}")
-        if said and not said.has_srgb_primaries:
-            doubt_primaries(path, said.source)
-        pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, kept)]]
-    return pixels[..., 0] if len(kept) == 1 else pixels
+        if profile_encoding and not profile_encoding.has_srgb_primaries:
+            doubt_primaries(path, profile_encoding.source)
+        pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, channels)]]
+    return pixels[..., 0] if len(channels) == 1 else pixels
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
@@ -147,8 +147,8 @@ def write_exr(path: Path, pixels: np.ndarray) -> None:
 def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     """The file at `path` and what its header says, for a block that reads it.
 
-    Of EXR the part that is a picture. Raises FormatError unless it is of this `kind`, and small
-    enough.
+    An EXR is opened at the part that is a picture. Raises FormatError unless the file is of this
+    `kind`, and small enough.
     """
     module = load_for_file(PACKAGE, path)
     settings = module.ImageSpec()
@@ -186,13 +186,13 @@ def _seek_picture(path: Path, file: Any) -> Any:
     colored = [index for index in pictures if len(_channels_of_picture(specs[index])) > 2]
     chosen = colored or pictures
     if len(chosen) != 1:
-        parts = [
+        subimages = [
             f"{spec.get_string_attribute('oiio:subimagename')}: {', '.join(spec.channelnames)}"
             for spec in specs
         ]
-        what = "several parts that are pictures" if chosen else "no picture among its channels"
-        known = "expected R, G, B, optionally A, or Y, in one part"
-        raise FormatError(path, f"has {what} ({'; '.join(parts).lstrip(': ')}); {known}")
+        text = "several parts that are pictures" if chosen else "no picture among its channels"
+        advice = "expected R, G, B, optionally A, or Y, in one part"
+        raise FormatError(path, f"has {text} ({'; '.join(subimages).lstrip(': ')}); {advice}")
     file.seek_subimage(chosen[0], 0)
     return specs[chosen[0]]
 

@@ -50,7 +50,7 @@ COLORS = ("LA", "RGB", "RGBA")
 MODES = ("1", "L", "P", "I", "I;16", *COLORS)
 """Pillow's modes that are read: in PNG, I is 16 bits."""
 SPREAD = {"1": 255, "L;2": 85, "L;4": 17}
-"""By what Pillow spreads samples of few bits over 8, but not always the one that is transparent."""
+"""Factors by which Pillow scales samples of few bits to 8; it may forget the transparent one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ def read_image(path: Path, frame: int = 0, time: float = 0.0) -> Image:
         if stored.dtype.kind == "f":
             return _image_of(path, stored)
         if path.suffix.lower() == ".npy":
-            what = f"holds whole numbers ({stored.dtype}), not radiance"
-            raise FormatError(path, f"{what}; save it as float32, or 8 bits of sRGB as .png")
+            text = f"holds whole numbers ({stored.dtype}), not radiance"
+            raise FormatError(path, f"{text}; save it as float32, or 8 bits of sRGB as .png")
         if path.suffix.lower() not in FILMS and has_linear_samples(path):
             return _image_of(path, _decode(stored, np.asarray))
         return _image_of(path, _decode(stored), 1 / np.iinfo(stored.dtype).max)
@@ -105,8 +105,8 @@ def read_mask(path: Path, frame: int = 0, time: float = 0.0) -> Image:
     alpha = np.ones_like(white) if image.coverage is None else image.coverage
     counts = (white > alpha / 2) & (alpha > 0.5)
     if suffix not in FILMS and white.any() and not counts.any():  # which may leave black noisy
-        what = f"is nowhere more than half white (at most {white.max():.3g}) and half opaque"
-        raise FormatError(path, f"{what}; a mask is white where pixels count")
+        text = f"is nowhere more than half white (at most {white.max():.3g}) and half opaque"
+        raise FormatError(path, f"{text}; a mask is white where pixels count")
     return Image(as_float32(counts[..., None]))
 
 
@@ -114,8 +114,8 @@ def _read_stored(path: Path, frame: int, time: float) -> np.ndarray:
     """Linear values as floats, or whole numbers as the file has them."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        known = ", ".join(READERS)
-        raise FormatError(path, f"unknown image format {path.suffix!r}; known: {known}")
+        suffixes = ", ".join(READERS)
+        raise FormatError(path, f"unknown image format {path.suffix!r}; known: {suffixes}")
     return read_frame(path, frame, time) if reader is read_frame else reader(path)
 
 
@@ -128,10 +128,10 @@ def _image_of(path: Path, values: np.ndarray, step: float = 0.0) -> Image:
     flawed = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(axis=2)
     if flawed.any():
         row, column = np.argwhere(flawed)[0]
-        what = "NaN" if np.isnan(values[row, column]).any() else "an infinite value"
+        flaw = "NaN" if np.isnan(values[row, column]).any() else "an infinite value"
         where = f"row {row}, column {column} ({np.count_nonzero(flawed)} such pixels)"
         advice = "repair it: a pixel to ignore may hold any finite number"
-        raise FormatError(path, f"{what} at {where}; {advice}")
+        raise FormatError(path, f"{flaw} at {where}; {advice}")
     if values.ndim == 2:
         return Image(np.repeat(values[..., None], 3, axis=2), None, step)
     if values.shape[2] == 3:
@@ -211,7 +211,7 @@ def _read_encoded(path: Path) -> np.ndarray:
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
         if mode not in MODES:
             raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
-        # Of JPEG others are previews and maps beside the picture.
+        # Further frames of a JPEG are previews and maps.
         if picture.format in ("PNG", "WEBP") and (count := getattr(picture, "n_frames", 1)) > 1:
             raise FormatError(path, f"is an animation of {count} pictures; save a single one")
         if "16B" in str(picture.tile) and mode in COLORS:  # which Pillow reads as 8 bits

@@ -19,11 +19,11 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
 VECTORS = ("velocity",)
-"""What fields are called whose three numbers are along x, y and z, not colors."""
+"""Names of fields whose three numbers are along x, y and z, not colors."""
 SIGNED = ("g", *VECTORS)
-"""What fields are called that may be negative."""
+"""Names of fields that may be negative."""
 EMPTY = 1e-4
-"""Of the largest: cells with less count as empty. An optimization leaves no cell at exactly 0."""
+"""Cells below this part of the largest value count as empty: an optimization leaves none at 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
         legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
         raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")
     values = as_float32(values)
-    for is_legal, what in (
+    for is_legal, flaw in (
         (np.isfinite(values), "NaN or infinite"),
         ((values >= 0) | (name in SIGNED), "negative"),
     ):
@@ -85,7 +85,7 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
             z, y, x = np.argwhere(~is_legal)[0, :3]
             count = np.count_nonzero(~is_legal)
             where = f"cell (x, y, z) = ({x}, {y}, {z}) ({count} such values)"
-            raise FormatError(path, f"{name} is {what} at {where}; clean it first")
+            raise FormatError(path, f"{name} is {flaw} at {where}; clean it first")
     if bounds is not None and not (
         bounds.shape == (2, 3) and np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()
     ):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,8 @@ def netcdf_names(path: Path) -> list[str]:
         axes = {name: _axes(variable, seen) for name, variable, seen in _variables(file)}
         names = [name for name in axes if set("xyz") <= set(axes[name].values())]
         if not names:
-            known = ", ".join(dict.fromkeys(axis for each in axes.values() for axis in each))
-            raise FormatError(path, f"has the dimensions {known}; name some of them x, y and z")
+            sides = ", ".join(dict.fromkeys(chain.from_iterable(axes.values())))
+            raise FormatError(path, f"has the dimensions {sides}; name some of them x, y and z")
         return names
 
 
@@ -71,24 +72,25 @@ def _variables(
     A coordinate has the name of its dimension, or else is the only length along it alone; those
     `above` are of dimensions of groups around this one.
     """
-    known = {name: one for name, one in (above or {}).items() if name not in group.dimensions}
-    lengths, others = dict[str, list[Any]](), dict[str, Any]()
+    coordinates = {n: c for n, c in (above or {}).items() if n not in group.dimensions}
+    lengths, variables = dict[str, list[Any]](), dict[str, Any]()
     for name, variable in group.variables.items():
         if not np.issubdtype(variable.dtype, np.number):
             continue
         if name in variable.dimensions:
-            known[name] = variable
+            coordinates[name] = variable
             continue
-        others[name] = variable
+        variables[name] = variable
         if variable.ndim == 1 and size_of(_says(variable, "units"), METERS) is not None:
             axis, (along,) = _axis_of(name, variable), variable.dimensions
             if axis and _axis_of(along, None) in ("", axis):
                 lengths.setdefault(along, []).append(variable)
-    known = {along: each[0] for along, each in lengths.items() if len(each) == 1} | known
-    for name, variable in others.items():
-        yield prefix + name, variable, known
+    single = {along: only for along, (only, *more) in lengths.items() if not more}
+    coordinates = single | coordinates
+    for name, variable in variables.items():
+        yield prefix + name, variable, coordinates
     for name, inner in group.groups.items():
-        yield from _variables(inner, f"{prefix}{name}/", known)
+        yield from _variables(inner, f"{prefix}{name}/", coordinates)
 
 
 def read_netcdf(path: Path, name: str) -> Field:
@@ -97,21 +99,21 @@ def read_netcdf(path: Path, name: str) -> Field:
     Raises FormatError when it is damaged, unevenly spaced or not a legal field.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
-        variable, known = next(each[1:] for each in _variables(file) if each[0] == name)
+        variable, coordinates = next(entry[1:] for entry in _variables(file) if entry[0] == name)
         values, axes = _numbers(path, variable), dict[str, str]()
         sizes = dict(zip(variable.dimensions, values.shape, strict=True))
-        for dimension, axis in sorted(
-            _axes(variable, known).items(), key=lambda one: -sizes[one[0]]
-        ):
+        axes_of_variable = _axes(variable, coordinates)
+        for dimension in sorted(axes_of_variable, key=lambda side: -sizes[side]):
+            axis = axes_of_variable[dimension]
             if axis in [*"xyz"] and axis not in axes:
                 axes[axis] = dimension
             elif sizes[dimension] != 1:
-                what = f"{name} has {sizes[dimension]} entries along {dimension!r}"
-                raise FormatError(path, f"{what}; choose one (ncks -d {dimension},0)")
-        kept = [axes[axis] for axis in "zyx"]
-        order = sorted(variable.dimensions, key=lambda one: [*kept, one].index(one))
-        values = values.transpose([variable.dimensions.index(one) for one in order])
-        sides = [_side(path, axis, axes[axis], known.get(axes[axis])) for axis in "xyz"]
+                text = f"{name} has {sizes[dimension]} entries along {dimension!r}"
+                raise FormatError(path, f"{text}; choose one (ncks -d {dimension},0)")
+        first = [axes[axis] for axis in "zyx"]
+        order = sorted(variable.dimensions, key=lambda side: [*first, side].index(side))
+        values = values.transpose([variable.dimensions.index(side) for side in order])
+        sides = [_side(path, axis, axes[axis], coordinates.get(axes[axis])) for axis in "xyz"]
         bounds, unit = _box(path, sides), _says(variable, "units")
     flips = tuple(slice(None, None, side.step) for side in reversed(sides))
     values = values.reshape(values.shape[:3])[flips]
@@ -130,9 +132,9 @@ def _says(variable: Any, attribute: str) -> str:
     return str(getattr(variable, attribute, "")).strip()
 
 
-def _axes(variable: Any, known: Coordinates) -> dict[str, str]:
+def _axes(variable: Any, coordinates: Coordinates) -> dict[str, str]:
     """Which of x, y, z and t each dimension of `variable` is, "" where that is unknown."""
-    return {name: _axis_of(name, known.get(name)) for name in variable.dimensions}
+    return {name: _axis_of(name, coordinates.get(name)) for name in variable.dimensions}
 
 
 def _axis_of(dimension: str, coordinate: Any) -> str:
@@ -158,10 +160,10 @@ def _side(path: Path, axis: str, dimension: str, coordinate: Any) -> _Side:
     is_depth = not positive and any(_begins(name, "depth") for name in names)
     are_levels = any(_begins(name, LEVELS) for name in names) or (is_depth and coordinate is None)
     if meters is None and (unit or (are_levels and axis == "z")):
-        what = f"is in {unit}, which is no known length" if unit else "says no unit of length"
+        fault = f"is in {unit}, which is no known length" if unit else "says no unit of length"
         drop = f"leave it out (ncks -C -x -v {dimension}) and say volume.bounds"
         advice = "interpolate to heights in m" if axis == "z" else f"project it to m, or {drop}"
-        raise FormatError(path, f"{dimension} {what}; {advice}")
+        raise FormatError(path, f"{dimension} {fault}; {advice}")
     if coordinate is None:
         return _Side(dimension)
     centers = _centers(path, coordinate, dimension)

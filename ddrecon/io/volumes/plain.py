@@ -71,11 +71,11 @@ def read_vol(path: Path, name: str) -> Field:
         raise FormatError(path, "not a Mitsuba volume: it does not begin with 'VOL' and a header")
     _, version, kind, x, y, z, colors, *corners = HEADER.unpack_from(data)
     if (version, kind) != (VERSION, FLOAT32):
-        known = f"only version {VERSION} with float32 values (type {FLOAT32}) can be read"
-        raise FormatError(path, f"is of version {version} and type {kind}; {known}")
+        readable = f"only version {VERSION} with float32 values (type {FLOAT32}) can be read"
+        raise FormatError(path, f"is of version {version} and type {kind}; {readable}")
     if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
-        said = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
-        raise FormatError(path, f"is damaged: its header says {said}")
+        cells_text = f"{x} x {y} x {z} cells of {colors}, which is not the size of its data"
+        raise FormatError(path, f"is damaged: its header says {cells_text}")
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
     return check_field(path, name, values, np.array(corners).reshape(2, 3))
 

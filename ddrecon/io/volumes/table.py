@@ -62,10 +62,10 @@ def read_field(path: Path, name: str) -> Field:
     """The field `name` (`density`, ...) of the volume at `path`; raises FormatError if unusable."""
     kind = _format_of(path)
     with guard_reading(path):
-        if kind.names and name not in (known := kind.names(path)):
-            others = ", ".join(map(repr, known)) or "none"
-            advice = f"; say name: {known[0]} beside file" if len(known) == 1 else ""
-            raise FormatError(path, f"has no field {name!r}; it has {others}{advice}")
+        if kind.names and name not in (names := kind.names(path)):
+            names_text = ", ".join(map(repr, names)) or "none"
+            advice = f"; say name: {names[0]} beside file" if len(names) == 1 else ""
+            raise FormatError(path, f"has no field {name!r}; it has {names_text}{advice}")
         return kind.read(path, name)
 
 
@@ -112,8 +112,8 @@ def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
 def _format_of(path: Path) -> VolumeFormat:
     if (suffix := path.suffix.lower()) not in FORMATS:
-        known = ", ".join(FORMATS)
-        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {known}")
+        suffixes = ", ".join(FORMATS)
+        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {suffixes}")
     return FORMATS[suffix]
 
 
@@ -124,23 +124,23 @@ def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
     """
     fields: dict[str, Field] = {}
     for path in sources:
-        found, reasons = read_fields(path)
+        stored, reasons = read_fields(path)
         for reason in reasons.values():
             warnings.warn(f"{path}: left out: {reason}", DataWarning, 2)
-        for name, field in found.items():
+        for name, field in stored.items():
             if name in fields:
                 raise FormatError(path, f"has a field {name!r}, and so has a file before it")
             fields[name] = field
             if field.bounds is None:
                 raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
-            places = {_place(each) for each in fields.values()}
+            places = {_place(stored_field) for stored_field in fields.values()}
             if len(places) > 1:
                 ours, theirs = _place(field), _place(next(iter(fields.values())))
                 raise FormatError(path, f"has {ours}, the first field {theirs}")
     if not fields:
         raise FormatError(sources[0], "has no fields")
     assert field.bounds is not None
-    return {name: each.values for name, each in fields.items()}, field.bounds
+    return {name: stored_field.values for name, stored_field in fields.items()}, field.bounds
 
 
 def _place(field: Field) -> str:
@@ -150,15 +150,15 @@ def _place(field: Field) -> str:
 
 
 def turn_up(
-    fields: Fields, bounds: np.ndarray, before: str, after: str
+    fields: Fields, bounds: np.ndarray, old_up: str, new_up: str
 ) -> tuple[Fields, np.ndarray]:
-    """`fields` and their box turned so that the axis `after` points up where `before` did.
+    """`fields` and their box turned so that the axis `new_up` points up where `old_up` did.
 
     From y to z (x, y, z) is (x, -z, y).
     """
-    if before == after:
+    if old_up == new_up:
         return fields, bounds
-    old, new = ("xyz".index(name) for name in (before, after))
+    old, new = ("xyz".index(name) for name in (old_up, new_up))
     turned = {
         name: np.flip(values.swapaxes(2 - old, 2 - new), 2 - old) for name, values in fields.items()
     }

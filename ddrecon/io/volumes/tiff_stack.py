@@ -51,9 +51,10 @@ def read_stack(path: Path, name: str) -> Field:
         while file.seek_subimage(len(pages), 0):
             pages.append(read_pixels(path, file, "unknown"))
             check_size(4 * pages[0].size * len(pages), path, "the stack")
-        # That no page follows is an error to it too: in OpenImageIO 3.0 the file's name alone.
-        if (said := file.geterror()) and "could not seek" not in said and said != f"Err: {path}":
-            raise FormatError(path, f"is damaged: {said}")
+        # The end of the pages is an error, too: in OpenImageIO 3.0 the file's name alone.
+        error = file.geterror()
+        if error and "could not seek" not in error and error != f"Err: {path}":
+            raise FormatError(path, f"is damaged: {error}")
         per_unit = [spec.get_float_attribute(f"{axis}Resolution", 1.0) for axis in "XY"]
     values = np.stack(pages)
     facts = _facts(path, description, values.shape[3])
@@ -85,15 +86,15 @@ def _facts(path: Path, description: str, samples: int) -> dict[str, str]:
     several = ""
     if re.search(r"<(\w+:)?OME\b", description):
         images = re.findall(r"<(?:\w+:)?Pixels\b[^>]*>", description)
-        said = dict(re.findall(r'(\w+)="([^"]*)"', "".join(images)))
-        slices, channels, times = (int(said.get(f"Size{axis}", 1)) for axis in "ZCT")
+        attributes = dict(re.findall(r'(\w+)="([^"]*)"', "".join(images)))
+        slices, channels, times = (int(attributes.get(f"Size{axis}", 1)) for axis in "ZCT")
         if len(images) != 1 or channels != samples or times > 1:
             several = f"{len(images)} images of {channels} channels and {times} frames"
         facts, units = {"images": str(slices)}, set()
-        if all(f"PhysicalSize{axis}" in said for axis in "XYZ"):
-            units = {said.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"}
+        if all(f"PhysicalSize{axis}" in attributes for axis in "XYZ"):
+            units = {attributes.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"}
             words = zip(("width", "height", "spacing"), "XYZ", strict=True)
-            facts |= {word: said[f"PhysicalSize{axis}"] for word, axis in words}
+            facts |= {word: attributes[f"PhysicalSize{axis}"] for word, axis in words}
     elif description.startswith('{"shape":'):
         shape = json.loads(description)["shape"]
         if sum(count > 1 for count in shape[: -2 - (samples > 1)]) > 1:

@@ -31,7 +31,7 @@ ONLY_ACTIVE_VALUES = b"\0"
 LEAF, LOWER, UPPER = 3, 4, 5
 """Log2 of the children along an axis, of a leaf and the nodes above: OpenVDB's standard tree."""
 SIDE, VOXELS = 2**LEAF, 2 ** (3 * LEAF)
-"""Of a leaf."""
+"""Voxels of a leaf: along a side, and in all."""
 POSITIONS = struct.Struct("<3q")
 """Where a grid begins, where its voxels do, and where it ends."""
 HEADER, UUID_LENGTH = struct.Struct("<qIIIB"), 36
@@ -117,8 +117,8 @@ def _topology(places: np.ndarray, masks: list[bytes], background: bytes) -> tupl
         is_child[child] = True
         # No active tiles nor, therefore, values of its own.
         data += _bits(is_child) + bytes(len(is_child) // 8) + ONLY_ACTIVE_VALUES
-        for each in np.unique(child) if below else ():
-            add_node(inside[child == each], *below)
+        for index in np.unique(child) if below else ():
+            add_node(inside[child == index], *below)
         if not below:
             leaves = inside[np.argsort(child)].tolist()
             data += b"".join(masks[leaf] for leaf in leaves)
@@ -131,11 +131,11 @@ def _topology(places: np.ndarray, masks: list[bytes], background: bytes) -> tupl
 
 
 def _metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:
-    parts = [
+    records = [
         _text(name) + _text(kind) + struct.pack("<I", len(value)) + value
         for name, (kind, value) in entries.items()
     ]
-    return struct.pack("<I", len(parts)) + b"".join(parts)
+    return struct.pack("<I", len(records)) + b"".join(records)
 
 
 def _bits(is_on: np.ndarray) -> bytes:
@@ -181,8 +181,8 @@ def read_vdb(path: Path, name: str) -> Field:
         block = stream.voxels(components).reshape(SIDE, SIDE, SIDE, components)
         x, y, z = np.minimum(cells - place, SIDE)
         stream.require(min(x, y, z) > 0)
-        own = tuple(slice(at, at + SIDE) for at in place[::-1])
-        values[own] = block[:x, :y, :z].transpose(2, 1, 0, 3)
+        voxels = tuple(slice(at, at + SIDE) for at in place[::-1])
+        values[voxels] = block[:x, :y, :z].transpose(2, 1, 0, 3)
     low = first - size / 2
     box = np.stack([low, low + size * cells])
     return check_field(path, name, values, box)

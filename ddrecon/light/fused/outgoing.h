@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/kernels/cells.h"
-// E2.3 towards a camera, of light by its moments in angle; `Moments.positive_along` is the
-// definition.
+// E2.3 towards a camera, of light by its moments in angle; `radiance_along` in `light/moments.py`
+// is the definition.
 
 namespace ddrecon {
 
@@ -79,15 +79,15 @@ template <class F> struct View {
     }
 };
 
-// Light of DEGREE > 0 in angle, its moments of degree l times a factor. Given are fields: the mean,
-// the flux along z, y and x, all higher moments, and radiance besides (HAS_MORE). And numbers:
-// where the camera is, which VARIES, and the factors.
+// Light of DEGREE > 0 in angle, its moments of degree l times a factor. Given are fields: all
+// moments phi, and radiance besides (HAS_MORE). And numbers: where the camera is, which VARIES, and
+// the factors.
 template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
     static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1), INS = COUNT + HAS_MORE;
     enum { EYE = 0, FACTOR = 3, NUMBERS = 4 + DEGREE };
 
-    // Harmonics towards the camera, where those of degree 1 are a unit vector, at a cell; what
-    // moments of each degree add; and what all but the mean do.
+    // Harmonics towards the camera, at a cell; what moments of each degree add; and what all but
+    // the mean do.
     template <class N> struct Directed {
         N y[COUNT], sum[DEGREE + 1], along;
     };
@@ -103,9 +103,7 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
         const N shortened = view.is_eye ? pick(is_there, F(1) / distance, N(F(0))) : N(F(1));
         UNROLLED
         for (int a = 0; a < 3; ++a) v[a] = shortened * v[a];
-        if constexpr (DEGREE > 1)
-            fill_harmonics<F, DEGREE>(
-                v, v[0] * v[0] + v[1] * v[1] + v[2] * v[2], N(F(1)), N(F(0)), y);
+        fill_harmonics<F, DEGREE>(v, v[0] * v[0] + v[1] * v[1] + v[2] * v[2], N(F(1)), N(F(0)), y);
         found.along = N(F(0));
         if constexpr (HAS_MORE) found.along = N(in[COUNT][i]);
         UNROLLED
@@ -113,7 +111,6 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
             found.sum[l] = N(F(0));
             UNROLLED
             for (int k = l * l; k < (l + 1) * (l + 1); ++k) {
-                if (l == 1) y[k] = v[k - 1];
                 found.sum[l] += in[k][i] * y[k];
             }
             found.along += factor[l] * found.sum[l];

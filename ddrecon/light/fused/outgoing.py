@@ -10,7 +10,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.kernels.cell_function import RowFunction
-from ddrecon.light.moments import MARGIN, Moments
+from ddrecon.light.moments import MARGIN
 
 HEADER = "light/fused/outgoing.h"
 VIEW = "View<F>{ny, nx, is_eye, hz, hy, hx, lz, ly, lx, margin, least}, "
@@ -18,15 +18,14 @@ GIVEN = "int ny, nx, is_eye; F hz, hy, hx, lz, ly, lx, margin, least"
 
 
 def scatter_fused(
-    grid: Grid, light: Moments, factors: Tensor, rays: Rays, more: Tensor | None
+    grid: Grid, light: Tensor, factors: Tensor, rays: Rays, more: Tensor | None
 ) -> Tensor:
-    """`Moments.positive_along` towards the camera of `rays`, of `light` weighted by `factors`.
+    """`radiance_along` towards the camera of `rays`, of `light` phi weighed by `factors`.
 
-    `light` has a flux; `factors`: as of `Moments.weighted`, [L + 1, C or 1, 1, 1, 1].
+    `light`: [K, C, z, y, x] with K > 1; `factors`: as of `weigh`, [L + 1, C or 1, 1, 1, 1].
     """
-    higher = light.higher
-    degree = 1 if higher is None else math.isqrt(4 + len(higher)) - 1
-    fields = [one for one in (light.mean, *(light.flux or ()), higher, more) if one is not None]
+    degree = math.isqrt(len(light)) - 1
+    fields = [light] if more is None else [light, more]
     colors = max(factors.shape[1], *(one.shape[-4] for one in fields))
     point = -rays.direction[0] if rays.eye is None else rays.eye
     each = point[:, None], factors[: degree + 1].reshape(degree + 1, -1)
@@ -34,7 +33,7 @@ def scatter_fused(
     _, y, x = grid.shape
     given = {"ny": y, "nx": x, "is_eye": rays.eye is not None, "margin": MARGIN}
     given |= zip(("hz", "hy", "hx", "lz", "ly", "lx"), (*grid.spacing, *grid.lower), strict=True)
-    given["least"] = 1e6 * torch.finfo(light.mean.dtype).tiny
+    given["least"] = 1e6 * torch.finfo(light.dtype).tiny
     name = f"Outgoing<{degree}, {int(more is not None)}, {int(point.requires_grad)}>"
     shape = colors, *grid.shape
     (radiance,) = RowFunction(HEADER, name, (shape,), x, VIEW, GIVEN, given).apply(numbers, *fields)

@@ -71,7 +71,7 @@ template <class F, int BLOCK> struct Ways {
     }
 
     static INLINE void add(F* to, F value) {
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
         atomicAdd(to, value);
 #else
         *to += value;

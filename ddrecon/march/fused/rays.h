@@ -98,7 +98,6 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     typedef Numbers<F> P;
     typedef typename P::V V;
     typedef typename P::W W;
-    typedef typename P::M M;
     using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_RAYS, Which::VARIES_TABLES;
     typedef ddrecon::Table<F, L::CURVE> Table;
 
@@ -272,27 +271,16 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
     // bend of that each is handed to `take`.
     template <class Take> void take_slopes(int n, const Way& s, int from, int to, Take take) const {
-        const V none = P::all(F(0)), z = value_of(place(ray, s, 0));
-        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
-        M is_kink = Kink<F>::is_at(y, lines.rows) | Kink<F>::is_at(x, lines.columns);
-        if (!IS_SLICED) is_kink = is_kink | Kink<F>::is_at(z, given.depth);
-        const bool has_kink = !P::every(P::pick(is_kink, P::all(F(1)), none) == none);
-        Spot<F, IS_SLICED, Slope> sides[2];
-        for (int i = 0; i < 1 + has_kink; ++i) {
-            const F side = has_kink ? F(2 * i - 1) : F(0);
-            sides[i].y = Kink<F>::template place<Slope>(y, lines.rows, side, 0);
-            sides[i].x = Kink<F>::template place<Slope>(x, lines.columns, side, 1);
-            if constexpr (!IS_SLICED)
-                sides[i].z = Kink<F>::template place<Slope>(z, given.depth, side, 2);
-        }
+        auto at = [&](int axis, int size, int direction) {
+            return Place<F, Slope>::moving(value_of(place(ray, s, axis)), size, direction);
+        };
+        Spot<F, IS_SLICED, Slope> spot;
+        spot.y = at(1, lines.rows, 0);
+        spot.x = at(2, lines.columns, 1);
+        if constexpr (!IS_SLICED) spot.z = at(0, given.depth, 2);
         for (int c = from; c < to; ++c) {
-            const F* field = given.fields[c] + slice(n);
-            Slope bend(none), other(none);
-            Slope v = sides[0].value(field, lines, L::is_cubic(c), bend);
-            if (has_kink) {
-                v = F(0.5) * (v + sides[1].value(field, lines, L::is_cubic(c), other));
-                bend = F(0.5) * (bend + other);
-            }
+            Slope bend(P::all(F(0)));
+            const Slope v = spot.value(given.fields[c] + slice(n), lines, L::is_cubic(c), bend);
             take(c, v, bend);
         }
     }

@@ -14,7 +14,7 @@
 
 namespace ddrecon {
 
-#if defined(__CUDA_ARCH__)
+#if IS_GPU
 template <class F> INLINE void spread_place(
     F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
     const F ya = y.a, xa = x.a;

@@ -21,7 +21,6 @@ from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.transport.characteristics import Course, Direction
-from ddrecon.transport.fused.swept import units_of_parts
 
 POINTS = 4
 """Cells at most that light comes from."""
@@ -159,5 +158,4 @@ def _matrices(units: list[Unit], order: list[int], number: int) -> list[Tensor]:
     z, y, x, weights = torch.tensor(rows, dtype=torch.float64).T
     degree = math.isqrt(len(order)) - 1
     values = harmonics(torch.stack([z, y.abs(), x.abs()], 1), degree)[order]
-    of_parts = units_of_parts(degree)[order, None]
-    return [(values / of_parts).flatten(), (values * of_parts * weights).flatten()]
+    return [values.flatten(), (values * weights).flatten()]

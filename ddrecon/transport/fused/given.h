@@ -24,13 +24,14 @@ struct Chunk {
 // lie behind them. A launch does some colors `together`, a chunk of the directions of each piece,
 // and one `half` of the slices; what is found `adds` to what others have.
 template <class F> struct Sweep {
-    const F *factors, *beam_factors, *scales, *extinction, *scattering, *gradient, *densest;
-    const F *light_parts[5], *source_parts[5], *bars[5];
-    const F *d_factors, *d_scales, *d_gradient, *d_light_parts[5], *d_source_parts[5];
+    const F *factors, *scales, *extinction, *scattering, *gradient, *densest;
+    const F *light[2], *source[2], *bars[2];
+    const F *d_factors, *d_scales, *d_gradient, *d_light[2], *d_source[2];
     const F *parts, *matrices;
     const int *courses, *units, *order, *ranges, *chunks;
     int depth, height, width, pitch, margin, colors, most, slab, slabs, directions;
-    int extinction_channels, scattering_channels, scratch_rows, pieces, chunk_count;
+    int light_low, source_low, extinction_channels, scattering_channels, scratch_rows, pieces,
+        chunk_count;
     int together, color_from, chunk, half, adds;
     F *found, *saved, *lines, *scratch, *returning, *e_bar, *sc_bar, *gradient_bar;
     double* sums;

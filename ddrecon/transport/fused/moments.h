@@ -28,11 +28,11 @@ template <class F> struct Block {
     }
 };
 
-// A moment of light; light is given as mean, flux along z, y, x, and what is higher, each of `all`
-// colors and cells.
-template <class F> INLINE const F* part_of(const F* const* parts, int k, long long all) {
-    const int places[4] = {0, 2, 1, 3};
-    return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
+// Moment k of light, each of `all` colors and cells; null for none. Light is given as moments of
+// degrees 0 and 1, so many `low` ones, and those of higher degree.
+template <class F> INLINE const F* moment_of(const F* const* phi, int low, int k, long long all) {
+    if (k < 4) return phi[0] && k < low ? phi[0] + k * all : nullptr;
+    return phi[1] ? phi[1] + (k - 4) * all : nullptr;
 }
 
 // Of moments to a DEGREE, those of parity p (even in y before odd, of each even in x before

@@ -69,7 +69,7 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         Sums<F, COUNT, 1> sums;
         const long long at = job.color * light.cells + here.at;
         for (int i = 0; i < COUNT; ++i) {
-            sums.rows[i][0] = light.row_of(part_of(of.bars, of.order[i], light.all), at);
+            sums.rows[i][0] = light.row_of(moment_of(of.bars, 4, of.order[i], light.all), at);
             sums.by[i][0] = F(1);
         }
         to_directions<DEGREE>(light.matrix(1), sums, units_at(here), -width, 0, width);

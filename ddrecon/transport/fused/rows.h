@@ -184,22 +184,20 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         Sums<F, COUNT, 2> sums;
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i], own = k * of.colors + job.color;
-            const F* light = part_of(of.light_parts, k, all);
-            const F* source =
-                of.beam_factors ? of.source_parts[0] : part_of(of.source_parts, k, all);
-            sums.rows[i][0] = row_of(light, at), sums.rows[i][1] = row_of(source, at);
-            sums.by[i][0] = of.factors[own];
-            sums.by[i][1] = of.beam_factors ? of.beam_factors[own] : F(1);
+            sums.rows[i][0] = row_of(moment_of(of.light, of.light_low, k, all), at);
+            sums.rows[i][1] = row_of(moment_of(of.source, of.source_low, k, all), at);
+            sums.by[i][0] = of.factors[own], sums.by[i][1] = F(1);
         }
         to_directions<DEGREE>(matrix(0), sums, units_at(here, false), of.width, from, to);
         if constexpr (IS_CHANGED) {
             Sums<F, COUNT, 3> changes;
             for (int i = 0; i < COUNT; ++i) {
                 const int k = of.order[i], own = k * of.colors + job.color;
-                const F* const* parts[3] = {of.d_source_parts, of.d_light_parts, of.light_parts};
+                const F* const* const lights[3] = {of.d_source, of.d_light, of.light};
+                const int lows[3] = {of.source_low, of.light_low, of.light_low};
                 const F by[3] = {F(1), of.factors[own], of.d_factors[own]};
                 for (int n = 0; n < 3; ++n) {
-                    changes.rows[i][n] = row_of(part_of(parts[n], k, all), at);
+                    changes.rows[i][n] = row_of(moment_of(lights[n], lows[n], k, all), at);
                     changes.by[i][n] = by[n];
                 }
             }
@@ -315,9 +313,9 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i];
             const bool is_known = k < 4 && !job.piece;
-            const F* const* light_parts = IS_CHANGED ? of.d_light_parts : of.light_parts;
-            const F* part = is_known ? part_of(light_parts, k, all) : nullptr;
-            taken[i] = row_of(part, job.color * cells + here.at);
+            const F* const* light = IS_CHANGED ? of.d_light : of.light;
+            const F* known = is_known ? moment_of(light, of.light_low, k, all) : nullptr;
+            taken[i] = row_of(known, job.color * cells + here.at);
             found[i] = begin + k * all;
         }
         to_moments<DEGREE>(

@@ -36,7 +36,7 @@ class Rows:
 
     def __init__(self, swept: Swept, changes: Swept | None = None):
         threads = torch.get_num_threads()
-        self.swept, self.changes, self.like = swept, changes, swept.like
+        self.swept, self.changes, self.like = swept, changes, swept.gradient[0]
         self.count, self.colors = swept.factors.shape
         self.depth, self.height, self.width = self.like.shape[1:]
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
@@ -122,8 +122,9 @@ class Rows:
         scratch_rows = NUMBERS + self.count
         scratch = self.like.new_zeros(self.lanes * scratch_rows * self.pitch)
         given = given | self.tables | {
-            "light_parts": swept.light, "source_parts": swept.source, "factors": swept.factors,
-            "beam_factors": swept.beam_factors, "scales": swept.scales,
+            "light": swept.light, "source": swept.source, "factors": swept.factors,
+            "light_low": swept.lows[0], "source_low": swept.lows[1],
+            "scales": swept.scales,
             "extinction": self.fields[0], "extinction_channels": self.channels[0],
             "scattering": self.fields[-1], "scattering_channels": self.channels[-1],
             "gradient": swept.gradient, "ranges": self.ranges, "densest": self.densest,
@@ -135,7 +136,7 @@ class Rows:
         }  # fmt: skip
         if (changes := self.changes) is not None:
             given |= {
-                "d_light_parts": changes.light, "d_source_parts": changes.source,
+                "d_light": changes.light, "d_source": changes.source,
                 "d_factors": changes.factors, "d_scales": changes.scales,
                 "d_gradient": changes.gradient,
             }  # fmt: skip

@@ -111,7 +111,7 @@ def test_folders_within_are_removed_by_part(tmp_path: Path) -> None:
             fill(tmp_path / f"frames/{number}", RUN, "volumes/a")
     (tmp_path / "frames/2/mine").write_text("mine")
     with claim_folder(tmp_path, FILM, overwrite=True) as folder:
-        folder.clear(parts=["frames/1/"])
+        folder.clear(beginnings=["frames/1/"])
     names = {MANIFEST, "film.json", "frames/2/mine"}
     names |= {f"frames/{n}/{name}" for n in (0, 2) for name in (MANIFEST, "volumes/a")}
     assert set(contents(tmp_path)) == names and not (tmp_path / "frames/1").exists()

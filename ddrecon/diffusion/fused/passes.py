@@ -1,0 +1,331 @@
+"""Multigrid's passes as kernels (`passes.h`): listed in a table once, launched as often as wanted.
+
+On a GPU each pass is a launch, with a thread for each cell. On a processor an item is a row; passes
+over few cells, and all of them where there is one thread, are done within one launch.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes
+from ddrecon.diffusion.operator import Operator
+from ddrecon.kernels.launch import launch_later, thread_count
+from ddrecon.kernels.text import TextKernel, declarations
+
+Kind = IntEnum(
+    "Kind",
+    "SCALE WEIGH COARSEN MATRIX PRODUCT SMOOTH RESIDUAL RELAX RESTRICT SOLVE CORRECT",
+    start=0,
+)
+"""What a pass does, as `passes.h` has it."""
+PASS = """
+long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u, source, out;
+F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
+"""
+"""What a pass is given, as `passes.h` declares it: eight bytes each."""
+SMALL = 30_000
+"""So few cells, of all colors, are best done by one thread."""
+
+
+class Vector(NamedTuple):
+    """Numbers of all colors on a grid, from a `place` in the work of a cycle on.
+
+    `twin`: the place of another vector of that grid, for what does not change in place.
+    """
+
+    place: int
+    shape: tuple[int, ...]
+    twin: int = -1
+
+
+class KernelPasses(Passes):
+    """Lists the passes of a preparation, or of a cycle for vectors of so many `colors`.
+
+    `is_by_cell`: whether an item does a cell, as on a GPU, and not a row. `kept`: what the table
+    points to.
+    """
+
+    def __init__(self, like: Tensor, colors: int = 1):
+        self.like, self.colors, self.is_by_cell = like, colors, like.is_cuda
+        self.size, self.rows, self.kept = 0, list[dict[str, int]](), list[Tensor]()
+
+    def new_vector(self, shape: Sequence[int], *, has_twin: bool = False) -> Vector:
+        """Room for a vector on a grid of this `shape` [z, y, x], or for two."""
+        place, count = self.size, self.colors * math.prod(shape)
+        self.size += count * (1 + has_twin)
+        return Vector(place, tuple(shape), place + count if has_twin else -1)
+
+    def scale(self, operator: Operator) -> tuple[Tensor, Tensor, Tensor]:
+        shape = operator.loss.shape
+        inverse, kept = (self.like.new_empty(shape) for _ in range(2))
+        ties = self.like.new_empty(3, math.prod(shape) // self._width(shape, 2))
+        self._add("SCALE", shape, operator, made=[inverse, kept, ties])
+        return inverse, kept, ties
+
+    def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
+        grid = tuple(operator.loss.shape[1:])
+        shape = [(n + 1) // 2 if a == axis else n for a, n in enumerate(grid, 1)]
+        faces, loss = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
+        below, above, *made = (self.like.new_empty(faces) for _ in range(5))
+        made.append(self.like.new_empty(loss))
+        way = [Coarsening(axis, grid[axis - 1], below, above)]
+        weights = [below, above, made[axis - 1]]
+        self._add_transfer("WEIGH", faces, grid, way, operator, made=weights)
+        self._add("COARSEN", loss, operator, way, grid=grid, rows=1, made=made)
+        z, y, x, loss_made = made
+        return way[0], Operator((z, y, x), loss_made, operator.periodic)
+
+    def matrix(self, operator: Operator) -> Tensor:
+        count = operator.loss[0].numel()
+        matrix = self.like.new_empty(len(operator.loss), count, count, dtype=torch.float64)
+        self._add("MATRIX", operator.loss.shape, operator, rows=0, made=[matrix])
+        return matrix
+
+    def run(self) -> None:
+        kernel = prepare_kernel(8 * self.like.itemsize)
+        program = Program(self, kernel, self.like.new_empty(1))
+        program.launch(program.cut(0, len(self.rows)))
+        self.rows.clear()
+
+    def product(self, operator: Operator, u: Vector) -> Vector:
+        """A u."""
+        out = self.new_vector(u.shape)
+        self._add("PRODUCT", self._all(u.shape), operator, u=u, out=out)
+        return out
+
+    def smooth(self, level: Level, source: Vector) -> Vector:
+        out = self.new_vector(source.shape, has_twin=True)
+        return self._add_level("SMOOTH", level, source=source, out=out)
+
+    def relax(self, level: Level, u: Vector, source: Vector, step: float) -> Vector:
+        out = Vector(u.twin, u.shape, u.place)
+        return self._add_level("RELAX", level, u=u, source=source, out=out, step=STEPS.index(step))
+
+    def residual(self, level: Level, u: Vector, source: Vector) -> Vector:
+        out = Vector(u.twin, u.shape)
+        return self._add_level("RESIDUAL", level, u=u, source=source, out=out)
+
+    def restrict(self, level: Level, residual: Vector) -> Vector:
+        for together in self._groups(level.coarsenings):
+            grid, out = residual.shape, self.new_vector(together[-1].below.shape[1:])
+            shape, vectors = self._all(out.shape), {"source": residual, "out": out}
+            self._add_transfer("RESTRICT", shape, grid, together, level.operator, **vectors)
+            residual = out
+        return residual
+
+    def solve(self, inverse: Tensor, source: Vector) -> Vector:
+        out = self.new_vector(source.shape)
+        given = {"inverse": inverse, "cell_colors": len(inverse), "source": source, "out": out}
+        self._add("SOLVE", self._all(out.shape), rows=0, **given)
+        return out
+
+    def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
+        groups = self._groups(level.coarsenings)
+        for number, together in reversed([*enumerate(groups)]):
+            cells = {coarsening.axis: coarsening.cells for coarsening in together}
+            grid = [cells.get(axis, n) for axis, n in enumerate(coarse.shape, 1)]
+            # The last one, to the grid of u, adds to that what is kept.
+            kept, out = (None, self.new_vector(grid)) if number else (level.kept, u)
+            given = {"source": coarse, "out": out, "kept": kept}
+            self._add_transfer("CORRECT", self._all(grid), grid, together, level.operator, **given)
+            coarse = out
+        return u
+
+    def _groups(self, coarsenings: Sequence[Coarsening]) -> list[Sequence[Coarsening]]:
+        """Those of one pass: all on a GPU, where launches cost most; else one, as vector code."""
+        return [coarsenings] if self.is_by_cell else [[one] for one in coarsenings]
+
+    def _all(self, shape: Sequence[int]) -> tuple[int, ...]:
+        return self.colors, *shape
+
+    def _width(self, shape: Sequence[int], rows: int) -> int:
+        """How many cells an item does: one, a row, or a slice."""
+        return 1 if self.is_by_cell else math.prod(shape[len(shape) - rows :])
+
+    def _add_level(self, kind: str, level: Level, **given: Any) -> Vector:
+        out: Vector = given["out"]
+        given |= {"inverse": level.inverse, "kept": level.kept}
+        self._add(kind, self._all(out.shape), level.operator, **given)
+        return out
+
+    def _add_transfer(
+        self,
+        kind: str,
+        shape: Sequence[int],
+        grid: Sequence[int],
+        coarsenings: Sequence[Coarsening],
+        operator: Operator,
+        **given: Any,
+    ) -> None:
+        """Lists a pass along one axis, or more on a GPU. Across it rows need not be told apart."""
+        axes = {coarsening.axis for coarsening in coarsenings}
+        if not self.is_by_cell:
+            shape, grid = (_merge_axes(each, axes) for each in (shape, grid))
+        self._add(kind, shape, operator, coarsenings, grid=grid, rows=1, **given)
+
+    def _add(
+        self,
+        kind: str,
+        shape: Sequence[int],
+        operator: Operator | None = None,
+        coarsenings: Sequence[Coarsening] = (),
+        rows: int = 2,
+        **given: Any,
+    ) -> None:
+        """Lists a pass whose items fill `shape` [C, z, y, x]; the grid is that, or another one."""
+        width = self._width(shape, rows)
+        row: dict[str, Any] = {"kind": Kind[kind], "width": width}
+        row |= {"items": math.prod(shape) // width, "n": given.pop("grid", shape[1:]), **given}
+        if operator:
+            row |= {"c": operator.conductances, "loss": operator.loss}
+            row |= {"face_colors": len(operator.conductances[0]), "cell_colors": len(operator.loss)}
+            row["periodic"] = sum(1 << axis for axis in operator.periodic)
+        row["axes"] = sum(1 << coarsening.axis - 1 for coarsening in coarsenings)
+        for coarsening in coarsenings:
+            row[f"below_{coarsening.axis - 1}"] = coarsening.below
+            row[f"above_{coarsening.axis - 1}"] = coarsening.above
+        self.rows.append(dict(self._numbers_of(row)))
+
+    def _numbers_of(self, row: dict[str, Any]) -> Iterator[tuple[str, int]]:
+        """Each number of a `row` of the table, with its name."""
+        for name, value in row.items():
+            if isinstance(value, Tensor):
+                self.kept.append(value)
+                yield name, value.data_ptr()
+            elif isinstance(value, Vector):
+                yield name, value.place
+            elif isinstance(value, int | None):
+                yield name, value or 0
+            else:
+                for number, entry in enumerate(value):
+                    yield from self._numbers_of({f"{name}_{number}": entry})
+
+
+def entries_of(given: str) -> Iterator[str]:
+    """The names of the numbers and addresses that `given` declares, each entry of lists."""
+    for _, _, name, count in declarations(given):
+        yield from [f"{name}_{entry}" for entry in range(count)] or [name]
+
+
+def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
+    """`shape` [(C,) z, y, x], in which axes that lie beside each other, and not in `axes`, are one.
+
+    So that rows, along x, are as long as can be: all of a slice for what happens across slices.
+    """
+    *colors, z, y, x = shape
+    if axes == {1}:
+        return *colors, z, 1, y * x
+    return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
+
+
+class Program:
+    """Passes in a table where kernels see it, and launches that do them on vectors in `work`."""
+
+    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor):
+        self.rows, self.kept = [*passes.rows], [*passes.kept]
+        names = [*entries_of(PASS)]
+        table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
+        # Without waiting: the numbers have left the processor's memory when this returns.
+        table = table.to(work.device, non_blocking=True)
+        self.bound = kernel.bind({"table": table}, {"work": work})
+        self.is_alone = not work.is_cuda and thread_count(work) == 1
+        self.is_shared = work.is_cuda
+
+    def cut(self, first: int, last: int) -> list[tuple[int, int, int]]:
+        """The launches that do passes `first` to `last`: items, the first pass, the one after it.
+
+        One item may be several passes: then a thread does them all.
+        """
+        launches = []
+        for number in range(first, last):
+            row = self.rows[number]
+            is_large = row["items"] * row["width"] > SMALL and not self.is_alone
+            if self.is_shared or is_large:
+                if first < number:
+                    launches.append((1, first, number))
+                launches.append((row["items"], number, number + 1))
+                first = number + 1
+        return [*launches, *([(1, first, last)] if first < last else [])]
+
+    def launch(self, launches: Sequence[tuple[int, int, int]]) -> None:
+        """Does what was `cut`."""
+        for items, begin, end in launches:
+            self.bound.launch(items, begin=begin, end=end, is_whole=items == 1)
+
+
+def passes_kernel(name: str, bits: int) -> TextKernel:
+    """The passes of a table from `begin` to `end`: an item of each, or all that there are."""
+    text = f"""
+    for (int k = begin; k < end; ++k) {{
+        const Work<F> pass = {{((const Pass<F>*)table)[k], work, F({STEPS[0]!r}), F({STEPS[1]!r})}};
+        const Size from = is_whole ? 0 : item, to = is_whole ? pass.p.items : item + 1;
+        for (Size i = from; i < to; ++i) {name}(pass, i);
+    }}
+    """
+    given = "long *table; int begin, end; bool is_whole; F *work"
+    return TextKernel(f"multigrid_{name}", bits, text, given, "work", "diffusion/fused/passes.h")
+
+
+@functools.cache
+def prepare_kernel(bits: int) -> TextKernel:
+    """The passes that prepare a hierarchy."""
+    return passes_kernel("prepare", bits)
+
+
+@functools.cache
+def cycle_kernel(bits: int) -> TextKernel:
+    """The passes of a cycle, and products."""
+    return passes_kernel("cycle", bits)
+
+
+def name_kernels(like: Tensor) -> None:
+    """Has the kernels of a solve on tensors `like` this compiled meanwhile."""
+    for kernel in (cycle_kernel, prepare_kernel):
+        launch_later(kernel(8 * like.itemsize).kernel, like)
+
+
+def prepare(operator: Operator) -> tuple[Operator, Hierarchy]:
+    """`operator` as kernels take it, and its grids."""
+    faces = max(map(len, operator.conductances))
+    z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
+    loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
+    operator = Operator((z, y, x), loss, operator.periodic)
+    return operator, Hierarchy.of(operator, KernelPasses(loss))
+
+
+class KernelCycle:
+    """Products and V-cycles of an operator, of vectors like `source`, by kernels."""
+
+    def __init__(self, operator: Operator, source: Tensor):
+        operator, self.hierarchy = operator.once(prepare)
+        passes = KernelPasses(source, len(source))
+        direction, residual = (passes.new_vector(source.shape[1:]) for _ in range(2))
+        product = passes.product(operator, direction)
+        u = self.hierarchy.cycle(passes, residual)
+        work = source.new_empty(passes.size)
+        self.direction, self.residual, self._product, self._u = (
+            work[vector.place :][: source.numel()].view_as(source)
+            for vector in (direction, residual, product, u)
+        )
+        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work)
+        self._first, self._others = (
+            self._program.cut(*ends) for ends in ((0, 1), (1, len(passes.rows)))
+        )
+
+    def product(self) -> Tensor:
+        """A times the direction."""
+        self._program.launch(self._first)
+        return self._product
+
+    def cycle(self) -> Tensor:
+        """Roughly A^-1 times the residual."""
+        self._program.launch(self._others)
+        return self._u
