@@ -43,9 +43,9 @@ from ddrecon.light.reduced import (
     sum_unscattered_sky,
 )
 from ddrecon.light.sky import Sky, Source, decompose_lights
-from ddrecon.march.emission import Emission, Inflow
 from ddrecon.march.ground import LitGround, light_evenly, light_texels, reflect, see_ground, upwards
 from ddrecon.march.integral import march
+from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.march.periods import HALO
 from ddrecon.march.sight import look_through
 from ddrecon.march.windows import look_inside, see_through
@@ -273,7 +273,7 @@ def fluence_of(light_field: LightField, settings: DiffusionSettings) -> Tensor:
 
 def _glow(
     light_field: LightField, plane: Plane, has_source: bool, bundles: Sequence[Rays]
-) -> Emission:
+) -> OutgoingLight:
     """What the medium sends down to a ground, along `bundles` of rays into directions `upwards`.
 
     Its `diffuse` light is that along one bundle after another, [N C, z, y, x]. Beams count by what
@@ -281,7 +281,7 @@ def _glow(
     ground receives as direct light.
     """
     if not has_source:
-        each = [_emission(light_field, rays) for rays in bundles]
+        each = [_outgoing(light_field, rays) for rays in bundles]
         return replace(each[0], diffuse=torch.cat([one.diffuse for one in each]))
     period, wide = light_field.unrolled()
     light, degree = scatter_once_more(wide.medium, wide.diffuse), wide.medium.degree
@@ -297,7 +297,7 @@ def _glow(
         scattered = (1 - wide.medium.forward_fraction) * scattered
     diffuse = (diffuse + period.extend(scattered)).flatten(0, 1)
     others = replace(light_field, beams=(), outside=None)
-    return replace(_emission(others, bundles[0]), diffuse=diffuse)
+    return replace(_outgoing(others, bundles[0]), diffuse=diffuse)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
@@ -439,7 +439,7 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         behind = look_behind(sight.rays, given)
         if light_field.ground is not None:
             behind = see_ground(light_field.ground, medium, sight.rays, behind, scene.render)
-        radiance = march(_emission(light_field, sight.rays), sight, scene.render, behind)
+        radiance = march(_outgoing(light_field, sight.rays), sight, scene.render, behind)
     else:
         rays, windows = look_inside(camera, medium.grid, medium.index, scene.render)
         at_faces, sky = light_field.diffuse, sum_unscattered_sky(medium, light_field.skies, 0)
@@ -451,8 +451,8 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
         for window in windows:
             behind = None if given is None else given[:, window.numbers]
             behind = look_behind(Rays(window.points, window.outside, None), behind)
-            emission = _emission(light_field, window.sight.rays)
-            seen = see_through(window, emission, at_faces, medium, behind, scene.render)
+            outgoing = _outgoing(light_field, window.sight.rays)
+            seen = see_through(window, outgoing, at_faces, medium, behind, scene.render)
             colors = max(len(radiance), len(seen))
             radiance = radiance.expand(colors, len(rays.direction))
             radiance = radiance.index_copy(1, window.numbers, seen.expand(colors, -1))
@@ -462,9 +462,9 @@ def _image(light_field: LightField, scene: Scene, camera: Camera, given: Tensor 
     return radiance.expand(3, -1).unflatten(-1, camera.size)
 
 
-def _emission(
+def _outgoing(
     light_field: LightField, bundle: Rays, unrolled: tuple[Unrolled, LightField] | None = None
-) -> Emission:
+) -> OutgoingLight:
     """What the medium sends towards the camera of `bundle` (E2.2, E2.3, E2.11).
 
     `unrolled`: that of `light_field`, where it is known.
@@ -478,27 +478,30 @@ def _emission(
     diffuse = scatter_towards(medium, wide.diffuse, bundle, wide.turned, sky)
     if light_field.has_means:
         diffuse = sharpen(medium, diffuse)
-    emission = Emission(
+    is_periodic = bool(light_field.medium.grid.periodic)
+    unlit = OutgoingLight(
         medium.grid,
         medium.extinction,
         medium.scattering,
-        wide.beams,
+        (),
         diffuse,
         medium.seen,
         medium.peak,
         medium.remaining if medium.is_cellwise else None,
         medium.support,
         medium.emission,
+        period=period if is_periodic else None,
         inflow=_inflow(wide, bundle),
     )
-    if not light_field.medium.grid.periodic:
-        return emission
+    outgoing = light_up(unlit, wide.beams)
+    if not is_periodic:
+        return outgoing
     depends = len(light_field.diffuse) > 1 or light_field.skies
 
-    def from_eye(eye: Tensor) -> Emission:
-        return _emission(light_field, replace(bundle, eye=eye), (period, wide))
+    def from_eye(eye: Tensor) -> OutgoingLight:
+        return _outgoing(light_field, replace(bundle, eye=eye), (period, wide))
 
-    return replace(emission, period=period, from_eye=from_eye if depends else None)
+    return replace(outgoing, from_eye=from_eye if depends else None)
 
 
 def _inflow(light_field: LightField, rays: Rays) -> Inflow | None:

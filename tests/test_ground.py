@@ -194,7 +194,7 @@ def test_directions_together_are_each_by_itself(g: float) -> None:
     unlit = replace(lit, beams=(), outside=None)
     source, total = lit.received.source, torch.zeros(3, texels[..., 0].numel()).double()
     for way, angle, sight in zip(ways, angles, sights, strict=True):
-        one = renderer._emission(unlit, sight.rays)
+        one = renderer._outgoing(unlit, sight.rays)
         towards = tuple(-way)
         scattered = (1 - medium.forward_fraction) * source.along(towards)
         one = replace(one, diffuse=one.diffuse + scattered)

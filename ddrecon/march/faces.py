@@ -20,7 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import for_channels, thinness
 from ddrecon.numerics.remember import remember
 
@@ -40,7 +40,7 @@ NOWHERE = (False,) * len(FACES)
 """At none of them."""
 
 
-def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
+def extend_fields(emission: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
     """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
@@ -69,7 +69,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     return extended
 
 
-def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | None]:
+def _find_lacks(emission: OutgoingLight, is_line: Sequence[bool]) -> list[Tensor | None]:
     """By how much diffuse light on faces is less than on the line to there (E2.17).
 
     By face [C, rows + 2, columns + 2], or None: less of it comes in than medium sends out.

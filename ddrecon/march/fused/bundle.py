@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
-from ddrecon.march.emission import Emission
 from ddrecon.march.fused.kernels import Layout
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.phase import PhaseFunction, remember_of_phase
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
@@ -54,13 +54,13 @@ def pack_rays(
     return Packed(bundle, origin, direction)
 
 
-def see_beams(emission: Emission, packed: Packed) -> Tensor:
+def see_beams(outgoing: OutgoingLight, packed: Packed) -> Tensor:
     """The `angles` [2 beams, R] at which rays see beams, as of `Given` in `rays.h`."""
     seen = [
         _see_beam(packed.direction, beam.direction)
         if isinstance(beam, Beam)
         else torch.stack(beam.passing(packed.origin, packed.direction))
-        for beam in emission.beams
+        for beam in outgoing.beams
     ]
     if len(seen) == 1:
         return seen[0]
@@ -75,20 +75,20 @@ def _see_beam(direction: Tensor, towards: Tensor) -> Tensor:
     return torch.stack([(angle_of(cosine) * (STEPS / math.pi)).to(cosine), cosine])
 
 
-def table_of(emission: Emission, layout: Layout) -> Tensor:
+def table_of(outgoing: OutgoingLight, layout: Layout) -> Tensor:
     """The tables that kernels read, [tables * (steps + 1) * 2, K]; none where p is constant."""
     if not layout.has_curves:
-        return emission.diffuse.new_empty(0, 1)
-    return emission.seen.table(layout.peak >= 0).to(emission.diffuse).flatten(0, 2)
+        return outgoing.diffuse.new_empty(0, 1)
+    return outgoing.seen.table(layout.peak >= 0).to(outgoing.diffuse).flatten(0, 2)
 
 
-def factors_of(emission: Emission, layout: Layout, angles: Tensor) -> list[Tensor | None]:
+def factors_of(outgoing: OutgoingLight, layout: Layout, angles: Tensor) -> list[Tensor | None]:
     """p of each beam [1 or C, R] where it is the same all along a ray, else None (E2.2)."""
-    count = len(emission.beams)
+    count = len(outgoing.beams)
     if layout.peak >= 0 or layout.numbers:
         return [None] * count
     return [
-        None if is_point else _find_factor(emission.seen.phase, cosine)
+        None if is_point else _find_factor(outgoing.seen.phase, cosine)
         for is_point, cosine in zip(layout.beams, angles[count:], strict=True)
     ]
 
@@ -98,13 +98,13 @@ def _find_factor(phase: PhaseFunction, cosine: Tensor) -> Tensor:
     return phase.value(cosine)
 
 
-def numbers_of(emission: Emission) -> Tensor:
+def numbers_of(outgoing: OutgoingLight) -> Tensor:
     """The scale and the peak of each color, and the bound of third-order corrections."""
-    scale = emission.extinction.scale.view(-1).expand(emission.colors)
-    peak = emission.peak
-    if peak is None or "peak" in emission.fields:
+    scale = outgoing.extinction.scale.view(-1).expand(outgoing.colors)
+    peak = outgoing.peak
+    if peak is None or "peak" in outgoing.fields:
         peak = torch.zeros_like(scale)
-    bound = emission.extinction.mass_bound if emission.beams else 0.0
+    bound = outgoing.extinction.mass_bound if outgoing.beams else 0.0
     return torch.cat(
         [scale, peak.view(-1).expand_as(scale), torch.as_tensor(bound).to(scale).view(1)]
     )

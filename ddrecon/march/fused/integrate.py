@@ -1,4 +1,4 @@
-"""The view-ray integral of an `Emission` by fused kernels: what `march.integral` does in chunks.
+"""The view-ray integral of outgoing light by fused kernels: what `march.integral` does in chunks.
 
 It is one differentiable function of tensors.
 """
@@ -17,7 +17,6 @@ from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission
 from ddrecon.march.fused.bundle import factors_of, numbers_of, pack_rays, see_beams, table_of
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
@@ -27,6 +26,7 @@ from ddrecon.march.fused.kernels import (
     integral_kernel,
     tangent_kernel,
 )
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import Sampler
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -42,37 +42,37 @@ def march_rays(
     sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
-    emission, ends = sampler.emission, (crossing.hit, crossing.near, crossing.far)
-    packed = pack_rays(emission.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
-    layout, (cells, fields) = Layout.of(emission), cells_of(sampler)
-    angles = see_beams(emission, packed)
+    outgoing, ends = sampler.outgoing, (crossing.hit, crossing.near, crossing.far)
+    packed = pack_rays(outgoing.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
+    layout, (cells, fields) = Layout.of(outgoing), cells_of(sampler)
+    angles = see_beams(outgoing, packed)
     out, masses, _ = Integrate.apply(
         layout,
         cells,
         packed.bundle,
         angles,
-        numbers_of(emission),
-        table_of(emission, layout),
+        numbers_of(outgoing),
+        table_of(outgoing, layout),
         packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
         *fields,
     )
     # The walk's masses begin with what is in front.
     own = masses if front is None else masses - front
-    return _compose(emission, out, factors_of(emission, layout, angles)), own
+    return _compose(outgoing, out, factors_of(outgoing, layout, angles)), own
 
 
-def _compose(emission: Emission, out: Tensor, factors: Sequence[Tensor | None]) -> Tensor:
+def _compose(outgoing: OutgoingLight, out: Tensor, factors: Sequence[Tensor | None]) -> Tensor:
     """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
     light that of what remains; beams' irradiances, and p where it is one of the `factors`
     [1 or C, R] (E2.2).
     """
-    diffuse, *arriving = out.split(emission.colors)
-    scattered = diffuse * emission.diffuse_scale.view(-1, 1)
-    for beam, light, factor in zip(emission.beams, arriving, factors, strict=True):
+    diffuse, *arriving = out.split(outgoing.colors)
+    scattered = diffuse * outgoing.diffuse_scale.view(-1, 1)
+    for beam, light, factor in zip(outgoing.beams, arriving, factors, strict=True):
         weighted = light if factor is None else light * factor
-        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + weighted * strength.view(-1, 1)
     return scattered
 

@@ -11,7 +11,7 @@ import torch
 
 from ddrecon.kernels.text import TextKernel, names_of
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.phase_cells import count_powers, is_scaled
 
 _GIVEN = """
@@ -51,12 +51,12 @@ class Layout(NamedTuple):
     bits: int
 
     @staticmethod
-    def of(emission: Emission) -> Layout:
-        """How the fields of `emission` stand in a node."""
-        seen, has_peak = emission.seen, emission.peak is not None
-        counts = {name: len(field) for name, field in emission.fields.items()}
+    def of(outgoing: OutgoingLight) -> Layout:
+        """How the fields of `outgoing` stand in a node."""
+        seen, has_peak = outgoing.seen, outgoing.peak is not None
+        counts = {name: len(field) for name, field in outgoing.fields.items()}
         return Layout(
-            emission.colors,
+            outgoing.colors,
             counts["extinction"],
             counts["diffuse"],
             counts.get("scattering", 0),
@@ -64,11 +64,11 @@ class Layout(NamedTuple):
             counts.get("peak", 0) if has_peak else -1,
             counts.get("number", 0),
             counts.get("remaining", 0),
-            len(seen.table(has_peak)) if emission.beams else 1,
+            len(seen.table(has_peak)) if outgoing.beams else 1,
             count_powers(seen.phase, has_peak),
             seen.phase.cells is not None and is_scaled(seen.phase.kind),
-            tuple(isinstance(beam, PointBeam) for beam in emission.beams),
-            torch.finfo(emission.diffuse.dtype).bits,
+            tuple(isinstance(beam, PointBeam) for beam in outgoing.beams),
+            torch.finfo(outgoing.diffuse.dtype).bits,
         )
 
     @property
