@@ -34,10 +34,10 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import MissingExtraError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, variable_names, with_values

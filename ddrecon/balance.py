@@ -28,6 +28,8 @@ from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
+from ddrecon.light_field import fluence_of, multiply_scatters
+from ddrecon.lighting import solve_light
 from ddrecon.march.direct import Beamed, shine_on, transmittance
 from ddrecon.march.ground import LitGround
 from ddrecon.medium.coefficients import Medium, keep_medium
@@ -35,7 +37,6 @@ from ddrecon.medium.fresnel import reflectance, transmitted_moments
 from ddrecon.medium.levels import refine_medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.renderer import fluence_of, multiply_scatters, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.transport.bounced import TURNS, follow_inside

@@ -12,13 +12,14 @@ from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
-from ddrecon.renderer import solve_light, view_picture
+from ddrecon.picture import view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.uncertainty.curvature import Curvature

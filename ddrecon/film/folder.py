@@ -37,13 +37,13 @@ from ddrecon.scene_file.load import (
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
-SHARE = 6
+FEWER = 6
 """A frame that begins with another makes so many times fewer iterations: the last of its run."""
 FINAL_RATE = 0.05
 """The part of their value to which learning rates fall; with a larger one films flicker more."""
-KEPT = 0.2
+MIXED = 0.2
 """It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
-FARTHEST = 3
+MOST_APART = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
@@ -119,7 +119,7 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            optimize |= {"begin_at": 1 - 1 / SHARE, "final_rate": FINAL_RATE, "keep_start": KEPT}
+            optimize |= {"begin_at": 1 - 1 / FEWER, "final_rate": FINAL_RATE, "keep_start": MIXED}
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
@@ -149,7 +149,7 @@ class Film:
 
     def _near(self, number: int) -> tuple[list[int], list[int]]:
         """The frames that are done and close to the frame `number`: before it, and after it."""
-        far = FARTHEST * self.frames.step
+        far = MOST_APART * self.frames.step
         near = [n for n in self.done() if 0 < abs(n - number) <= far]
         return [n for n in near if n < number], [n for n in near if n > number]
 

@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light_field import LightField
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_present
-from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values

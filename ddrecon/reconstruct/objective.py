@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.picture import render_each
 from ddrecon.ranks import sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import own_views
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
 from ddrecon.variables.values import variable_names, with_values

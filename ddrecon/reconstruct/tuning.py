@@ -49,7 +49,7 @@ TRUST = 0.5
 calibration as if each image were known no better."""
 
 # How long a run is, and how exact (`schedule`, `levels`).
-PLANNED, MOST = 300, 1000
+PLANNED, MOST_ITERATIONS = 300, 1000
 """A run that ends by itself refines and slows down as one of so many iterations, or sooner; and
 makes at most so many."""
 WINDOW, FALL = 20, 0.01

@@ -24,9 +24,11 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError, UsageError, suggestion
+from ddrecon.light_field import LightField
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
+from ddrecon.picture import view_picture
 from ddrecon.progress import Progress
-from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import SHORT_STEPS, is_of_volume, kind_of
 from ddrecon.variables.values import (

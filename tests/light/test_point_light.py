@@ -16,7 +16,7 @@ from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import follow_point_light, receive_point_light
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.settings import RenderSettings
 
 SHAPE = (5, 4, 6)

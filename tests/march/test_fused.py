@@ -16,7 +16,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values

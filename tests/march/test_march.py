@@ -16,7 +16,7 @@ from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 

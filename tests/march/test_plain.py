@@ -25,6 +25,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.point_light import PointBeam
+from ddrecon.lighting import send, solve_light
 from ddrecon.march.box import intersect_box
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
@@ -32,7 +33,6 @@ from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.third_order import ThirdOrder
-from ddrecon.renderer import _outgoing, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
@@ -160,7 +160,7 @@ def unattenuated(
 
 def emit(scene: Scene) -> tuple[OutgoingLight, Rays]:
     rays = cast_rays(scene.views[0].camera)
-    return _outgoing(solve_light(scene, SolveMemory()), rays), rays
+    return send(solve_light(scene, SolveMemory()), rays), rays
 
 
 def march_fast(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:

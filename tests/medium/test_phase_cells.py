@@ -8,11 +8,12 @@ from media import make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.renderer import render, solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 
