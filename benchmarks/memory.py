@@ -49,7 +49,7 @@ SOLVE = """
 import sys, torch
 from pathlib import Path
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import solve_light
+from ddrecon.lighting import solve_light
 from ddrecon.scene_file.build import load_scene
 scene = load_scene(Path(sys.argv[1]))
 density = scene.volume.density.requires_grad_()
@@ -138,14 +138,12 @@ def place() -> str:
 def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, float, str]:
     """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
     import numpy as np
-    from ddrecon.diffusion.solvers.fused import multigrid
 
     from ddrecon.diffusion.implicit import SolveMemory
+    from ddrecon.picture import render_each
     from ddrecon.reconstruct.loop import Reconstruction
-    from ddrecon.renderer import render_each
     from ddrecon.scene_file.build import load_scene
 
-    multigrid.ALONE = 0  # as of a large volume
     np.save(folder / "view.npy", np.full((16, 16, 3), 0.1, np.float32))
     path = folder / "scene.yaml"
     path.write_text(json.dumps(scene_of(cells, 16, case, is_optimized=True)))

@@ -32,7 +32,7 @@ from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
-WIDE = 8.0
+TOO_WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
@@ -153,7 +153,7 @@ def lines(report: dict[str, Any]) -> list[str]:
 
 def _advise_on_cells(width: float) -> str:
     """What to change where all views see cells at least so many pixels wide."""
-    if width < WIDE:
+    if width < TOO_WIDE:
         return ""
     return (
         f", which show less than the pictures: {CELL:g} would do, by smaller cells "

@@ -26,9 +26,9 @@ from ddrecon.march.box import cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
-LOOKED_AT = 8192
+TRACED_PIXELS = 8192
 """About the most pixels of a view that are traced to see what is cut off."""
-LOST = 0.002
+CUT_LIGHT = 0.002
 """The part of a view's light that a support may cut off without a warning."""
 KEY = "optimize.parameters.density.support"
 
@@ -84,7 +84,7 @@ class Support:
         may_hold, seen = self._hulls(grid)
         leaves_out = (~may_hold & seen).flatten(1)
         for view, shown in zip(self.views, self.shown, strict=True):
-            every = 1 + int(shown.sum()) // LOOKED_AT
+            every = 1 + int(shown.sum()) // TRACED_PIXELS
             index = shown.flatten().nonzero()[::every, 0]
             rays = cast_rays(view.camera).select(index)
             crossing = cross_box(grid, rays)
@@ -141,7 +141,7 @@ def find_cut(support: Support, grid: Grid) -> str | None:
         strength = (view.image - (0.0 if view.background is None else view.background)).abs()
         light = strength.amax(0).flatten()
         share = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
-        if share > LOST:
+        if share > CUT_LIGHT:
             cut[view.name], by = share, [a + b for a, b in zip(by, alone, strict=True)]
     if not cut:
         return None

@@ -1,7 +1,7 @@
-"""What experiments say of each cell and number: deviations, and how often they held (E11.4).
+"""Deviations of each cell and number by experiments, and how often they held (E11.4).
 
 A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
-a factor for its class, times `SHORT`.
+a factor for its class, times `RATIO`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from ddrecon.uncertainty.experiments import Uncertainty, is_tabled
 from ddrecon.variables.kinds import split_name
 from ddrecon.variables.values import component_names
 
-WITHIN = 0.68
+COVERED = 0.68
 """The share of cells within one deviation."""
-SHORT = 1.55
+RATIO = 1.55
 """The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
 lack what no reconstruction shows (docs/uncertainty.md)."""
 EMPTY = 0.02
 """Cells of less than this part of the largest are empty."""
 WIDTH = 3
 """Cells a side over which errors are averaged,"""
-WIDE = 9
+SMOOTH = 9
 """and over which samples hang together."""
 
 
@@ -84,7 +84,7 @@ class Field:
         """The deviation by all experiments `but` one; unseen cells have at least that of noise."""
         spread, deviation = self.spread(but), self.left.sqrt()
         for name, cells in self.classes.items():
-            by_errors = SHORT * self.factors[name] * spread
+            by_errors = RATIO * self.factors[name] * spread
             if name == "unseen":
                 by_errors = torch.maximum(by_errors, deviation)
             deviation = torch.where(cells, by_errors, deviation)
@@ -120,10 +120,10 @@ class Field:
         if not self.errors:
             return {}
         errors = [(at, error.abs()[where]) for at, error in enumerate(self.errors)]
-        factors = [SHORT * _find_within(error / self.spread(at)[where]) for at, error in errors]
+        factors = [RATIO * _find_within(error / self.spread(at)[where]) for at, error in errors]
         sizes = torch.cat([error / self.deviation_but(at)[where] for at, error in errors])
         within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
-        factors_of_class = {"factor": SHORT * self.factors[name], "factors": factors}
+        factors_of_class = {"factor": RATIO * self.factors[name], "factors": factors}
         return factors_of_class | (within if len(errors) > 1 else {})
 
     def draw(self, generator: torch.Generator) -> Tensor:
@@ -185,7 +185,7 @@ def _with_deviation(value: float, errors: Tensor) -> dict[str, float | None]:
     """A number with its deviation, by the `errors` of experiments: wider where there are few."""
     count = len(errors)
     size = float(errors.double().square().mean().sqrt()) if count else None
-    return {"value": value, "deviation": size and SHORT * (1 + 2 / count) * size}
+    return {"value": value, "deviation": size and RATIO * (1 + 2 / count) * size}
 
 
 def _entry_names(parameter: Parameter) -> Sequence[str]:
@@ -198,12 +198,12 @@ def _entry_names(parameter: Parameter) -> Sequence[str]:
 
 
 def _find_within(sizes: Tensor) -> float:
-    """What `WITHIN` of the `sizes` are at most; 1 where there are none."""
+    """What `COVERED` of the `sizes` are at most; 1 where there are none."""
     count = sizes.numel()
-    return float(sizes.flatten().kthvalue(math.ceil(WITHIN * count)).values) if count else 1.0
+    return float(sizes.flatten().kthvalue(math.ceil(COVERED * count)).values) if count else 1.0
 
 
 def _draw_smooth(like: Tensor, generator: torch.Generator) -> Tensor:
-    """A random field like `like`, of mean square 1, smooth over `WIDE` cells."""
-    wave = mean_around(torch.randn(like.shape, generator=generator, dtype=like.dtype), WIDE)
+    """A random field like `like`, of mean square 1, smooth over `SMOOTH` cells."""
+    wave = mean_around(torch.randn(like.shape, generator=generator, dtype=like.dtype), SMOOTH)
     return wave / wave.square().mean().sqrt()

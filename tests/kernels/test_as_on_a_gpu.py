@@ -13,7 +13,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.medium.phase_blend import TwoLobe
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, variable_names, with_values

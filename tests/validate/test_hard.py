@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ddrecon.diffusion import solve
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import render, solve_light
+from ddrecon.lighting import solve_light
+from ddrecon.picture import render
 from ddrecon.validate import hard
 from ddrecon.validate.hard import CASES, TOLERANCE, HardCase, HardResult, balance_of, run_case
 
@@ -45,8 +46,8 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
-    name, renderer = "g -0.99, density jumps by 1e6", import_module("ddrecon.renderer")
-    monkeypatch.setattr(renderer, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
+    name, lighting = "g -0.99, density jumps by 1e6", import_module("ddrecon.lighting")
+    monkeypatch.setattr(lighting, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
     assert run_case(name, CASES[name], CPU).failures() == ["radiance"]
 
 
