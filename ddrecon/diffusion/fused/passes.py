@@ -334,14 +334,14 @@ class KernelCycle:
         work = source.new_empty(program.size)
         self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
         self._first, self._others = program.cut(0, 1), program.cut(1, len(program.rows))
-        self.direction, self.residual, self._product, self._solution = (
+        self.direction, self.residual, self.room, self._solution = (
             work[vector.place :][: source.numel()].view_as(source) for vector in vectors
         )
 
     def product(self) -> Tensor:
         """A times the direction."""
         launch(self._bound, self._first)
-        return self._product
+        return self.room
 
     def cycle(self) -> Tensor:
         """Roughly A^-1 times the residual."""
