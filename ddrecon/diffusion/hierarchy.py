@@ -108,10 +108,10 @@ class Passes:
             resistance = torch.full_like(resistance, math.inf)
         below, above = half / resistance, half.roll(-1, axis) / resistance
         coarsening = Coarsening(axis, cells, below, above)
-        coarse = [sum(_pairs(c, axis)) for c in operator.conductances]
+        coarse = [torch.add(*_pairs(c, axis)) for c in operator.conductances]
         coarse[axis - 1] = 1 / resistance + _stiffness(coarsening, operator)
         z, y, x = coarse
-        loss = sum(_pairs(operator.loss, axis))
+        loss = torch.add(*_pairs(operator.loss, axis))
         return coarsening, Operator((z, y, x), loss, operator.periodic)
 
     def matrix(self, operator: Operator) -> Tensor:
@@ -230,7 +230,7 @@ class Hierarchy:
         shape = tuple(operator.loss.shape[1:])
         guess = _usual_axes.get(shape, [])
         while True:
-            levels, ties, grid = [], list[Tensor](), operator
+            levels, ties, grid = list[Level](), list[Tensor](), operator
             while _is_level(grid, is_finest=not levels):
                 inverse, kept, tie = passes.scale(grid)
                 axes = guess[len(levels)] if len(levels) < len(guess) else _long_axes(grid)

@@ -102,14 +102,15 @@ def _iterate(
         return _sum_cells(torch.mul(a, a, out=room).mul_(inverse))
 
     source_square = square_norm(source).clamp(min=tiny)
-    residual.copy_(source)
-    if guess is not None and guess.shape == source.shape:
+    if guess is None or guess.shape != source.shape:
+        residual.copy_(source)
+    else:
         direction.copy_(guess)
-        left = source - cycle.product()
+        torch.sub(source, cycle.product(), out=residual)
         # A guess that is worse than zero is not used.
-        helps = square_norm(left) <= source_square
+        helps = square_norm(residual) <= source_square
         u = torch.where(helps, guess, u)
-        residual.copy_(torch.where(helps, left, source))
+        residual.copy_(torch.where(helps, residual, source))
     direction.zero_()
     power, iteration = torch.ones_like(source_square), 0
     while True:
