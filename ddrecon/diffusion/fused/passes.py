@@ -21,6 +21,7 @@ from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Pas
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
@@ -33,6 +34,8 @@ long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u
 F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *results[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
+TOGETHER = 400
+"""Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
@@ -222,6 +225,28 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
     return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
 
 
+def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
+    """`numbers` where `like` lies."""
+    if may_read():
+        # Without waiting: the numbers have left the processor's memory when this returns.
+        return torch.tensor(numbers).to(like.device, non_blocking=True)
+    # A graph copies nothing from there; it keeps what kernels are given by value.
+    table = like.new_empty(len(numbers), dtype=torch.int64)
+    for start in range(0, len(numbers), TOGETHER):
+        row = [*numbers[start : start + TOGETHER]]
+        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, given, {"table": table})
+    return table
+
+
+@functools.cache
+def table_kernel() -> TextKernel:
+    """Writes numbers that it is given to a table."""
+    text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
+    given = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, given, "table")
+
+
 class Program:
     """A table of passes where kernels see it, and the launches that do them.
 
@@ -233,9 +258,8 @@ class Program:
         self.kernel = passes_kernel(name, 8 * like.itemsize)
         self.rows, self.tensors = [*passes.rows], [*passes.tensors]
         names = [*entries_of(PASS)]
-        table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
-        # Without waiting: the numbers have left the processor's memory when this returns.
-        self.table = table.to(like.device, non_blocking=True)
+        numbers = [row.get(name, 0) for row in self.rows for name in names]
+        self.table = _write_table(numbers, like)
         # So many cells of all colors are best done by one thread for each color.
         self.most = -1 if like.is_cuda else SMALL
         if not like.is_cuda and thread_count(like) <= self.colors:
