@@ -52,7 +52,7 @@ def solve_by_multigrid(
         raise SolveError(
             "multigrid did not reach its tolerance",
             solution.iterations,
-            solution.residual,
+            float(solution.residual),
             "raise diffusion.tolerance or use --dtype float64",
         )
     return solution
