@@ -167,7 +167,7 @@ class KernelPasses(Passes):
         """Lists a pass along one axis, or more on a GPU. Across it rows need not be told apart."""
         axes = {coarsening.axis for coarsening in coarsenings}
         if not self.is_by_cell:
-            shape, grid = (_merge_axes(each, axes) for each in (shape, grid))
+            shape, grid = (_merge_axes(sizes, axes) for sizes in (shape, grid))
         self._add(kind, shape, operator, coarsenings, grid=grid, rows=1, **values)
 
     def _add(
@@ -234,8 +234,8 @@ def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
     table = like.new_empty(len(numbers), dtype=torch.int64)
     for start in range(0, len(numbers), TOGETHER):
         row = [*numbers[start : start + TOGETHER]]
-        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
-        table_kernel().launch(1, given, {"table": table})
+        values = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, values, {"table": table})
     return table
 
 
@@ -243,8 +243,8 @@ def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
 def table_kernel() -> TextKernel:
     """Writes numbers that it is given to a table."""
     text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
-    given = f"long n[{TOGETHER}], start, count, *table"
-    return TextKernel("multigrid_table", 64, text, given, "table")
+    declared = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, declared, "table")
 
 
 class Program:
