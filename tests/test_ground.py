@@ -39,6 +39,7 @@ from ddrecon.light.lights import (
 from ddrecon.march import ground as below
 from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Volume
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene, View
@@ -195,8 +196,8 @@ def test_directions_together_are_each_by_itself(g: float) -> None:
     source, total = lit.received.source, torch.zeros(3, texels[..., 0].numel()).double()
     for way, angle, sight in zip(ways, angles, sights, strict=True):
         one = renderer._emission(unlit, sight.rays)
-        towards = tuple(-way)
-        scattered = (1 - medium.forward_fraction) * source.along(towards)
+        values = harmonics(-way, medium.degree).view(-1, 1, 1, 1, 1)
+        scattered = (1 - medium.forward_fraction) * (values * source).sum(0)
         one = replace(one, diffuse=one.diffuse + scattered)
         seen = march(one, sight, scene.render, behind.expand(3, len(sight.rays.origin)))
         total = total + angle * way[plane.axis] * (seen - behind)

@@ -38,31 +38,16 @@ INLINE void fill_harmonics(const N* v, const N& square, const N& cosine, const N
             v, square, v[2] * cosine - v[1] * sine, v[2] * sine + v[1] * cosine, y);
 }
 
-// `even` + `along`, floored below a `margin` of their sizes; with its slopes by both.
-template <class F> struct Bent {
-    F value, by_even, by_along;
-    INLINE Bent(F even, F along, F margin, F least) {
-        const F r = even + along, size = margin * (size_of(even) + size_of(along));
-        const F divisor = size > least ? size : least, part = r / divisor;
-        const F opened = F(1) + (part < F(-1) ? F(-1) : (part > F(1) ? F(1) : part));
-        const bool is_inside = (r >= -divisor) & (r <= divisor), is_whole = r >= size;
-        const F slope = is_inside ? F(0.5) * opened * (size / divisor) : F(0);
-        const F moved = size >= least ? slope * part : F(0);
-        const F by_size = is_whole ? F(0) : margin * (F(0.25) * opened * opened - moved);
-        value = is_whole ? r : F(0.25) * size * opened * opened;
-        by_even = (is_whole ? F(1) : slope) + by_size * sign_of(even);
-        by_along = (is_whole ? F(1) : slope) + by_size * sign_of(along);
-    }
-    static INLINE F size_of(F x) { return x < F(0) ? -x : x; }
-    static INLINE F sign_of(F x) { return x < F(0) ? F(-1) : (x > F(0) ? F(1) : F(0)); }
-};
-template <class F> INLINE F floored(F even, F along, F margin, F least) {
-    return Bent<F>(even, along, margin, least).value;
+// `even` + `along`, floored below a `margin` of their sizes: `floored` in `light/moments.py`.
+template <class N> INLINE N size_of(const N& x) {
+    return pick(value_of(x) > 0, x, pick(value_of(x) < 0, -x, N(0)));
 }
-template <class F>
-INLINE Dual<F> floored(const Dual<F>& even, const Dual<F>& along, F margin, F least) {
-    const Bent<F> found(even.value, along.value, margin, least);
-    return even.chain(found.value, found.by_even, along, found.by_along);
+template <class N, class F> INLINE N floored(const N& even, const N& along, F margin, F least) {
+    const N r = even + along, size = margin * (size_of(even) + size_of(along));
+    const N part = r / pick(value_of(size) >= least, size, N(least));
+    const N low = pick(value_of(part) >= F(-1), part, N(F(-1)));
+    const N opened = F(1) + pick(value_of(low) <= F(1), low, N(F(1)));
+    return pick(value_of(r) >= value_of(size), r, F(0.25) * size * opened * opened);
 }
 
 // Where the camera is: at a point, or without `is_eye` in a direction; and what cells see of it.
@@ -148,9 +133,10 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
         for (int i = 0; i < row.width; ++i) {
             Directed<N> found;
             direct(view, first, i, eye, factor, in, found);
-            const F even = factor[0] * in[0][i];
-            const Bent<F> whole(even, value_of(found.along), view.margin, view.least);
-            const F even_bar = bar[i] * whole.by_even, along_bar = bar[i] * whole.by_along;
+            Dual<F, 2> even(factor[0] * in[0][i]), along(value_of(found.along));
+            even.by[0] = along.by[1] = F(1);
+            const Dual<F, 2> radiance = floored(even, along, view.margin, view.least);
+            const F even_bar = bar[i] * radiance.by[0], along_bar = bar[i] * radiance.by[1];
             sum[FACTOR] += in[0][i] * even_bar;
             out[0][i] = factor[0] * even_bar;
             UNROLLED

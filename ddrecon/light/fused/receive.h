@@ -6,21 +6,13 @@
 
 namespace ddrecon {
 
-// exp(-mass) phi(depth), with its slopes by both.
-template <class F> struct Visible {
-    F value, by_mass, by_depth;
-    INLINE Visible(F mass, F depth) {
-        const F clear = decay(mass);
-        const Decayed<F> cell = decayed(depth);
-        value = clear * cell.phi;
-        by_mass = -value;
-        by_depth = clear * (cell.psi - cell.phi);
-    }
-};
-template <class F> INLINE F visible(F mass, F depth) { return Visible<F>(mass, depth).value; }
-template <class F> INLINE Dual<F> visible(const Dual<F>& mass, const Dual<F>& depth) {
-    const Visible<F> found(mass.value, depth.value);
-    return mass.chain(found.value, found.by_mass, depth, found.by_depth);
+// exp(-mass) phi(depth).
+template <class N> INLINE N visible(const N& mass, const N& depth) {
+    const auto clear = decay(value_of(mass));
+    const auto cell = decayed(value_of(depth));
+    typedef Sloped<decltype(cell.phi + clear)> Function;
+    return along(mass, Function{clear, -clear}) *
+           along(depth, Function{cell.phi, cell.psi - cell.phi});
 }
 
 // What all beams have: fields [channels, cells], weights [lights, moments, colors], and the path of
@@ -86,46 +78,43 @@ template <class F, int CHUNK> struct Receiver {
         const long long begin = ((long long)item + first_item) * CHUNK;
         const int count = count_from(begin);
         for (int i = 0; i < lights * channels; ++i) {
-            const int one = i / channels, channel = i % channels;
+            const int light = i / channels, channel = i % channels;
             const F* __restrict e = entered + i * cells + begin;
             const F* __restrict f = field + channel * cells + begin;
-            const F own_step = steps[one];
-            double* found = sums + ((long long)item * lights + one) * (1 + (1 + moments) * colors);
-            F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
-            for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
+            F* __restrict e_bar = entered_bar + i * cells + begin;
+            F* __restrict f_bar = field_bar + channel * cells + begin;
+            double* sum = sums + ((long long)item * lights + light) * (1 + (1 + moments) * colors);
+            for (int t = 0; t < count; ++t) e_bar[t] = F(0);
             const int last = channels == 1 ? colors : channel + 1;
             for (int c = channels == 1 ? 0 : channel; c < last; ++c) {
-                const F s = scale[c];
-                F bar[CHUNK], seen[CHUNK], of_scale[CHUNK];
+                const F s = scale[c], step = s * steps[light];
+                F bar[CHUNK], seen[CHUNK], of_scale[CHUNK], of_step[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
-                    const F own = weights[weight(one, a, c)];
+                    const F own = weights[weight(light, a, c)];
                     const F* __restrict from = bars + moment(a, c) + begin;
                     for (int t = 0; t < count; ++t) bar[t] += own * from[t];
                 }
                 for (int t = 0; t < count; ++t) {
-                    const F path = own_step * f[t];
-                    const Visible<F> tau(s * e[t], s * path);
-                    const F mass_bar = tau.by_mass * bar[t], depth_bar = tau.by_depth * bar[t];
+                    Dual<F, 2> mass(s * e[t]), depth(step * f[t]);
+                    mass.by[0] = depth.by[1] = F(1);
+                    const Dual<F, 2> tau = visible(mass, depth);
+                    const F mass_bar = tau.by[0] * bar[t], depth_bar = tau.by[1] * bar[t];
                     seen[t] = tau.value;
-                    of_entered[t] += s * mass_bar;
-                    of_field[t] += s * own_step * depth_bar;
-                    of_scale[t] = path * depth_bar + e[t] * mass_bar;
+                    e_bar[t] += s * mass_bar;
+                    f_bar[t] += step * depth_bar;
+                    of_scale[t] = steps[light] * f[t] * depth_bar + e[t] * mass_bar;
                     of_step[t] = s * f[t] * depth_bar;
                 }
                 if (!varies) continue;
-                found[0] += total(of_step, count);
-                found[1 + c] = total(of_scale, count);
+                sum[0] += total(of_step, count);
+                sum[1 + c] = total(of_scale, count);
                 for (int a = 0; a < moments; ++a) {
                     const F* __restrict from = bars + moment(a, c) + begin;
                     for (int t = 0; t < count; ++t) of_scale[t] = from[t] * seen[t];
-                    found[1 + (1 + a) * colors + c] = total(of_scale, count);
+                    sum[1 + (1 + a) * colors + c] = total(of_scale, count);
                 }
             }
-            F* __restrict out = entered_bar + i * cells + begin;
-            F* __restrict of_cell = field_bar + channel * cells + begin;
-            for (int t = 0; t < count; ++t) out[t] = of_entered[t];
-            for (int t = 0; t < count; ++t) of_cell[t] += of_field[t];
         }
     }
 };
