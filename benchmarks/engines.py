@@ -22,7 +22,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, with_values

@@ -49,7 +49,7 @@ SOLVE = """
 import sys, torch
 from pathlib import Path
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import solve_light
+from ddrecon.lighting import solve_light
 from ddrecon.scene_file.build import load_scene
 scene = load_scene(Path(sys.argv[1]))
 density = scene.volume.density.requires_grad_()
@@ -140,12 +140,10 @@ def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, flo
     import numpy as np
 
     from ddrecon.diffusion.implicit import SolveMemory
-    from ddrecon.diffusion.solvers.fused import multigrid
+    from ddrecon.picture import render_each
     from ddrecon.reconstruct.loop import Reconstruction
-    from ddrecon.renderer import render_each
     from ddrecon.scene_file.build import load_scene
 
-    multigrid.ALONE = 0  # as of a large volume
     np.save(folder / "view.npy", np.full((16, 16, 3), 0.1, np.float32))
     path = folder / "scene.yaml"
     path.write_text(json.dumps(scene_of(cells, 16, case, is_optimized=True)))

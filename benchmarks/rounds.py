@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 

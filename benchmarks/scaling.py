@@ -26,8 +26,8 @@ from ddrecon.bench.plume import plume_scene
 from ddrecon.cameras import look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light.lights import DirectionalLight
+from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings, ParameterSettings
 

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import DirectionalLight

@@ -34,7 +34,7 @@ from torch.nn.functional import interpolate
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings

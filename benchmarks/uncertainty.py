@@ -30,9 +30,9 @@ from torch import Tensor
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.numerics.around import mean_around
+from ddrecon.picture import render
 from ddrecon.reconstruct.levels import resample, scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.turntable import place_turntable

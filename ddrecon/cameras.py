@@ -96,17 +96,17 @@ class Pane:
     index: float
 
     def bend(self, eye: Tensor, away: Sequence[Tensor]) -> list[Tensor]:
-        """Where light from an `eye` before the pane comes from in points `away` from it, behind it.
+        """The directions (z, y, x), of any length, to an `eye` before the pane from points `away`
+        from the eye, behind it.
 
-        All along z, y, x: of any length. With t the tangent of the angle before the pane, at the
-        heights H and d before and behind it, Snell's law has the distance across as
-        H t + d t / sqrt(n^2 + (n^2 - 1) t^2).
+        With t the tangent of the angle before the pane, at the heights H and d before and behind
+        it, Snell's law has the distance across as H t + d t / sqrt(n^2 + (n^2 - 1) t^2).
         """
         before = (eye[self.axis] - self.place).abs()
         behind = away[self.axis].abs() - before
-        square = sum(one**2 for axis, one in enumerate(away) if axis != self.axis)
+        square = sum(along**2 for axis, along in enumerate(away) if axis != self.axis)
         excess, squared = (self.index**2 - 1) * square, self.index**2
-        # By Newton's method, of t over the distance: from 0 up, and it never comes beyond.
+        # Newton's method for t over the distance: from 0 up, and it never comes beyond.
         tangent = torch.zeros_like(square + behind)
         for step in range(NEWTON_STEPS):
             # The last step's derivative is that of the implicit function.
@@ -116,7 +116,7 @@ class Pane:
                 tangent = tangent - ((before + behind / root) * tangent - 1) / slope
         inside = tangent / (squared + excess * tangent**2).sqrt()
         side = away[self.axis].sign()
-        return [-side if axis == self.axis else -inside * one for axis, one in enumerate(away)]
+        return [-side if axis == self.axis else -inside * along for axis, along in enumerate(away)]
 
 
 @dataclass(frozen=True)
@@ -187,14 +187,13 @@ def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
 def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:
     """The rays through every pixel, row by row, R = height * width for each of `offsets`.
 
-    These say where rays pass through their pixels, as parts of it (row, column): without any, in
-    the middle.
+    `offsets`: where rays pass through their pixels, as parts of these (row, column); the middle
+    where there is none.
     """
     right, up, backward, origin = camera.pose.unbind(1)
     places = torch.cat([image_places(camera, offset) for offset in offsets or [(0.5, 0.5)]])
     if not camera.is_perspective:
-        x, y = places.unbind(1)
-        plane = x[:, None] * right - y[:, None] * up
+        plane = places @ torch.stack([right, -up])
         return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)
     direction = array_order(_look_through(camera, places))
     eye = array_order(origin)
@@ -204,49 +203,42 @@ def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:
 def _look_through(camera: Camera, places: Tensor) -> Tensor:
     """Unit directions (x, y, z) from a perspective camera through `places` [R, 2]."""
     right, up, backward, _ = camera.pose.unbind(1)
-    x, y = places.unbind(1)
     if camera.lens is None or camera.distortion is None:
-        way = x[:, None] * right - y[:, None] * up - backward
+        direction = places @ torch.stack([right, -up]) - backward
     else:
-        seen = ray_through(camera.lens, camera.distortion, torch.stack([x, y], 1))
-        way = seen @ torch.stack([right, -up, -backward])
-    return torch.nn.functional.normalize(way, dim=-1)
+        through_lens = ray_through(camera.lens, camera.distortion, places)
+        direction = through_lens @ torch.stack([right, -up, -backward])
+    return torch.nn.functional.normalize(direction, dim=-1)
 
 
 def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Tensor:
-    """Where pixels lie in the plane one unit in front of a perspective camera, `[R, 2]`.
+    """Where pixels lie, `[R, 2]` (to the right and down), row by row.
 
-    To the right and down; of an orthographic camera in its image plane, in world units. `offset` is
-    as for `cast_rays`.
+    Of a perspective camera in the plane one unit in front of it, of an orthographic one in its
+    image plane, in world units. `offset` is as for `cast_rays`.
     """
-    y, x = torch.meshgrid(*_lines_of_pixels(camera, offset), indexing="ij")
-    return torch.stack([x, y], -1).view(-1, 2)
+    (height, width), like, middle = camera.size, camera.pose, camera.principal_point
+    row, column = (
+        torch.arange(count, dtype=like.dtype, device=like.device) + shift
+        for count, shift in zip((height, width), offset, strict=True)
+    )
+    step = camera.half_width * 2 / width
+    down = (row - middle[1] * height) * (step * camera.pixel_aspect)
+    right = (column - middle[0] * width) * step
+    return torch.stack(torch.meshgrid(right, down, indexing="xy"), -1).view(-1, 2)
 
 
 def edge_places(camera: Camera) -> Tensor:
     """Those of `image_places` that lie along the edges of the image."""
-    y, x = _lines_of_pixels(camera, (0.5, 0.5))
-    return torch.cat([torch.cartesian_prod(x, y[[0, -1]]), torch.cartesian_prod(x[[0, -1]], y)])
-
-
-def _lines_of_pixels(camera: Camera, offset: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """How far down rows and to the right columns of pixels lie, as `image_places` has them."""
-    height, width = camera.size
-    like, middle = camera.pose, camera.principal_point
-    row, column = (
-        torch.arange(count, dtype=like.dtype, device=like.device) + part
-        for count, part in zip((height, width), offset, strict=True)
-    )
-    step = camera.half_width * 2 / width
-    rows = (row - middle[1] * height) * (step * camera.pixel_aspect)
-    return rows, (column - middle[0] * width) * step
+    places = image_places(camera).view(*camera.size, 2)
+    return torch.cat([places[0], places[-1], places[:, 0], places[:, -1]])
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Where `points` [N, 3] (x, y, z) [u] are seen, `[N, 2]`, and how far away, `[N]`.
 
-    In columns and rows from the image's top left corner; NaN where they are not: behind a
-    perspective camera, or beyond the corners of its image, where distortion may have folded over.
+    In columns and rows from the image's top left corner; NaN behind a perspective camera, and
+    beyond the corners of its image, where distortion may have folded over.
     """
     right, up, backward, origin = camera.pose.detach().unbind(1)
     away = points - origin
@@ -258,7 +250,7 @@ def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
         places = ray[:, :2] / ray[:, 2:]
         if camera.lens is not None and camera.distortion is not None:
             places = distort(camera.lens, camera.distortion.detach(), ray)
-        # The farthest from the axis are at the image's edges.
+        # The places farthest from the axis are at the image's edges.
         cosine = -(_look_through(camera, edge_places(camera)).detach() @ backward)
         is_seen = ray[:, 2] / away.norm(dim=1) >= cosine.min() - 1e-6
     step = 2 * float(camera.half_width) / width

@@ -24,8 +24,8 @@ CHOICES = ("auto", *ENGINES)
 TORCH_ALONE: dict[str, frozenset[str]] = {
     "view rays": frozenset(),
     "light": frozenset(),
-    "diffusion": frozenset({"gpu", "periodic", "printed", "flux_limited"}),
-    "transport rounds": frozenset({"gpu", "periodic", "refracting"}),
+    "diffusion": frozenset({"printed", "flux_limited"}),
+    "transport rounds": frozenset(),
 }
 """Each part of the renderer, and the traits of a scene with any of which torch runs it."""
 CACHE = "WARP_CACHE_PATH"

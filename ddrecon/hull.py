@@ -1,7 +1,7 @@
 """Visual hulls: where there may be smoke, by what views show, and the box around it.
 
-A place is left out where any view that sees it sees nothing there (Laurentini 1994,
-doi:10.1109/34.273735). Pictures are taken at full resolution, whatever the grid's.
+A place is left out where a view looks at it and shows nothing (Laurentini 1994,
+doi:10.1109/34.273735). Pictures are used at full resolution, whatever the grid's.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 
 DARKEST = 0.1
-"""So much of each picture, at least, is background. Chosen on the capture, as what follows."""
+"""The least part of each picture that is background. Chosen on the capture, as the next three."""
 DEVIATIONS = 4.0
-"""Black is less than so many deviations of noise above it."""
+"""Deviations of noise above the darkest pixels up to which a pixel is black."""
 TAIL = 0.98
-"""This part of black is within two deviations."""
+"""The part of black pixels within two deviations."""
 TOGETHER = 0.3
-"""Smoke is where this part of neighbors show something; what noise shows stands alone."""
+"""The part of neighbors that show something around smoke; noise stands alone."""
 MOST_PIXELS = 256
-"""Neighbors are those in a picture of at most so many pixels along a side, and so are boxes."""
+"""Pixels a side of the reduced pictures in which neighbors are counted and boxes found."""
 BOX_CELLS, SHRINKS = 48, 0.97
-"""A box is cut to the cells that are left of so many along each side, again and again until no side
-shrinks below this part of itself."""
+"""Cells along each side of a box, which is cut to those that are left, until no side shrinks below
+this part of itself."""
 
 
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
-"""A box is far too large if less than the first part of it may hold smoke, is elsewhere or far too
-small if it has less than the second of what may, and cuts off what reaches beyond it by the third
-of a side. It fits what it has more than the last of."""
+"""A box is far too large if less than FILLED of it may hold smoke; it is elsewhere or far too small
+if it holds less than HELD of the smoke, cuts off smoke that reaches beyond it by CUT of a side, and
+fits if it holds more than ALL."""
 
 
 OUTSIDE = "no overlap", "hardly any overlap"
-"""What `doubt_box` begins with where a box is elsewhere."""
+"""Beginnings of `doubt_box` where a box is elsewhere."""
 
 
 class HullError(SceneError):
@@ -53,9 +53,9 @@ class HullError(SceneError):
 def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
-    By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    with `auto`, where it is brighter than its black, or differs from its background, by more than
-    noise, or is not known. Raises HullError where that is most of its edges.
+    A pixel shows something by the mask, or without one where it is not black, as alpha 0 is. With
+    `auto`, it does where it is brighter than black, or differs from the background, by more than
+    noise, or is masked out. Raises HullError where most of the edges show something.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
@@ -120,9 +120,9 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    `shown` [h, w] is whether a pixel shows something; a cell may hold it where a pixel does within
-    `margin` pixels of those that the cell covers. Beyond its image, a camera shows what the nearest
-    pixel does.
+    `shown` [h, w] is whether a pixel shows something; a cell may hold medium where a pixel does
+    within `margin` pixels of those that the cell covers. Outside the image the nearest pixel
+    counts.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
@@ -161,7 +161,7 @@ def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
     """The corners [2, 3] (x, y, z) [u] of the box around all that the views of `frames` may show.
 
-    By the pixels [h, w] that each shows, single ones left out, widened by `margin`. A frame of
+    Each view shows the pixels [h, w], single ones left out, widened by `margin`. A frame of
     which a view shows nothing has no smoke yet. Raises HullError where the views leave no place,
     or any.
     """

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from ddrecon import renderer
+from ddrecon import lighting, picture
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
 from ddrecon.numerics.autodiff import leave_uncompiled, refuse_batches, require_plain_autograd
@@ -29,18 +29,18 @@ DTYPES = (torch.float32, torch.float64)
 
 
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
-    """Pictures `[views, 3, h, w]`, as `ddrecon.renderer.render` has them, of a legal `scene`.
+    """Pictures `[views, 3, h, w]`, as `ddrecon.picture.render` has them, of a legal `scene`.
 
     Raises UsageError where `require_legal` does.
     """
     _look_at(scene, view)
-    return refuse_batches(renderer.render(scene, view, memory))
+    return refuse_batches(picture.render(scene, view, memory))
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
-    """The fluence `[C, z, y, x]`, as `ddrecon.renderer.fluence` has it; raises as `render`."""
+    """The fluence `[C, z, y, x]`, as `ddrecon.lighting.fluence` has it; raises as `render`."""
     _look_at(scene, None)
-    return refuse_batches(renderer.fluence(scene, memory))
+    return refuse_batches(lighting.fluence(scene, memory))
 
 
 def _look_at(scene: Scene, view: str | None) -> None:

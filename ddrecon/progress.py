@@ -19,7 +19,7 @@ IN_A_LOG = 30.0
 """Seconds between two states of a bar in a file, each of which is a line there."""
 LONG = 2.0
 """After so many seconds it is said what is being done."""
-SHORT = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 """A bar beside which there is room for what it says, in 80 columns."""
 
 

@@ -68,14 +68,16 @@ class DiffusionSettings:
     refine_along: str = one_of("xyz", ("x", "y", "z", "xy", "xz", "yz", "xyz"), expert=True)
 
     @property
-    def has_rounds(self) -> bool:
-        """Whether transport rounds are possible: they begin with P1 in conservative form."""
+    def is_conservative_p1(self) -> bool:
+        """Whether diffusion is that with which transport rounds begin."""
         return (self.model, self.scheme) == ("p1", "conservative")
 
     @property
     def rounds(self) -> int:
         """The most transport rounds: where None, one if any are possible."""
-        return int(self.has_rounds) if self.transport_rounds is None else self.transport_rounds
+        return (
+            int(self.is_conservative_p1) if self.transport_rounds is None else self.transport_rounds
+        )
 
     @property
     def angles(self) -> int:
@@ -90,7 +92,7 @@ class DiffusionSettings:
     def violations(self) -> Iterator[Violation]:
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
-        if self.rounds > 0 and not self.has_rounds:
+        if self.rounds > 0 and not self.is_conservative_p1:
             yield (
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",

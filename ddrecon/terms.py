@@ -1,4 +1,4 @@
-"""What physics a scene needs, in words: the same conditions the renderer composes its terms by."""
+"""What physics a scene needs, in words: by the conditions on which light is composed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from ddrecon.light.lights import (
 )
 from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns, decompose_lights
+from ddrecon.light_field import multiply_scatters
+from ddrecon.lighting import exchange_grid
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
-from ddrecon.renderer import exchange_grid, multiply_scatters
 from ddrecon.scene import Scene
 from ddrecon.transport.sweep import count_directions
 
@@ -50,13 +51,9 @@ def needed_terms(scene: Scene) -> list[str]:
 
 def engine_of_scene(scene: Scene) -> dict[str, str]:
     """The engine that runs each part of rendering `scene`."""
-    volume, settings = scene.volume, scene.diffusion
+    settings = scene.diffusion
     return engine_of_parts(
-        gpu=volume.density.is_cuda,
-        periodic=bool(volume.grid.periodic),
-        refracting=volume.index != 1,
-        printed=settings.scheme == "printed",
-        flux_limited=settings.model == "flux_limited",
+        printed=settings.scheme == "printed", flux_limited=settings.model == "flux_limited"
     )
 
 

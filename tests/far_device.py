@@ -135,10 +135,9 @@ def _near(value: Any) -> Any:
 
 @contextlib.contextmanager
 def near_kernels() -> Iterator[None]:
-    """Fused kernels launched there run on the processor; solves and sweeps take a GPU's ways."""
+    """Fused kernels launched there run on the processor; sweeps take a GPU's way."""
     import warp as wp
 
-    from ddrecon.diffusion.solvers import multigrid
     from ddrecon.kernels import launch
     from ddrecon.transport import sweep
 
@@ -152,7 +151,6 @@ def near_kernels() -> Iterator[None]:
             (Far, "is_cuda", False),
             (launch, "_device", lambda _: own_device(_HOST)),
             (wp, "from_torch", array),
-            (multigrid, "has_kernels", lambda *_, **traits: False),
             (sweep, "has_kernels", lambda *_, **traits: False),
         ):
             stack.enter_context(patch.object(owner, name, function))

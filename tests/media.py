@@ -12,13 +12,14 @@ from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
-from ddrecon.march.emission import Emission
+from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
-from ddrecon.renderer import solve_light, view_picture
+from ddrecon.picture import view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.uncertainty.curvature import Curvature
@@ -97,16 +98,18 @@ def make_scene(
     return Scene(volume, lights, [View("view", camera)], *settings)
 
 
-def march_rays(emission: Emission, rays: Rays, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+def march_rays(
+    outgoing: OutgoingLight, rays: Rays, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
     """Radiance and transmittance [C, R] along `rays`, a camera's or any others."""
-    sight = look_along(emission.grid, rays, settings)
-    radiance, seen = (march(emission, sight, settings, one) for one in (None, torch.ones(())))
+    sight = look_along(outgoing.grid, rays, settings)
+    radiance, seen = (march(outgoing, sight, settings, one) for one in (None, torch.ones(())))
     return radiance, seen - radiance
 
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid))
+    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid), grid.periodic)
 
 
 def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:
@@ -132,10 +135,8 @@ def dense_matrix(operator: Operator) -> Tensor:
         place = [cell // strides[0], cell // strides[1] % shape[1], cell % shape[2]]
         matrix[:, cell, cell] += operator.loss[:, place[0], place[1], place[2]]
         for axis in range(3):
-            faces, is_last = operator.conductances[axis], place[axis] + 1 == shape[axis]
-            if place[axis] == faces.shape[1 + axis]:
-                continue
-            conductance = faces[:, place[0], place[1], place[2]]
+            is_last = place[axis] + 1 == shape[axis]
+            conductance = operator.conductances[axis][:, place[0], place[1], place[2]]
             neighbor = cell + strides[axis] * (1 - shape[axis] * is_last)
             matrix[:, cell, cell] += conductance
             matrix[:, neighbor, neighbor] += conductance

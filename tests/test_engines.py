@@ -15,8 +15,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
+from ddrecon.picture import render_each
 from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import DiffusionSettings, RenderSettings

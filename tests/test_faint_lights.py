@@ -21,9 +21,11 @@ from ddrecon.light.lights import (
     Light,
     PointLight,
 )
+from ddrecon.light_field import fluence_of
+from ddrecon.lighting import solve_light
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import Blend
-from ddrecon.renderer import fluence_of, solve_light, view_image
+from ddrecon.picture import view_image
 from ddrecon.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("few_directions")

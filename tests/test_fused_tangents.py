@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, variable_names, with_values
@@ -52,7 +52,7 @@ def scene_of(case: str, dtype: torch.dtype = torch.float64) -> Scene:
     if case in EVERY_LIGHT:
         tensor = density.new_tensor
         scene.lights += [
-            PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
+            PointLight(tensor([0.9, 0.7, 0.2137]), tensor([1.0, 2.0, 0.5])),
             EnvironmentLight(
                 random_values(3, 4, 8, seed=3, dtype=dtype), tensor(0.5), tensor(20.0), 6
             ),

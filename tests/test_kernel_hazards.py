@@ -18,7 +18,7 @@ from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
@@ -78,7 +78,7 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
     is_cellwise: bool, monkeypatch: pytest.MonkeyPatch
 ):
     # However few cells and pixels there are, threads share them.
-    monkeypatch.setattr("ddrecon.diffusion.solvers.fused.hierarchy.SMALL", 0)
+    monkeypatch.setattr("ddrecon.diffusion.fused.passes.SMALL", 0)
     use_engine("warp")
     scene, threads, runs = every_light(is_cellwise), torch.get_num_threads(), []
     values = {name: value_of(scene, name).detach() for name in VARIED}

@@ -9,7 +9,7 @@ from media import make_camera, make_scene
 
 from ddrecon.cameras import Camera, cast_rays, image_places, project
 from ddrecon.lenses import distort, ray_through
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.settings import RenderSettings
 
 LENSES = {

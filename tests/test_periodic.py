@@ -13,15 +13,16 @@ from media import half_empty, make_scene, render_tangent, tensor
 from torch import Tensor
 
 from ddrecon import load_scene
-from ddrecon.balance import find_balance
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
-from ddrecon.renderer import fluence, render
+from ddrecon.lighting import fluence
+from ddrecon.picture import render
 from ddrecon.scene import Scene, View
+from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")
@@ -87,7 +88,7 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
     cells: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Moved by half a period, which is whole cells of both grids."""
-    monkeypatch.setattr("ddrecon.renderer.MOST_CELLS", cells)
+    monkeypatch.setattr("ddrecon.lighting.MOST_CELLS", cells)
     shape, shift = (6, 5, 12), (3, 6)
     one, moved = (repeated(half_empty(*shape), by, **KINDS["ground"]) for by in ((0, 0), shift))
     for scene in (one, moved):  # so flat that no light crosses cells sideways fastest

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
 

@@ -16,8 +16,9 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.light.moments import flux_along_axes
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import Components, render, solve_light, view_components
+from ddrecon.picture import Components, render, view_components
 from ddrecon.scene import Scene, View
 from ddrecon.validate.gradcheck import GradientCheck, check_parameters
 

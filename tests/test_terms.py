@@ -17,8 +17,9 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
+from ddrecon.lighting import solve_light
 from ddrecon.medium.phase import HenyeyGreenstein
-from ddrecon.renderer import solve_light, view_picture
+from ddrecon.picture import view_picture
 from ddrecon.scene import Scene
 from ddrecon.terms import needed_terms
 

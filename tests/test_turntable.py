@@ -8,7 +8,7 @@ from media import make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import View
 from ddrecon.turntable import place_turntable, turn_camera, upright_axis
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from media import half_empty, make_scene, tensor
 
-from ddrecon.renderer import render
+from ddrecon.picture import render
 
 
 def test_an_empty_volume_shows_the_background_as_it_is() -> None:

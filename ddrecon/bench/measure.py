@@ -24,10 +24,10 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.extras import load_extra
 from ddrecon.io.files.atomic import replace_file
+from ddrecon.picture import render_each
 from ddrecon.progress import Progress
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values

@@ -22,7 +22,7 @@ def main(*arguments: Any, **settings: Any) -> None:
     except OSError as error:
         if error.filename is not None or error.errno is None:
             raise
-        # Of a stream, not of a file: what is left in it cannot be written at the end either.
+        # A stream failed, not a file: the rest of its buffer cannot be written at the end either.
         with suppress(OSError):
             os.write(2, f"cannot write: {error.strerror}\n".encode())
         os._exit(3)

@@ -32,7 +32,7 @@ from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
-WIDE = 8.0
+TOO_WIDE = 8.0
 """Cells that are at least so many pixels wide to all views are told."""
 
 
@@ -59,7 +59,7 @@ def supports_of(frames: Iterable[Scene]) -> list[Support]:
             with nullcontext() if density.support else suppress(SceneError):
                 support = find_support(train, replace(settings, parameters={"density": auto}))
                 if support is not None and supports:
-                    # Of a film the first pictures alone: all take more memory than there is.
+                    # A film keeps the pictures of its first frame: all take too much memory.
                     views = [View(view.name, view.camera) for view in support.views]
                     support = replace(support, views=views)
                 supports += [] if support is None else [support]
@@ -153,7 +153,7 @@ def lines(report: dict[str, Any]) -> list[str]:
 
 def _advise_on_cells(width: float) -> str:
     """What to change where all views see cells at least so many pixels wide."""
-    if width < WIDE:
+    if width < TOO_WIDE:
         return ""
     return (
         f", which show less than the pictures: {CELL:g} would do, by smaller cells "

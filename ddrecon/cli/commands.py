@@ -16,24 +16,13 @@ from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
 
 DRIVERS = "/dev/nvidiactl", "/dev/dxg", "/dev/kfd"
-"""One is there where torch may see a GPU; elsewhere it is not loaded to look for one."""
-GONE = {
-    "--mp4": "say `ffmpeg -i DIR/ring_%03d.png ring.mp4` after it",
-    "--tensorboard": "loss.csv has the same numbers",
-    "--uncertainty": "say `ddrecon uncertainty RUN -o DIR` after it",
-}
-"""Options that there were, and what to do instead."""
+"""Devices of which one exists where torch may see a GPU; else torch is not loaded to look."""
 
 
 class Commands(click.Group):
-    """Commands whose `--json` stands alone but before a FILE, which ends in .json.
-
-    So it takes no scene file for one.
-    """
+    """Lets `--json` stand without a value: `--json` prints, `--json report.json` writes."""
 
     def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
-        if gone := GONE.keys() & args:
-            raise click.UsageError("; ".join(f"{word}: {GONE[word]}" for word in sorted(gone)))
         words = [
             "--json=-" if word == "--json" and not after.endswith(".json") else word
             for word, after in pairwise([*args, ""])

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from ddrecon.scene import Scene
 
 LEFT_OUT = ("sigma_a", "sigma_s")
-"""Not written of a medium: sigma_t and albedo are what programs of film and games take."""
+"""Fields that are not written: programs of film and games take sigma_t and albedo."""
 ROUNDING = 1e-6
-"""By what part cells may differ that are the same: one cross section follows from the others."""
+"""Relative rounding below which cells count as equal: one cross section follows from others."""
 
 
 @click.command()
@@ -151,7 +151,7 @@ def _is_scene(source: Path) -> bool:
 def info(session: Session, file: Path) -> None:
     """Print what is in FILE: a volume's box, cells and fields, or an image's size and values.
 
-    Of a scene file or the folder of a finished run, it is its volume.
+    A scene file, or the folder of a finished run, counts as its volume.
     """
     _require_volumes([file])
     scene = session.load(file) if _is_scene(file) else None

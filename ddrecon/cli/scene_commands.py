@@ -68,7 +68,7 @@ def check(session: Session, scene: Path) -> None:
 def balance(session: Session, scene: Path) -> None:
     """Print what power enters the box of SCENE, what is absorbed in it and what leaves it."""
     loaded = session.load(scene)
-    from ddrecon.balance import find_balance, lines
+    from ddrecon.validate.balance import find_balance, lines
 
     report = find_balance(loaded)
     session.show(report, lines(report))
@@ -374,10 +374,8 @@ def _optimize_film(
 @click.option(
     "--next-view",
     type=click.Choice(["ring"]),
-    help="Which picture next? Rank twelve by how far off those taken they are: by the first "
-    "camera, turned around the volume.",
+    help="Rank 12 candidate cameras on a ring by their angle to the nearest existing camera.",
 )
-@click.option("--tolerance", type=float, hidden=True)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
@@ -391,7 +389,6 @@ def uncertainty(
     read: float | None,
     has_samples: bool,
     next_view: str | None,
-    tolerance: float | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -405,8 +402,6 @@ def uncertainty(
     from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
     from ddrecon.uncertainty.folder import uncertainty_lines
 
-    if tolerance is not None:
-        warn("--tolerance: samples are no longer solved for; leave it out", DataWarning, 2)
     require_no_film(run)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
     if taken.stage + 1 < len(taken.problem.factors):

@@ -27,7 +27,6 @@ from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_fl
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.periods import Unrolled, unroll
 
 
 @dataclass(frozen=True)
@@ -68,50 +67,23 @@ class DiffusionProblem:
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E2.7."""
-        if self.medium.grid.periodic:
-            return self._periodic_system
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import assemble_system
 
             z, y, x, loss, right = assemble_system(
                 self.medium, self.diffusion, self._source, self.outside
             )
-            return Operator((z, y, x), loss), self._with_emission(right)
+            return self._operator(z, y, x, loss), self._with_emission(right)
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
             _loss_and_source, self.medium, self.diffusion, self._source[0], self.outside
         )
         if self._source[1] is not None:
             right = right - self._spread(self._source[1])
-        return Operator((z, y, x), loss), self._with_emission(right)
+        return self._operator(z, y, x, loss), self._with_emission(right)
 
-    @cached_property
-    def _unrolled(self) -> tuple[Unrolled, DiffusionProblem]:
-        """The same in a period and a cell more on both sides, beyond which lie faces of a box."""
-        period = unroll(self.medium.grid, 1)
-        medium = self.medium.put(period.wide, period.extend)
-        diffusion = period.extend(self.diffusion)
-        wide = period.extend(self.source), self.outside, self.has_flux
-        return period, DiffusionProblem(medium, lambda _: diffusion, *wide)
-
-    @property
-    def _periodic_system(self) -> tuple[Operator, Tensor]:
-        period, problem = self._unrolled
-        operator, right = problem.system
-        z, y, x = (
-            self._crop_faces(faces, axis)
-            for axis, faces in zip(AXES, operator.conductances, strict=True)
-        )
-        return Operator((z, y, x), period.crop(operator.loss)), period.crop(right)
-
-    def _crop_faces(self, faces: Tensor, axis: int) -> Tensor:
-        """The `faces` along `axis` of a period, the last of them that at its ends."""
-        for other, count in zip(AXES, self.medium.grid.shape, strict=True):
-            if other - 1 in self.medium.grid.periodic:
-                # A cell that is its own neighbor exchanges nothing.
-                count = 0 if other == axis and count == 1 else count
-                faces = faces.narrow(other, 1, count)
-        return faces
+    def _operator(self, z: Tensor, y: Tensor, x: Tensor, loss: Tensor) -> Operator:
+        return Operator((z, y, x), loss, self.medium.grid.periodic)
 
     def _with_emission(self, right: Tensor) -> Tensor:
         return right if self.medium.emission is None else right + self.medium.emission
@@ -126,11 +98,6 @@ class DiffusionProblem:
         """
         if not self.has_flux:
             return None
-        if self.medium.grid.periodic:
-            period, problem = self._unrolled
-            added, start = (one if one is None else period.extend(one) for one in (more, begun))
-            first = problem.flux(period.extend(mean), added, start, sign)
-            return first if first is None else period.crop(first)
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import find_flux
 
@@ -155,9 +122,6 @@ class DiffusionProblem:
         _, right = self.system
         if flux is None:
             return right + source
-        if self.medium.grid.periodic:
-            period, problem = self._unrolled
-            return period.crop(problem.right_side(period.extend(source), period.extend(flux)))
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import spread_flux
 

@@ -25,8 +25,7 @@ from ddrecon.diffusion.operator import (
     conductance,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution, solve_by_multigrid
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux

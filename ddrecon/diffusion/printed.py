@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn.functional import conv3d, pad
 
 from ddrecon.diffusion.implicit import AutodiffOperator, ImplicitSolve, SolverWithMemory
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux

@@ -37,18 +37,18 @@ from ddrecon.scene_file.load import (
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
-SHARE = 6
-"""A frame that begins with another makes so many times fewer iterations: the last of its run."""
+FEWER = 6
+"""How many times fewer iterations a frame makes that starts from another: the last of a run."""
 FINAL_RATE = 0.05
-"""To what part of their value its learning rates fall; with larger ones films flicker more."""
-KEPT = 0.2
-"""It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
-FARTHEST = 3
+"""The part of their value to which learning rates fall; with a larger one films flicker more."""
+MIXED = 0.2
+"""The part of a frame's start that is mixed into its result: less noise and less flicker."""
+MOST_APART = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
 PART = "part"
-"""What the locks of parts are called, `part.0000-0011.lock`."""
+"""The beginning of the names of parts' locks, `part.0000-0011.lock`."""
 SEQUENCE = "sequence"
 """The folder of exported volumes, `film_0000.vdb` and so on."""
 
@@ -84,7 +84,7 @@ class Film:
     def claim(
         self, *, overwrite: bool = False, resume: bool = True
     ) -> AbstractContextManager[Folder]:
-        """Its folder for the one of several parts that begins, calibrates or reports."""
+        """The film's folder, for the one of several parts that begins, calibrates or reports."""
         tell = self._tell if resume else None
         return claim_folder(self.path, FILM, overwrite=overwrite, resume=resume, tell=tell)
 
@@ -119,7 +119,7 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            optimize |= {"begin_at": 1 - 1 / SHARE, "final_rate": FINAL_RATE, "keep_start": KEPT}
+            optimize |= {"begin_at": 1 - 1 / FEWER, "final_rate": FINAL_RATE, "keep_start": MIXED}
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
@@ -149,7 +149,7 @@ class Film:
 
     def _near(self, number: int) -> tuple[list[int], list[int]]:
         """The frames that are done and close to the frame `number`: before it, and after it."""
-        far = FARTHEST * self.frames.step
+        far = MOST_APART * self.frames.step
         near = [n for n in self.done() if 0 < abs(n - number) <= far]
         return [n for n in near if n < number], [n for n in near if n > number]
 
@@ -159,7 +159,7 @@ class Film:
         for frame in (number, other):
             fields = _fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
-            # Of what has colors their mean.
+            # Colors are averaged.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
             sums.append(torch.stack(values).sum(0))
         return find_flow(*sums) / (other - number)

@@ -1,4 +1,4 @@
-"""What a film has come to, of all frames that are done, whoever did them: its record and page."""
+"""The record and page of a film, of all finished frames, whichever process made them."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from ddrecon.run.report import registered_text
 from ddrecon.run.run_folder import REPORT, SUMMARY
 
 RECORD, MOVIE = "film.json", "movie.png"
-KEPT = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
-"""What of a run's summary is kept of each frame."""
+KEYS = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
+"""Entries of a run's summary that a film's record keeps of each frame."""
 SHOWN = 48
 """Frames whose pictures are on the page; all are in their folders."""
 WIDEST = 768
@@ -45,7 +45,7 @@ def write_film_report(film: Film) -> dict[str, Any]:
     rows, summaries = list[dict[str, Any]](), dict[int, dict[str, Any]]()
     for number in film.done():
         summaries[number] = json.loads((film.of(number) / SUMMARY).read_text())
-        row = {key: summaries[number][key] for key in KEPT if summaries[number][key] is not None}
+        row = {key: summaries[number][key] for key in KEYS if summaries[number][key] is not None}
         registered = summaries[number].get("registered", {})
         row |= {f"registered_{key}": value for key, value in registered.items()}
         rows.append({"frame": number, **row})

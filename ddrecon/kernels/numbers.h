@@ -64,9 +64,9 @@ template <> struct Format<double> {
     static constexpr double log2_low = 1.90821492927058770002e-10;
 };
 
-// How near to a cell's center a place counts as on it, in units of a line's length
+// How little before a cell's center a place counts as on it, in units of a line's length
 // (`numerics/third_order.py`).
-template <class F> constexpr F KINK = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
+template <class F> constexpr F NEARLY = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
 
 template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
 template <> inline constexpr double FACTORIAL<0> = 1.0;

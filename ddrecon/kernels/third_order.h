@@ -5,52 +5,41 @@
 
 namespace ddrecon {
 
-// A place among points on a line, the part a of the way from point n to the next: q = n + a.
+// A place among `size` points on a line, the part a of the way from point n to the next.
 template <class N> struct Place {
+    typedef decltype(value_of(N(0))) F;
     int n;
     N a;
-    double q;
-    INLINE explicit Place(double q) : n((int)q), q(q) {
-        n -= n > q;
+    INLINE Place(double q, int size) {
+        const double place = q + NEARLY<F> * size;
+        n = (int)place;
+        n -= n > place;
         a = N(q - n);
     }
 };
 
 // What points n - 1 to n + 2 count for at a place: linearly, and in what third order takes off
-// that. As dual numbers they change with the place: on a point by the mean of both sides' slopes.
+// that. As dual numbers they change with the place, on a point as beyond it.
 template <class N> struct Taps {
     typedef decltype(value_of(N(0))) F;
     N linear[4], bend[4];
 
-    INLINE Taps(const Place<N>& place, int size) {
-        const int nearest = (int)(place.q + 0.5);
-        const double off = place.q - nearest;
-        const bool is_kink = (off < 0 ? -off : off) < KINK<F> * size;
-        const N a = place.a;
-        N weight = N(F(0));
+    INLINE explicit Taps(const N& a) {
+        const N weight = F(0.5) * a * (F(1) - a);
         linear[0] = linear[3] = N(F(0));
         linear[1] = F(1) - a;
         linear[2] = a;
-        if (!is_kink) weight = F(0.5) * a * (F(1) - a);
         // Second differences, interpolated the part a of the way, are the values weighed by these.
         bend[0] = F(1) - a;
         bend[1] = F(3) * a - F(2);
         bend[2] = F(1) - F(3) * a;
         bend[3] = a;
-        if constexpr (IS_DUAL<N>)
-            for (int t = 0, center = a.value < F(0.5) ? 1 : 2; is_kink && t < 4; ++t)
-                linear[t].by[0] = F(0.5) * F((t == center + 1) - (t == center - 1)) * a.by[0];
         UNROLLED
         for (int t = 0; t < 4; ++t) bend[t] = weight * bend[t];
     }
-    // Values a `stride` apart, by both: those of plain numbers leave out what counts for nothing.
+    // Values of all four points, a `stride` apart, by both.
     template <class M> INLINE auto linearly(const M* value, int stride = 1) const {
-        const auto inner = linear[1] * value[stride] + linear[2] * value[2 * stride];
-        if constexpr (IS_DUAL<N>) {
-            return inner + linear[0] * value[0] + linear[3] * value[3 * stride];
-        } else {
-            return inner;
-        }
+        return linear[1] * value[stride] + linear[2] * value[2 * stride];
     }
     template <class M> INLINE auto curved(const M* value, int stride = 1) const {
         return bend[0] * value[0] + bend[1] * value[stride] + bend[2] * value[2 * stride] +

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
-from ddrecon.numerics.third_order import ThirdOrder, kink_width, ramp
+from ddrecon.numerics.third_order import ThirdOrder, nearly
 
 LEAST_SLOPE = 1e-6
 """A smaller slope counts as this: such beams enter through no side of a grid."""
@@ -93,7 +94,7 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
 
     There it goes a `step` [u] and drifts by `slope` [2], in rows and columns.
     """
-    speed = direction / direction.new_tensor(grid.spacing)
+    speed = direction / constant(grid.spacing, direction)
     slicing = Slicing.of(speed.tolist())
     slope = (
         torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
@@ -136,10 +137,8 @@ class Shear:
             )
         )
         rows, columns = torch.broadcast_tensors(rows[:, None], columns)
-        # Through an edge with the mean of both sides' slopes.
-        is_edge = (rows - columns).abs() < kink_width(rows, sum(self.lattice))
-        mean, later = 0.5 * (rows + columns), torch.maximum(rows, columns)
-        return torch.where(is_edge, mean + (later - mean).detach(), later)
+        # Through an edge by rows.
+        return torch.where(columns - rows < nearly(rows, sum(self.lattice)), rows, columns)
 
     def inside(self, like: Tensor) -> Tensor:
         """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].
@@ -147,15 +146,18 @@ class Shear:
         There are as many slices as `like` has.
         """
         entered = self._numbers(like, 0.5)[:, None, None] - self.entries
-        return ramp(entered, kink_width(entered, len(like) + 1))[:, None]
+        near = nearly(entered, len(like) + 1)
+        is_between = (entered > -near) & (entered < 1 + near)
+        return torch.where(is_between, entered, entered.detach().clamp(0, 1))[:, None]
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        Beyond them they are as their outermost cells.
+        Beyond them they are as their outermost cells. On a cell's center slopes are those of cells
+        among rays, which move the other way: the sides are swapped.
         """
         points = self._points(slices, shift, self.lattice, self.size, 1)
-        return sample_slices(slices, points).unflatten(-1, self.lattice)
+        return sample_slices(slices.flip(2, 3), -points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""

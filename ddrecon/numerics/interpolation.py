@@ -1,8 +1,8 @@
 """Linear interpolation in slices and volumes, differentiable in reverse and in forward mode.
 
-torch's `grid_sample` has no forward mode: there cells are gathered. And where points lie on cells'
-centers its slope is that of the side that rounding picks; here it is the mean of both, as central
-differences have it.
+torch's `grid_sample` has no forward mode, and where points lie on cells' centers its slope is that
+of the side that rounding picks. Where points move, cells are gathered, and there the slope is that
+of the side on which coordinates are larger.
 
 Coordinates are in torch's convention: -1 and 1 are the outer faces of the first and last cell
 (`align_corners=False`), and the last axis of the array comes first.
@@ -17,9 +17,8 @@ from torch.nn.functional import grid_sample
 from ddrecon.numerics.autodiff import is_forward
 from ddrecon.numerics.third_order import (
     ThirdOrder,
-    kink_width,
-    ramp,
     second_difference,
+    split_place,
     subtract_correction,
     third_order_weight,
 )
@@ -68,46 +67,24 @@ def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None)
 
 def _sample(values: Tensor, points: Tensor) -> Tensor:
     """Multilinear values `[N, K, ...]` of `values` [N, K, sizes] at `points` [N, ..., axes]."""
-    if is_forward():
+    if is_forward() or points.requires_grad:
         return _gather(values, points)
-    sampled = _grid_sample(values, points)
-    if not points.requires_grad:
-        return sampled
-    # Where points lie on kinks, those a little to both sides, along the axes on which they do.
-    sizes = points.new_tensor(values.shape[:1:-1])
-    place = ((points.detach() + 1) * sizes - 1) / 2
-    near = kink_width(points, 1) * sizes
-    is_on_kink = (place - place.round()).abs() < near
-    if not bool(is_on_kink.any()):
-        return sampled
-    shift = is_on_kink * (4 * near / sizes)
-    sides = [_grid_sample(values, points + way * shift) for way in (-1, 1)]
-    beside = 0.5 * (sides[0] + sides[1])
-    return beside + (sampled - beside).detach()
-
-
-def _grid_sample(values: Tensor, points: Tensor) -> Tensor:
     return grid_sample(values, points, mode="bilinear", padding_mode="border", align_corners=False)
 
 
 def _gather(values: Tensor, points: Tensor) -> Tensor:
-    """The same corner by corner: the nearest cell along each axis, and both beside it."""
+    """The same corner by corner: along each axis the center before a point, and the next one."""
     sizes, shape = values.shape[2:], points.shape[1:-1]
     corners = [
         (torch.zeros_like(points[..., 0], dtype=torch.long), torch.ones_like(points[..., 0]))
     ]
     for size, coordinate in zip(sizes, points.unbind(-1)[::-1], strict=True):
-        place, width = ((coordinate + 1) * size - 1) / 2, kink_width(points, size)
-        nearest = place.detach().round().clamp(0, size - 1)
-        # How far on the way to it, and from it.
-        come = ramp(place - nearest + 1, width)
-        gone = ramp(place - nearest, width)
-        weights = 1 - come, come - gone, gone
-        cells = [(nearest.long() + side).clamp(0, size - 1) for side in (-1, 0, 1)]
+        center, part = split_place(coordinate, size)
+        cells = [(center.long() + side).clamp(0, size - 1) for side in (0, 1)]
         corners = [
             (size * number + cell, factor * weight)
             for number, factor in corners
-            for cell, weight in zip(cells, weights, strict=True)
+            for cell, weight in zip(cells, (1 - part, part), strict=True)
         ]
     flat = values.flatten(2)
     return sum(

@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ddrecon.numerics.autodiff import is_varied
-
-KINK = 16
-"""Within so many units in the last place, of a coordinate counted in cells, a point counts as lying
-on a cell's center.
+NEARLY = 16
+"""So many units in the last place before a cell's center, of a coordinate counted in cells, a point
+counts as on it: there slopes are those beyond it, whatever rounding makes of the coordinate.
 """
 
 
@@ -82,39 +80,26 @@ def second_difference(values: Tensor, axis: int) -> Tensor:
     return longer.diff(n=2, dim=axis)
 
 
-def kink_width(place: Tensor, size: int) -> float:
-    """How near to a kink, in cells, a coordinate counted in `size` cells counts as lying on it."""
-    return float(KINK * torch.finfo(place.dtype).eps * size)
+def nearly(like: Tensor, size: int) -> float:
+    """How little before a center a place among `size` cells counts as on it, in cells."""
+    return float(NEARLY * torch.finfo(like.dtype).eps * size)
 
 
-def ramp(place: Tensor, tolerance: float) -> Tensor:
-    """`place` kept within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
-    if not is_varied(place):
-        return place.clamp(0, 1)
-    at = place.detach()
-    is_near = (at > -tolerance) & (at < 1 + tolerance)
-    is_inside = (at > tolerance) & (at < 1 - tolerance)
-    slope = 0.5 * (is_near.to(place.dtype) + is_inside.to(place.dtype))
-    # The second term is 0 and has the slope.
-    return at.clamp(0, 1) + slope * (place - at)
+def split_place(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """The last of `size` centers before places, and the part of the way from it to the next one.
+
+    `coordinate`: from -1 to 1 between the outer faces. Centers count on, beyond these as well.
+    """
+    place = ((coordinate + 1) * size - 1) / 2
+    center = (place.detach() + nearly(place, size)).floor()
+    return center, place - center
 
 
 def third_order_weight(coordinate: Tensor, size: int, border: int) -> Tensor:
     """a (1 - a) / 2 at `coordinate` in [-1, 1] along `size` cells.
 
-    It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers within the `border`;
-    on a kink its slope is the mean of both sides'.
+    It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers within the `border`.
     """
-    place = ((coordinate + 1) * size - 1) / 2
-    offset = place - place.round()
-    is_on_kink = offset.abs() < kink_width(place, size)
-
-    # The same from either neighbor: a = |offset| from the nearer one.
-    inner = 0.5 * offset.abs() * (1 - offset.abs())
-    first, last = border, size - 1 - border
-    within = torch.where((place > first) & (place < last), inner, torch.zeros_like(inner))
-
-    # At centers the value is 0. Slopes of both sides, -1/2 and 1/2, cancel, but at the outermost
-    # ones, where that of the outer side is 0.
-    end = (place.round() == first).to(place.dtype) - (place.round() == last).to(place.dtype)
-    return torch.where(is_on_kink, 0.25 * end * (place - place.detach()), within)
+    center, part = split_place(coordinate, size)
+    is_within = (center >= border) & (center < size - 1 - border)
+    return torch.where(is_within, 0.5 * part * (1 - part), torch.zeros_like(part))

@@ -69,7 +69,7 @@ class Stabilized(Scale):
         return stabilized.to(radiance.dtype)
 
     def slope(self, target: Tensor) -> Tensor:
-        # By the mean of neighbors: a weight that follows the noise would prefer what it darkens.
+        # Neighbors are averaged: a weight that follows the noise would prefer darkened pixels.
         level = avg_pool2d(target, 5, 1, 2, count_include_pad=False)
         return 1 / self.noise.deviation(level)
 

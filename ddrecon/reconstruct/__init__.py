@@ -1,1 +1,1 @@
-"""From images to volumes: the reconstruction loop. It knows of physics only `renderer.render`."""
+"""From images to volumes: the reconstruction loop. It sees light in pictures alone."""

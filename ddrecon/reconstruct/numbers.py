@@ -22,19 +22,20 @@ from torch import Tensor
 from ddrecon.cameras import Camera
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import own_views
-from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
 from ddrecon.variables.values import with_values
 
 
 def single_numbers(parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Those of `parameters` that are no field and no map."""
+    """The `parameters` that are neither fields nor maps."""
     return [p for p in parameters if not p.is_field and p.value.ndim < 2]
 
 

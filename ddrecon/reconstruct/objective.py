@@ -1,4 +1,4 @@
-"""What a reconstruction makes small: the views' losses plus penalties; and its images' PSNR."""
+"""The objective of a reconstruction: the views' losses plus penalties; and its images' PSNR."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.picture import render_each
 from ddrecon.ranks import sum_numbers
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import own_views
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import RESPONSE
 from ddrecon.variables.values import variable_names, with_values
@@ -46,14 +46,28 @@ class Comparison:
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its `image` add to the objective: its share, by weight, of the mean."""
-        target, seen = self.targets[view.name], image.detach()
-        self.pictures[view.name] = seen
-        value = self.share(view) * target.loss_of(image)
-        self.metrics["loss"].append(value.detach())
-        self.metrics["psnr"].append(target.psnr_of(seen))
+        loss = self.loss_of(view, image)
+        self.note(view, image.detach(), loss.detach())
+        return loss
+
+    def loss_of(self, view: View, image: Tensor) -> Tensor:
+        """The same, of which nothing is kept."""
+        return self.share(view) * self.targets[view.name].loss_of(image)
+
+    def note(self, view: View, image: Tensor, loss: Tensor) -> None:
+        """Keeps the `image` of `view`, the `loss` that it adds, and its quality."""
+        target = self.targets[view.name]
+        self.pictures[view.name] = image
+        self.metrics["loss"].append(loss)
+        self.metrics["psnr"].append(target.psnr_of(image))
         if "ssim" in self.metrics:
-            self.metrics["ssim"].append(target.ssim_of(seen))
-        return value
+            self.metrics["ssim"].append(target.ssim_of(image))
+
+    def forget(self) -> None:
+        """Forgets all images."""
+        self.pictures.clear()
+        for numbers in self.metrics.values():
+            numbers.clear()
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""
@@ -162,14 +176,14 @@ def fit_held_out(
     for keys in (["exposure"], ["offset"], ["exposure", "offset"]):
         if not sizes.keys() >= set(keys):
             continue
-        # By least squares, weighed as the target's loss weighs small errors.
+        # Least squares, weighed as the target's loss weighs small errors.
         ones = {1: light.new_ones(1, 3), 3: torch.eye(3).to(light)}
         columns = torch.cat([ones[sizes[key]][..., None, None] * basis[key] for key in keys])
         fixed = sum(response[key].view(-1, 1, 1) * basis[key] for key in basis if key not in keys)
         matrix, right = (
             (image * weight).double().cpu().flatten(-3) for image in (columns, target.image - fixed)
         )
-        # What a picture does not show, such as the exposure of black, is 0.
+        # A response that a picture does not show, such as the exposure of black, is 0.
         solution = torch.linalg.pinv(matrix @ matrix.T, hermitian=True) @ (matrix @ right)
         values = solution.to(light).split([sizes[key] for key in keys])
         fit = response | dict(zip(keys, values, strict=True))

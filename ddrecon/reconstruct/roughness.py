@@ -64,7 +64,7 @@ def _find_length(field: Tensor, grid: Grid, knee: float | None) -> Tensor:
 
 
 def _rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
-    """By how much `field` [..., z, y, x] is more in the next cell along `axis`, -3 to -1.
+    """The rise of `field` [..., z, y, x] to the next cell along `axis`, -3 to -1.
 
     After the last cell of a period comes its first; in a box the last has no next, and 0.
     """

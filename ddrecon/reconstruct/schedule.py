@@ -4,7 +4,7 @@ That is after a number of iterations, or when more of them bring nothing.
 
 A run with `iterations: auto` has parts: a part for each resolution, and a last one at the lowest
 learning rates. A part ends when the loss has come to rest, or when its share of `PLANNED`
-iterations is used up; the last part only at rest, or after `MOST` iterations in all.
+iterations is used up; the last part only at rest, or after `MOST_ITERATIONS` iterations in all.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Schedule:
         self.is_auto = settings.iterations == AUTO
         self.planned = tuning.PLANNED if self.is_auto else int(settings.iterations)
         begun = round(settings.begin_at * self.planned)
-        self.most = tuning.MOST if self.is_auto else max(self.planned - begun, 1)
+        self.most = tuning.MOST_ITERATIONS if self.is_auto else max(self.planned - begun, 1)
         self.refine_at, self.final_rate = settings.refine_at, settings.final_rate
         # As nearly whole passes as can be, so that a window hardly tells one view from another.
         drawn = min(settings.views_per_iteration or count, count)

@@ -1,4 +1,4 @@
-"""What a reconstruction starts from: its views, its parameters, and whether they are of use."""
+"""The start of a reconstruction: its views, its parameters, and whether they are usable."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Problem:
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 
     def at(self, stage: int) -> Level:
-        """It at the resolution of `stage`."""
+        """The problem at the resolution of `stage`."""
         factor = self.factors[stage]
         train, test = (scene_at_level(scene, factor) for scene in (self.train, self.test))
         if self.support is not None:
@@ -108,8 +108,8 @@ def select_views(scene: Scene, is_test: bool) -> Scene:
 def require_usable(train: Scene, settings: OptimizeSettings) -> None:
     """Raises SceneError where `settings` cannot be reconstructed from the views of `train`.
 
-    That is where there are none, nothing shines, a parameter does not touch them, or a target is
-    not finite. Raises FormatError where pictures are black, or masks leave no pixel.
+    Reasons are: no views, no light, a parameter that touches no view, or a target that is not
+    finite. Raises FormatError where pictures are black, or masks leave no pixel.
     """
     if not train.views:
         raise SceneError(
@@ -154,10 +154,10 @@ def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
 
 
 def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
-    """The loss that `settings` ask for, or what the pictures of the views of `train` deserve.
+    """The loss that `settings` ask for, or that fits the pictures of the views of `train`.
 
-    That is `display` for pictures stored as sRGB values, `l2` for linear ones. Raises SceneError
-    where there are both.
+    `display` fits pictures stored as sRGB values, `l2` linear ones. Raises SceneError where there
+    are both.
     """
     if settings.loss is not None:
         return settings.loss

@@ -13,12 +13,12 @@ from ddrecon.scene import Scene, View
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
-    """Those of the views of `scene` called `names` that this rank renders, in their order.
+    """The views of `scene` called `names` that this rank renders, in their order.
 
     One that is named twice is rendered twice, by the same rank.
     """
     pixels = {name: math.prod(scene.view(name).camera.size) for name in names}
-    # By turns, those of most pixels first, so that all end at about one time.
+    # Ranks take turns, largest views first, so that all end at about one time.
     rank_names = sorted(pixels, key=lambda name: -pixels[name])[own_rank() :: rank_count()]
     return [name for name in names if name in rank_names]
 

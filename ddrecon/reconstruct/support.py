@@ -26,19 +26,18 @@ from ddrecon.march.box import cross_box
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, MASKS, OptimizeSettings
 
-LOOKED_AT = 8192
-"""At most about so many pixels of a view are looked along to see what is cut off."""
-LOST = 0.002
-"""What a support cuts off is told from this part of a view's light on."""
+TRACED_PIXELS = 8192
+"""About the most pixels of a view that are traced to see what is cut off."""
+CUT_LIGHT = 0.002
+"""The part of a view's light that a support may cut off without a warning."""
 KEY = "optimize.parameters.density.support"
 
 
 @dataclass(frozen=True)
 class Support:
-    """What says where medium may be: `views` with what they show.
+    """Where medium may be, by what `views` show.
 
-    `shown` [h, w] of each view is whether a pixel shows something. `margin` is how many pixels what
-    they show is widened by.
+    `shown` [h, w] of each view is whether a pixel shows something, widened by `margin` pixels.
     """
 
     views: Sequence[View]
@@ -77,15 +76,15 @@ class Support:
         return torch.stack(may_hold), torch.stack(seen)
 
     def cut_pixels(self, grid: Grid) -> Iterator[tuple[Tensor, int, list[int]]]:
-        """Of each view, which pixels show something where no cell of `grid` is left.
+        """The pixels of each view that show something where no cell of `grid` is left.
 
-        Their indices, among every n-th of the pixels that show something, n, and for each view how
-        many of these pixels it alone has left without a cell.
+        Yields their indices among every n-th of the pixels that show something, n, and for each
+        view how many of these pixels it alone has left without a cell.
         """
         may_hold, seen = self._hulls(grid)
         leaves_out = (~may_hold & seen).flatten(1)
         for view, shown in zip(self.views, self.shown, strict=True):
-            every = 1 + int(shown.sum()) // LOOKED_AT
+            every = 1 + int(shown.sum()) // TRACED_PIXELS
             index = shown.flatten().nonzero()[::every, 0]
             rays = cast_rays(view.camera).select(index)
             crossing = cross_box(grid, rays)
@@ -108,7 +107,7 @@ def describe_support(
 ) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
-    That is the part of the cells of `grid` that any keeps, and what `doubt_support` says.
+    `cells` is the part of the cells of `grid` that any keeps; the rest is that of `doubt_support`.
     """
     if not supports:
         return None
@@ -142,7 +141,7 @@ def find_cut(support: Support, grid: Grid) -> str | None:
         strength = (view.image - (0.0 if view.background is None else view.background)).abs()
         light = strength.amax(0).flatten()
         share = every * float(light[index].sum()) / float(light.sum().clamp(min=1e-30))
-        if share > LOST:
+        if share > CUT_LIGHT:
             cut[view.name], by = share, [a + b for a, b in zip(by, alone, strict=True)]
     if not cut:
         return None

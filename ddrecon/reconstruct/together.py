@@ -1,7 +1,7 @@
 """Several reconstructions that share their numbers: the frames of a film, one calibration.
 
-Each has fields of its own. What is no field is one and the same for all, and moves by what the
-pictures of all say together (E10.2): by the same step as that of a single reconstruction.
+Each has its own fields. All other parameters are shared, and move by the pictures of all (E10.2),
+by the same step as in a single reconstruction.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class Together:
         return rows
 
     def spread(self) -> dict[str, Tensor]:
-        """By how much those who share a number disagree on it, entry by entry, by name.
+        """The disagreement of the runs on each shared number, entry by entry, by name.
 
-        That is the standard deviation, from one to another, of the step that each would make alone.
+        It is the standard deviation over runs of the step that each would make alone.
         """
         alone = [run.undamped_changes() for run in self.runs]
         if len(alone) < 2:

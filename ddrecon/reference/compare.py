@@ -13,11 +13,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.images.table import write_picture, write_preview
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
+from ddrecon.picture import view_image
 from ddrecon.progress import Progress
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer, error_text
-from ddrecon.renderer import solve_light, view_image
 from ddrecon.report.pictures import comparison, diverging, pixels
 from ddrecon.scene import Scene, View
 

@@ -93,8 +93,8 @@ def make_mitsuba_objects(module: ModuleType, value: Any) -> Any:
 class Traced:
     """The mean `image` [h, w] or [h, w, 3] of several passes, and its `noise`.
 
-    That is the standard error of its pixels (root mean square), relative to the root mean square of
-    the image; 0 for a black image.
+    `noise` is the standard error of the pixels (root mean square), relative to the root mean square
+    of the image; 0 for a black image.
     """
 
     image: np.ndarray
@@ -176,7 +176,7 @@ def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
 
 
 def _pick_number(number: Tensor, color: int) -> Tensor:
-    """Of a `number` by color [3] or [3, z, y, x] that one's; else the number as it is."""
+    """The entry of `color` in a `number` [3] or [3, z, y, x]; other numbers as they are."""
     return number if number.ndim in (0, 3) else _pick(number, color)
 
 

@@ -17,7 +17,7 @@ LEGEND = 70
 """Room for a name in the legend."""
 ROW = 20
 """Height of a row of bars."""
-MOST = 500
+MOST_POINTS = 500
 """Points of a curve that are drawn."""
 
 
@@ -41,7 +41,7 @@ def draw_curve(
         if is_logarithmic:
             kept = [(x, math.log10(y)) for x, y in kept if y > 0]
         if kept:
-            drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST)], kept[-1]]
+            drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST_POINTS)], kept[-1]]
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
     ys = [y for points in drawn.values() for _, y in points] or [0.0]
     left, right, across_at = _axis(xs, LEFT, WIDTH - RIGHT)

@@ -16,9 +16,9 @@ from ddrecon.io.files.atomic import replace_file
 
 ASSETS = resources.files("ddrecon.report") / "assets"
 SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "film.js", "page.js")
-"""What makes a page alive, in the order in which one needs the other."""
+"""Scripts of a live page, in the order in which one needs the other."""
 REFRESH = '<meta http-equiv="refresh" content="30">'
-"""What has a browser load a page again and again."""
+"""Makes a browser reload a page."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\
@@ -86,17 +86,15 @@ def section(heading: str, *blocks: str) -> str:
 
 
 def paragraph(text: str) -> str:
-    """A paragraph."""
     return f"<p>{escape(text)}</p>"
 
 
 def items(lines: Sequence[str]) -> str:
-    """A list of `lines`."""
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
 def warnings(lines: Sequence[str]) -> str:
-    """A list of `lines` that is not overlooked."""
+    """A list of `lines` that stands out."""
     return f'<div class="doubts">{items(lines)}</div>'
 
 
@@ -114,7 +112,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def versions(environment: Mapping[str, Any]) -> str:
-    """A table of what took part."""
     lists = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     return table(["", ""], [(name, " ".join(map(str, values))) for name, values in lists])
 
@@ -154,7 +151,6 @@ def scrub(figures: Sequence[str]) -> str:
 
 
 def captioned(element: str, caption: str) -> str:
-    """The `element` above `caption`."""
     return f"<figure>{element}<figcaption>{escape(caption)}</figcaption></figure>"
 
 

@@ -82,7 +82,7 @@ def see_through(density: Tensor, shares: Tensor) -> np.ndarray:
     colors, sides = diverge(2 * share - 1), list[np.ndarray]()
     for axis in (0, 2, 1):
         through = np.moveaxis(depth, axis, 0)
-        # Of z, what is nearest comes last.
+        # Along z, the nearest cell comes last.
         order = slice(None, None, -1 if axis == 0 else 1)
         through, color = through[order], np.moveaxis(colors, axis, 0)[order]
         through = through * (OPAQUE / max(float(through.sum(0).max()), 1e-30))

@@ -87,10 +87,7 @@ def volume_viewer(
 
 
 def _data(field: Shown) -> str:
-    """`field` for the scripts: as it is displayed, in 8 bits, x fastest.
-
-    Of more than about `MOST_CELLS` cells there are means of blocks.
-    """
+    """`field` for the scripts: as displayed, 8 bits, x fastest; block means above `MOST_CELLS`."""
     values = field.values.detach().float()
     values = values if values.ndim == 4 else values[None]
     factor = math.ceil((values[0].numel() / MOST_CELLS) ** (1 / 3))

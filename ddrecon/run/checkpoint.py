@@ -23,15 +23,15 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
 FORMAT = 8
-"""What a checkpoint holds; counts up when that changes."""
+"""The version of a checkpoint's contents."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
 ANEW = "start anew with --overwrite"
 UNUSABLE = f"not a usable checkpoint; {ANEW}"
-"""What is wrong with a damaged checkpoint, and what to do."""
-MOST = 5
+"""The fault of a damaged checkpoint, and what to do."""
+MOST_CHANGES = 5
 """Differences that are named."""
-LONGEST = 80
+LONGEST_VALUE = 80
 """Values of more characters are cut short where they are shown."""
 ABSENT = object()
 
@@ -142,8 +142,8 @@ def require_same(old: Any, new: Any, text: str) -> None:
         for path, (then, current) in pairs.items()
         if then != current
     ]
-    if len(changes) > MOST:
-        changes[MOST:] = [f"{text}: {len(changes) - MOST} more differ"]
+    if len(changes) > MOST_CHANGES:
+        changes[MOST_CHANGES:] = [f"{text}: {len(changes) - MOST_CHANGES} more differ"]
     if changes:
         raise UsageError(changes)
 
@@ -161,7 +161,7 @@ def _leaves(tree: Any, path: str) -> dict[str, Any]:
 def _shorten(value: Any) -> str:
     if value is ABSENT:
         return "absent"
-    return json.dumps(value)[:LONGEST]
+    return json.dumps(value)[:LONGEST_VALUE]
 
 
 def _digest(path: Path) -> str:

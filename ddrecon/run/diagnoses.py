@@ -36,7 +36,7 @@ GHOSTS = 0.01
 WORTHWHILE = 0.1
 """A run is unfinished where as many iterations again would take this part off its loss."""
 SURE = 3.0
-"""So many standard errors are no chance: the loss differs from view to view."""
+"""Standard errors that a fall must exceed, as the loss differs from view to view."""
 
 
 def diagnose(
@@ -173,12 +173,12 @@ def _promised_share(rows: Sequence[Row], sure: float) -> float | None:
 
 
 def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
-    """By how much `more` iterations would lower a loss that comes to rest as `losses` do.
+    """The fall of the loss in `more` iterations, extrapolated from `losses`.
 
-    They are taken for c + a q^t: of the means m1, m2, m3 of their thirds, of w iterations each,
-    the falls m1 - m2 and m2 - m3 have the ratio q^w = Q (Aitken 1926), and so a q^t is at the end
-    (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). It is 0 where the second fall may be chance: no more
-    than `sure` standard errors, by how much neighbors differ.
+    The model is c + a q^t. The means m1, m2, m3 of thirds of w iterations give
+    q^w = Q = (m2 - m3) / (m1 - m2) (Aitken 1926), and at the end
+    a q^t = (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). The result is 0 where the second fall may be
+    chance: no more than `sure` standard errors, by how much neighbors differ.
     """
     count = len(losses) // 3
     first, second, third = (losses[i * count : (i + 1) * count] for i in range(3))
@@ -194,11 +194,11 @@ def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
 
 
 def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
-    """By how many pixels (right, down) the render `image` [3, h, w] is to be moved to fit best.
+    """The shift in pixels (right, down) by which the render `image` [3, h, w] fits best.
 
-    And the part of its residual, to the picture of `view`, that this explains. It is one step of
-    Gauss-Newton: the residual is fitted by the derivatives of the render along both axes (central
-    differences; Lucas and Kanade 1981).
+    Also returns the part of the residual to the picture of `view` that the shift explains. The
+    shift is one Gauss-Newton step: the residual is fitted by the derivatives of the render along
+    both axes (central differences; Lucas and Kanade 1981).
     """
     target, weight = target_of(view), _weight(view)
     if min(image.shape[1:]) < 3:

@@ -12,7 +12,7 @@ from ddrecon.errors import DivergenceError, RanksError, SceneError, UsageError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder
-from ddrecon.progress import SHORT, bar_settings, say, tell
+from ddrecon.progress import BAR, bar_settings, say, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import support_text
@@ -26,7 +26,7 @@ from ddrecon.scene_file.load import SceneFile, referenced_files
 from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
-"""What the progress bar of a run is called that is no frame of a film."""
+"""The title of the progress bar of a run that is no frame of a film."""
 
 
 def open_run(
@@ -150,9 +150,9 @@ def advance(
     failure leaves the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.most
-    form, settings = SHORT if total else None, bar_settings(is_quiet)
+    form, settings = BAR if total else None, bar_settings(is_quiet)
     bar = tqdm(total=total, initial=run.iteration, desc=title, bar_format=form, **settings)
-    # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
+    # Deferred: torchrun kills all ranks when one ends, and must not tear a checkpoint.
     with defer_interrupt() as asked:
         try:
             with bar:
@@ -173,9 +173,9 @@ def advance(
 
 
 def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list[str]:
-    """The `summary` of a run that is done, in `folder`, as lines; all of it took so many `seconds`.
+    """The `summary` of a finished run in `folder`, as lines; this process took `seconds`.
 
-    Those of its iterations count what was done before it was resumed, too.
+    The seconds of iterations include those before a resume.
     """
     line = (
         f"{summary['iterations']} iterations in {summary['seconds']:.1f} s, and {seconds:.1f} s "

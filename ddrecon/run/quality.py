@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.pictures.scales import COMPARED, LINEAR
 from ddrecon.progress import Progress
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import fit_held_out, response_sizes
 from ddrecon.reconstruct.setup import choose_loss, targets_of
-from ddrecon.renderer import solve_light, view_picture
 from ddrecon.run.registration import register
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings

@@ -14,20 +14,21 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, project
+from ddrecon.light_field import LightField
 from ddrecon.losses import Target
 from ddrecon.medium.coefficients import Volume
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import fit_held_out
-from ddrecon.renderer import LightField, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import pose_rate
 from ddrecon.variables.values import extinction_of, with_values
 
 STEPS = 8
-"""At most; they end when one makes nothing better."""
-LEAST = 1e-3
+"""The most steps; they end when one improves nothing."""
+DAMPING = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
-FARTHEST = 40.0
+LARGEST_STEP = 40.0
 """No step is farther than so many rates, of a quarter of a pixel."""
 
 
@@ -66,9 +67,9 @@ def register(
         jacobian = (changes * slope).flatten(1).double().cpu()
         residual = error.flatten().double().cpu()
         matrix = jacobian @ jacobian.T
-        matrix = matrix + LEAST * matrix.diagonal().max() * torch.eye(6).double()
+        matrix = matrix + DAMPING * matrix.diagonal().max() * torch.eye(6).double()
         step = torch.linalg.lstsq(matrix, jacobian @ residual).solution
-        step = step / (step.abs().max() / FARTHEST).clamp(min=1)
+        step = step / (step.abs().max() / LARGEST_STEP).clamp(min=1)
         change = change + step.to(unit) * unit
         moved, picture = see_by(change)
     return best | {"shift": shift_between(view.camera, camera, scene.volume)}

@@ -16,11 +16,13 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
 from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
+from ddrecon.light_field import LightField, fluence_of
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.levels import resample
+from ddrecon.picture import view_components, view_picture
 from ddrecon.progress import Progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
-from ddrecon.renderer import LightField, fluence_of, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.run_folder import write_values
 from ddrecon.scene import Scene, View
@@ -34,8 +36,8 @@ GRADIENT = ".gradient"
 AT_REST = 0.01
 """Light that a transport round changes by a smaller part has come to rest."""
 FEW = 12
-"""Of more views only the first and the last are printed."""
-PARTS = (".reduced", ".single", ".multiple")
+"""Where there are more views, only the first and the last are printed."""
+COMPONENTS = (".reduced", ".single", ".multiple")
 
 
 def render_to_folder(
@@ -58,7 +60,7 @@ def render_to_folder(
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
         fluence_files = _write_fluence(light_field, scene, folder, kinds) if kinds else []
-        names = ["", *(PARTS if has_components else ())]
+        names = ["", *(COMPONENTS if has_components else ())]
         if parameter is not None:
             names = [kind + name for name in names for kind in ("", GRADIENT)]
         for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
@@ -148,7 +150,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
 def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[str]:
     """What `render` prints of its `report`: files, quality and time of each view.
 
-    Of more than a few views, and of several if it `is_quiet`, only the first and the last.
+    More than `FEW` views, or two if it `is_quiet`, are cut to the first and the last.
     """
     lines = []
     for name, files in report["files"].items():
@@ -172,7 +174,7 @@ def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[s
 def rounds_text(count: int, residual: float, tolerance: float | None) -> str:
     """How many transport rounds there were, and whether light has come to rest in them (E7.3).
 
-    That is where the last one changed it by less than the `tolerance`, or `AT_REST`.
+    It has where the last round changed light by less than the `tolerance`, or `AT_REST`.
     """
     if residual < (tolerance or AT_REST):
         verdict = "at rest"
@@ -189,14 +191,14 @@ def _images(
 ) -> dict[str, Tensor]:
     picture = view_picture(light_field, scene, view)
     images = {"": picture}
-    if PARTS[0] in names:
+    if COMPONENTS[0] in names:
         # As the camera exposes them; its offset, and what is behind, count as reduced.
         components = view_components(light_field, scene, view.camera)
         gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
         single, multiple = gain * components.single, gain * components.multiple
         reduced = picture - single - multiple
         radiances = reduced + single + multiple, reduced, single, multiple
-        images = dict(zip(("", *PARTS), radiances, strict=True))
+        images = dict(zip(("", *COMPONENTS), radiances, strict=True))
     pairs = {name: forward_ad.unpack_dual(image) for name, image in images.items()}
     plain = {name: pair.primal for name, pair in pairs.items()}
     derived = {

@@ -48,9 +48,9 @@ from ddrecon.variables.values import fields_of
 SHOWN = 24
 """Views whose pictures are on the page; all are in the folder."""
 PIXELS = 1_200_000
-"""So many pixels all pictures of views have together, at most."""
+"""The most pixels that all pictures of views have together."""
 GOES_ON = {"kind": "running", "text": "goes on"}
-"""How a run has `ended` that has not."""
+"""The `ended` of a run that still goes on."""
 LISTED = 12
 """More numbers of one parameter are not listed."""
 FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"

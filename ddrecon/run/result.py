@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ddrecon.scene import Scene
 
 RESULT = "result.yaml"
-"""What the file is called in a run's folder."""
+"""The name of the file in a run's folder."""
 
 
 def require_no_film(folder: Path, more: str = "") -> None:
@@ -52,23 +52,15 @@ def describe_result(
     same as tensors, its cameras as reconstructed. Nothing is left to optimize.
     """
     described = {key: value for key, value in describe(scene_file).items() if key != "optimize"}
-    # The rounds and samples of the run, which a scene file that leaves them out chooses by what it
-    # seeks and by how dense it starts.
-    chosen = {
-        "transport_rounds": scene.diffusion.transport_rounds,
-        "degree": scene.diffusion.degree,
-        "refine": scene.diffusion.refine,
-        "refine_along": scene.diffusion.refine_along,
-    }
-    described["diffusion"] |= {key: value for key, value in chosen.items() if value is not None}
+    # A scene file that leaves out rounds and samples would choose them anew, by its own density.
+    for key in ("transport_rounds", "degree", "refine", "refine_along"):
+        if (value := getattr(scene.diffusion, key)) is not None:
+            described["diffusion"][key] = value
     described["render"]["steps_per_voxel"] = scene.render.steps
     # The volume, in its box: a reconstructed pair of cross sections replaces either pair.
     low, high = scene.volume.grid.bounds_xyz
-    box = {
-        "bounds": {"min": list(low), "max": list(high)},
-        "resolution": list(reversed(scene.volume.grid.shape)),
-    }
-    described["volume"] |= box
+    described["volume"]["bounds"] = {"min": list(low), "max": list(high)}
+    described["volume"]["resolution"] = list(reversed(scene.volume.grid.shape))
     # The cameras: poses in place of twists.
     for view, section in zip(scene.views, described["views"], strict=True):
         height, width = view.camera.size
@@ -117,22 +109,20 @@ def put_values(described: dict[str, Any], values: Mapping[str, Any]) -> None:
         described["ground"]["albedo"] = {"file": albedo} if isinstance(albedo, str) else albedo
     for section in described["views"]:
         camera, owner = section["camera"], f"views.{section['name']}."
-        of_view = {
-            n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)
-        }
-        if "camera" in of_view:
+        attributes = {n.removeprefix(owner): v for n, v in values.items() if n.startswith(owner)}
+        if "camera" in attributes:
             for key in ("origin", "target", "up"):
                 camera.pop(key, None)
-            camera |= of_view["camera"]
-        if "focal" in of_view:
-            camera["fov"] = 2 * math.degrees(math.atan(0.5 / of_view["focal"]))
-        if "principal_point" in of_view:
-            camera["principal_point"] = of_view["principal_point"]
-        if "distortion" in of_view:
+            camera |= attributes["camera"]
+        if "focal" in attributes:
+            camera["fov"] = 2 * math.degrees(math.atan(0.5 / attributes["focal"]))
+        if "principal_point" in attributes:
+            camera["principal_point"] = attributes["principal_point"]
+        if "distortion" in attributes:
             model = camera["distortion"]["type"]
-            coefficients = zip(LENSES[model], of_view["distortion"], strict=True)
+            coefficients = zip(LENSES[model], attributes["distortion"], strict=True)
             camera["distortion"] = {"type": model} | dict(coefficients)
-        section.update({key: of_view[key] for key in RESPONSE if key in of_view})
+        section.update({key: attributes[key] for key in RESPONSE if key in attributes})
 
 
 def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:

@@ -33,7 +33,7 @@ from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
 from ddrecon.run.report import GOES_ON, list_numbers, write_run_report
-from ddrecon.run.result import RESULT, describe_result, plain, result_names
+from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
     SceneFile,
@@ -60,9 +60,9 @@ CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
 PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
-"""Its report is written about this often, and takes at most this part of its time."""
+"""The report is written about this often, and takes at most this part of the run's time."""
 REPORT, SUMMARY = "report.html", "summary.json"
-"""Its page, and what is written last of all: a run that has it is finished."""
+"""The page of a run, and the file that is written last: a run that has it is finished."""
 
 
 def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruction:
@@ -87,7 +87,7 @@ def require_run(folder: Path) -> Path:
 
 
 class Checkpoints:
-    """Those in the folder `path` of a run, or of several together, written now and then.
+    """The checkpoints in the folder `path` of a run, or of several together, written now and then.
 
     `result_of` describes what the result depends on.
     """
@@ -147,12 +147,12 @@ class RunFolder(Checkpoints):
         self.note_saved(run, 0.0)
 
     def save(self, run: Reconstruction | Together) -> None:
-        """Writes a checkpoint, after the log, which so never lacks rows that it counts."""
+        """Writes a checkpoint after the log, which therefore has all rows that it counts."""
         flush(self.log.path)
         super().save(run)
 
     def save_in_time(self, run: Reconstruction | Together) -> None:
-        """As of all checkpoints; and has the report say how far the run is, unless that is new."""
+        """Writes a checkpoint if the last is old, and likewise the report of the run so far."""
         super().save_in_time(run)
         if isinstance(run, Reconstruction) and run.iteration:
             start = monotonic()
@@ -219,9 +219,8 @@ class RunFolder(Checkpoints):
                 is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
             ):
                 parameters[name] = value.tolist()
+        parameters |= poses_of(scene, [f"views.{view.name}.camera" for view in scene.views])
         for view in scene.views:
-            matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
-            parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
             for key in RESPONSE:
                 if (value := getattr(view, key)) is not None:
                     parameters[f"views.{view.name}.{key}"] = value.tolist()

@@ -1,7 +1,7 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
 The strict part of YAML: one document of mappings, lists and scalars; no tags or repeated keys.
-Aliases are written out, up to `MAX_COPIES` values. What plain scalars mean is the core schema of
+Aliases are written out. What plain scalars mean is the core schema of
 YAML 1.2 (section 10.3.2), which has no merge key `<<`: `1e-3` is a number, `yes` is text.
 """
 
@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -20,8 +21,11 @@ from ddrecon.errors import Problems, SceneError
 Scalar = None | bool | int | float | str
 
 MAX_DEPTH = 32
-MAX_COPIES = 10_000
-"""So many values may come of aliases: a few of these could stand for billions."""
+TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
+MAX_NODES = 100_000
+"""A few aliases could stand for billions of values."""
+TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
+"""Those that nodes have of which a file says none."""
 LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
 
@@ -95,10 +99,12 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
-        return _Composer(text, locate, problems).document(key)
+        _require_shallow(text, locate)
+        if (source := yaml.compose(text, Loader=LOADER)) is None:
+            raise SceneError(f"{locate(1, 1)}: is empty")
+        return _Builder(locate, problems).build(source, key, None, 0)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
+        where = _place(locate, error.problem_mark or error.context_mark)
         what = ", ".join(filter(None, (error.context, error.problem)))
     except UnicodeEncodeError:
         where, what = locate(1, 1), "its text is not UTF-8"
@@ -109,95 +115,67 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     raise SceneError(f"{where}: not YAML: {what}")
 
 
-class _Composer:
-    """Builds nodes from the parser's events: aliases are seen before anything follows them.
-
-    `anchors` are the nodes that aliases may stand for, by name; `copies` counts what they became.
-    """
-
-    def __init__(self, text: str, locate: Locate, problems: Problems):
-        self.events = yaml.parse(text, Loader=LOADER)
-        self.locate, self.problems = locate, problems
-        self.anchors: dict[str, Node] = {}
-        self.copies = 0
-
-    def document(self, key: str) -> Node:
-        next(self.events)
-        if isinstance(next(self.events), yaml.StreamEndEvent):
-            raise SceneError(f"{self.locate(1, 1)}: is empty")
-        root = self.node(next(self.events), key, None, 0)
-        next(self.events)
-        if not isinstance(after := next(self.events), yaml.StreamEndEvent):
-            raise SceneError(f"{self.where(after)}: a second document begins; only one is allowed")
-        return root
-
-    def node(self, event: yaml.Event, key: str, key_where: str | None, depth: int) -> Node:
-        where = self.where(event)
-        node = Node(key, where, key_where or where, None)
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor not in self.anchors:
-                raise node.refused(f"*{event.anchor} stands for nothing: no &{event.anchor} before")
-            return self.copy(self.anchors[event.anchor], node, depth)
-        tag, anchor = getattr(event, "tag", None), getattr(event, "anchor", None)
-        if tag:
-            raise node.refused(f"tags such as {tag!r} are not supported")
+def _require_shallow(text: str, locate: Locate) -> None:
+    """Raises SceneError where `text` is nested so deep that composing it might end the process."""
+    depth = 0
+    for event in yaml.parse(text, Loader=LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
-            raise node.refused(f"nested more than {MAX_DEPTH} deep")
-        if isinstance(event, yaml.ScalarEvent):
-            node.value = event.value if event.style else resolve(event.value)
-        elif isinstance(event, yaml.SequenceStartEvent):
-            node.value = entries = list[Node]()
-            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
-                entries.append(self.node(event, node.child_key(len(entries)), None, depth + 1))
+            raise SceneError(f"{_place(locate, event.start_mark)}: {TOO_DEEP}")
+
+
+def _place(locate: Locate, mark: Any) -> str:
+    """Where a `mark` of PyYAML is, the beginning where there is none."""
+    return locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
+
+
+class _Builder:
+    """Makes nodes of those of PyYAML; what an alias stands for is copied, and `count` of nodes."""
+
+    def __init__(self, locate: Locate, problems: Problems):
+        self.locate, self.problems = locate, problems
+        self.count = 0
+
+    def build(self, source: yaml.Node, key: str, key_where: str | None, depth: int) -> Node:
+        """The node at `key` for `source`, within so many others."""
+        where = self.where(source)
+        node = Node(key, where, key_where or where, None)
+        self.count += 1
+        if depth > MAX_DEPTH:
+            raise node.refused(TOO_DEEP)
+        if self.count > MAX_NODES:
+            raise node.refused(f"holds more than {MAX_NODES:,} values, those of aliases counted")
+        if source.tag not in TAGS:
+            raise node.refused(f"tags such as {source.tag!r} are not supported")
+        if isinstance(source, yaml.ScalarNode):
+            node.value = source.value if source.style else resolve(source.value)
+        elif isinstance(source, yaml.SequenceNode):
+            node.value = [
+                self.build(entry, node.child_key(index), None, depth + 1)
+                for index, entry in enumerate(source.value)
+            ]
         else:
-            node.value = self.mapping(node, depth)
-        if anchor:
-            self.anchors[anchor] = node
+            node.value = self.entries(source, node, depth)
         return node
 
-    def copy(self, source: Node, node: Node, depth: int) -> Node:
-        """`node`, an alias of `source` or below one, with copies of all that is below `source`."""
-        self.copies += 1
-        if self.copies > MAX_COPIES or depth > MAX_DEPTH:
-            raise node.refused(
-                f"aliases stand for more than {MAX_COPIES:,} values, or are nested more than"
-                f" {MAX_DEPTH} deep; write the value out"
-            )
-
-        def below(name: object, child: Node) -> Node:
-            place = Node(node.child_key(name), child.where, child.key_where, None)
-            return self.copy(child, place, depth + 1)
-
-        if isinstance(source.value, dict):
-            node.value = {name: below(name, child) for name, child in source.value.items()}
-        elif isinstance(source.value, list):
-            node.value = [below(index, child) for index, child in enumerate(source.value)]
-        else:
-            node.value = source.value
-        return node
-
-    def mapping(self, parent: Node, depth: int) -> dict[str, Node]:
+    def entries(self, source: yaml.Node, parent: Node, depth: int) -> dict[str, Node]:
         entries = dict[str, Node]()
-        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
-            if not isinstance(event, yaml.ScalarEvent):
-                raise SceneError(
-                    f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text"
-                )
-            name = event.value if event.value.isprintable() else repr(event.value)
-            child = self.node(
-                next(self.events), parent.child_key(name), self.where(event), depth + 1
-            )
+        for named, value in source.value:
+            where = self.where(named)
+            if not isinstance(named, yaml.ScalarNode):
+                raise SceneError(f"{where}: {parent.child_key('?')}: a key must be plain text")
+            name = named.value if named.value.isprintable() else repr(named.value)
+            child = self.build(value, parent.child_key(name), where, depth + 1)
             if name in entries:
-                self.problems.note(
-                    child.key_refused(f"repeated key; it is already at {entries[name].key_where}")
-                )
+                place = entries[name].key_where
+                self.problems.note(child.key_refused(f"repeated key; it is already at {place}"))
             else:
                 entries[name] = child
         return entries
 
-    def where(self, event: yaml.Event) -> str:
-        mark = event.start_mark
-        return self.locate(mark.line + 1, mark.column + 1) if mark else self.locate(1, 1)
+    def where(self, source: yaml.Node) -> str:
+        return _place(self.locate, source.start_mark)
 
 
 _WORDS: dict[str, Scalar] = {

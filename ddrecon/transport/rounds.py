@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
-from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.diffusion.operator import Operator
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Cut, add, cut, mean_and_first
 from ddrecon.medium.coefficients import Medium
@@ -210,12 +210,7 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 
 
 def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
-    imbalance = right - operator.loss * mean
-    for axis, conductance in zip(AXES, operator.conductances, strict=True):
-        imbalance = imbalance - accumulate(
-            conductance * difference(mean, conductance, axis), mean, axis
-        )
-    return imbalance
+    return right - operator.apply(mean)
 
 
 def _transport_share(medium: Medium, step: tuple[float, float]) -> Tensor:

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
+from ddrecon.picture import view_picture
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import share_pictures
-from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import with_values
 

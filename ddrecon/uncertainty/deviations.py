@@ -1,7 +1,7 @@
-"""What experiments say of each cell and number: deviations, and how often they held (E11.4).
+"""Deviations of each cell and number by experiments, and how often they held (E11.4).
 
 A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
-a factor for its class, times `SHORT`.
+a factor for its class, times `RATIO`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from ddrecon.uncertainty.experiments import Uncertainty, is_tabled
 from ddrecon.variables.kinds import split_name
 from ddrecon.variables.values import component_names
 
-WITHIN = 0.68
-"""The part of cells that is to be within one deviation."""
-SHORT = 1.55
-"""How many times as large errors are as in experiments, whose volumes lack what no reconstruction
-shows: as measured where the truth was known (docs/uncertainty.md)."""
+COVERED = 0.68
+"""The share of cells within one deviation."""
+RATIO = 1.55
+"""The ratio of true to simulated errors, measured where the truth was known: volumes of experiments
+lack what no reconstruction shows (docs/uncertainty.md)."""
 EMPTY = 0.02
 """Cells of less than this part of the largest are empty."""
 WIDTH = 3
 """Cells a side over which errors are averaged,"""
-WIDE = 9
+SMOOTH = 9
 """and over which samples hang together."""
 
 
@@ -70,7 +70,7 @@ class Field:
 
     @cached_property
     def factors(self) -> dict[str, float]:
-        """Of each class how large, in spreads, two thirds of the experiments' errors are."""
+        """The size, in spreads, that two thirds of the experiments' errors keep, by class."""
         sizes = torch.stack(self.errors).abs() / self.spread()
         smoke = self.is_smoke
         return {n: _find_within(sizes[:, cells & smoke]) for n, cells in self.classes.items()}
@@ -81,10 +81,10 @@ class Field:
         return self.deviation_but(None) if self.errors else self.left.sqrt()
 
     def deviation_but(self, but: int | None) -> Tensor:
-        """It by all experiments `but` one. Where pictures tell nothing, it is what they leave."""
+        """The deviation by all experiments `but` one; unseen cells have at least that of noise."""
         spread, deviation = self.spread(but), self.left.sqrt()
         for name, cells in self.classes.items():
-            by_errors = SHORT * self.factors[name] * spread
+            by_errors = RATIO * self.factors[name] * spread
             if name == "unseen":
                 by_errors = torch.maximum(by_errors, deviation)
             deviation = torch.where(cells, by_errors, deviation)
@@ -120,10 +120,10 @@ class Field:
         if not self.errors:
             return {}
         errors = [(at, error.abs()[where]) for at, error in enumerate(self.errors)]
-        factors = [SHORT * _find_within(error / self.spread(at)[where]) for at, error in errors]
+        factors = [RATIO * _find_within(error / self.spread(at)[where]) for at, error in errors]
         sizes = torch.cat([error / self.deviation_but(at)[where] for at, error in errors])
         within = {f"within_{k}": float((sizes < k).double().mean()) for k in (1, 2)}
-        factors_of_class = {"factor": SHORT * self.factors[name], "factors": factors}
+        factors_of_class = {"factor": RATIO * self.factors[name], "factors": factors}
         return factors_of_class | (within if len(errors) > 1 else {})
 
     def draw(self, generator: torch.Generator) -> Tensor:
@@ -157,7 +157,7 @@ class Deviations:
                 value = cell * float(field.value.sum())
                 numbers[f"mass of {name}"] = _with_deviation(value, cell * sums)
         for p in self.tabled:
-            # Of one kind, all views' numbers err alike, and so do all entries of any other.
+            # All views' numbers of one kind err alike, and so do all entries of other numbers.
             alike = [q for q in self.tabled if q.view is not None and q.key == p.key]
             stacked = [torch.stack([e[q.name].flatten() for q in alike or [p]]) for e in errors]
             for at, name in enumerate(_entry_names(p)):
@@ -185,7 +185,7 @@ def _with_deviation(value: float, errors: Tensor) -> dict[str, float | None]:
     """A number with its deviation, by the `errors` of experiments: wider where there are few."""
     count = len(errors)
     size = float(errors.double().square().mean().sqrt()) if count else None
-    return {"value": value, "deviation": size and SHORT * (1 + 2 / count) * size}
+    return {"value": value, "deviation": size and RATIO * (1 + 2 / count) * size}
 
 
 def _entry_names(parameter: Parameter) -> Sequence[str]:
@@ -198,12 +198,12 @@ def _entry_names(parameter: Parameter) -> Sequence[str]:
 
 
 def _find_within(sizes: Tensor) -> float:
-    """What `WITHIN` of the `sizes` are at most; 1 where there are none."""
+    """What `COVERED` of the `sizes` are at most; 1 where there are none."""
     count = sizes.numel()
-    return float(sizes.flatten().kthvalue(math.ceil(WITHIN * count)).values) if count else 1.0
+    return float(sizes.flatten().kthvalue(math.ceil(COVERED * count)).values) if count else 1.0
 
 
 def _draw_smooth(like: Tensor, generator: torch.Generator) -> Tensor:
-    """A random field like `like`, of mean square 1, smooth over `WIDE` cells."""
-    wave = mean_around(torch.randn(like.shape, generator=generator, dtype=like.dtype), WIDE)
+    """A random field like `like`, of mean square 1, smooth over `SMOOTH` cells."""
+    wave = mean_around(torch.randn(like.shape, generator=generator, dtype=like.dtype), SMOOTH)
     return wave / wave.square().mean().sqrt()

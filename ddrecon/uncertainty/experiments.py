@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_picture
 from ddrecon.pictures.noise import LEAST, Noise
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.reconstruct.shares import share_pictures
-from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene
 from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import with_values
@@ -31,7 +32,7 @@ MOST_ROUNDS = 16
 PROBES = 3
 """Random pictures by which it is found what pictures tell of each cell."""
 STATE = ("count", "errors", "truth", "information")
-"""What a checkpoint keeps besides the experiment that goes on."""
+"""The state that a checkpoint keeps besides the current experiment."""
 
 
 class Uncertainty:

@@ -16,14 +16,14 @@ from ddrecon.report.page import items, paragraph, picture, section, table, write
 from ddrecon.report.pictures import see_through, slices
 from ddrecon.report.volumes import find_white_value
 from ddrecon.run.run_folder import write_values
-from ddrecon.uncertainty.deviations import SHORT, Deviations, Field
+from ddrecon.uncertainty.deviations import RATIO, Deviations, Field
 from ddrecon.variables.kinds import kind_of
 
 RECORD = "uncertainty.json"
 ASSUMED = (
     "Deviations come from experiments: the reconstruction was photographed, with more transport"
     " rounds than the run had and the errors of its pictures, and reconstructed by the same"
-    f" settings. They are scaled by {SHORT}, the ratio of true to simulated errors on four volumes"
+    f" settings. They are scaled by {RATIO}, the ratio of true to simulated errors on four volumes"
     " of known truth. Cameras, lights and optics that were not optimized are taken for true."
 )
 CAVEAT = (

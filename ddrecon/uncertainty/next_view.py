@@ -1,7 +1,6 @@
-"""Which picture to take next: the one from farthest off those that there are.
+"""Which picture to take next: the candidate farthest from the existing cameras.
 
-How much of what experiments leave open a picture would tell was tried, and proposed worse pictures
-(docs/decisions.md).
+A ranking by the variance that a picture would remove proposed worse ones (docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ from ddrecon.scene import Scene
 from ddrecon.turntable import place_turntable
 
 CANDIDATES = 12
-"""Pictures that are ranked."""
+"""Cameras that are ranked."""
 TIED = 2 / 3
-"""So far off as a part of the best, a picture was as good where it was tried."""
+"""Candidates of at least this part of the best angle were as good where it was tried."""
 
 
 def rank_views(scene: Scene) -> list[dict[str, Any]]:
-    """What `uncertainty.json` says of pictures that `scene` may get, best first.
+    """The candidates of `uncertainty.json` for the next picture of `scene`, best first.
 
-    All are by its first camera, turned around the volume. Of each: `name`; `angle` [degrees], how
-    far off the nearest picture it looks from; `matrix` [4, 4], camera to world; and whether it
-    `is_tied` with the best.
+    All are its first camera, turned around the volume. Each has its `name`; `angle` [degrees] to
+    the nearest existing camera; `matrix` [4, 4], camera to world; and whether it `is_tied` with the
+    best.
     """
     taken, ranked = [_way_to(view.camera, scene) for view in scene.views], list[dict[str, Any]]()
     for view in place_turntable(scene, scene.views[0], CANDIDATES):

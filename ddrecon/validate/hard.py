@@ -29,8 +29,8 @@ from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.picture import render
 from ddrecon.progress import Progress
-from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 

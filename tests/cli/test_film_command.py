@@ -23,7 +23,7 @@ import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.film.drive import share_out, spread_out
-from ddrecon.film.folder import KEPT, Film
+from ddrecon.film.folder import MIXED, Film
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.field import prune
 from ddrecon.io.volumes.table import field_names, read_field, write_field
@@ -175,7 +175,7 @@ def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
         for place in (Path("bare"), frame / "start", frame)
     )
     assert np.abs(bare - start).max() > 1e-3
-    np.testing.assert_allclose(kept, (1 - KEPT) * bare + KEPT * start, atol=1e-6)
+    np.testing.assert_allclose(kept, (1 - MIXED) * bare + MIXED * start, atol=1e-6)
 
 
 def test_frames_end_by_themselves_as_runs_do(

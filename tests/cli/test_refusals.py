@@ -37,7 +37,6 @@ render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
 optimize scene.yaml -o out --iterations 0 => 2 --iterations 0: optimize.iterations: must
 optimize scene.yaml -o out --iterations some => 2 --iterations some: optimize.iterations:
-optimize scene.yaml -o out --uncertainty => 2 Error: --uncertainty: say `ddrecon uncertainty
 optimize plain.yaml -o out => 2 plain.yaml: optimize: missing section
 optimize done -o out => 2 done: a finished run leaves nothing to optimize; name its scene, done/sc
 optimize done/result.yaml -o out --iterations 9 => 2 done/result.yaml: a finished run leaves noth

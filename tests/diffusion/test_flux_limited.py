@@ -18,7 +18,8 @@ from ddrecon.diffusion.flux_limited import (
 from ddrecon.diffusion.implicit import ImplicitSolve, SolveMemory, SolverWithMemory
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
-from ddrecon.renderer import render, solve_light
+from ddrecon.lighting import solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 

@@ -10,10 +10,10 @@ from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ddrecon.diffusion import hierarchy
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers import hierarchy
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 
 SHAPES = [(2, 3, 2), (1, 2, 4), (1, 1, 1), (2, 1, 2)]
 MODES: dict[str, Any] = {"check_forward_ad": True, "fast_mode": True}
@@ -33,10 +33,13 @@ def inputs():
     """source, loss and conductances of two colors, or of a gray operator under a colored source."""
 
     def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
-        faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]
-        sizes = enumerate([shape, *faces], 1)
-        others = [1 + random_values(colors, *size, seed=seed) for seed, size in sizes]
-        return [random_values(2, *shape) - 0.5, *others]
+        source, others = (
+            random_values(2, *shape) - 0.5,
+            [1 + random_values(colors, *shape, seed=seed) for seed in range(1, 5)],
+        )
+        for axis, faces in enumerate(others[1:], 1):
+            faces.select(axis, -1).zero_()  # on the box
+        return [source, *others]
 
     return make
 
@@ -70,8 +73,7 @@ def test_the_adjoint_takes_what_the_forward_solve_prepared_of_the_operator(
     def refuse(*_: object) -> None:
         raise AssertionError("prepared again")
 
-    monkeypatch.setattr(hierarchy, "coarsen", refuse)
-    monkeypatch.setattr(hierarchy.Coarsest, "of", refuse)
+    monkeypatch.setattr(hierarchy.Hierarchy, "of", refuse)
     solve_diffusion(solve, operator, 2 * source)
     torch.autograd.grad(u.sum(), loss)
 

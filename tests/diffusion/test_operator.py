@@ -15,7 +15,7 @@ from ddrecon.diffusion.operator import (
     difference,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 
 SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
@@ -61,17 +61,12 @@ def test_the_operator_is_a_positive_definite_m_matrix(operator: Operator):
 
 
 def test_accumulate_is_the_transpose_of_difference(grid: Grid):
-    """Also where the last cell along an axis is a neighbor of the first."""
     u = random_values(2, *grid.shape) - 0.5
     for axis in AXES:
-        for count in {grid.shape[axis - 1] - 1, grid.shape[axis - 1]}:
-            sizes = [
-                count if other == axis else n for other, n in zip(AXES, grid.shape, strict=True)
-            ]
-            faces = random_values(2, *sizes, seed=axis) - 0.5
-            torch.testing.assert_close(
-                (difference(u, faces, axis) * faces).sum(), (u * accumulate(faces, u, axis)).sum()
-            )
+        faces = random_values(2, *grid.shape, seed=axis) - 0.5
+        torch.testing.assert_close(
+            (difference(u, axis) * faces).sum(), (u * accumulate(faces, axis)).sum()
+        )
 
 
 @pytest.mark.parametrize("has_outside", [False, True])

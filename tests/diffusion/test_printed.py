@@ -26,8 +26,9 @@ from ddrecon.diffusion.printed import (
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import flux_along_axes, moments_of_flux
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import Volume, keep_medium
-from ddrecon.renderer import render, solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 

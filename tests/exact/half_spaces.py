@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 
 VIEWS = (1.0, 0.8, 0.5, 0.25)

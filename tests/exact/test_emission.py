@@ -11,8 +11,9 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
+from ddrecon.lighting import solve_light
 from ddrecon.medium.black_body import WHITE, black_body_radiance
-from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
 
 GRID = Grid((6, 5, 7), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))

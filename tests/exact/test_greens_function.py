@@ -5,7 +5,7 @@ import math
 import torch
 from media import convergence_order, make_operator
 
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 
 DIFFUSION = 0.3

@@ -9,10 +9,11 @@ from media import box_grid, make_operator, make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
-from ddrecon.renderer import solve_light, view_components
+from ddrecon.lighting import solve_light
+from ddrecon.picture import view_components
 from ddrecon.scene import Scene
 
 ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)

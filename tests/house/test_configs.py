@@ -11,10 +11,10 @@ from media import random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.picture import render
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.setup import Problem, select_views, start_parameters
-from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.schema import PhaseSection

@@ -62,7 +62,7 @@ def masses(
 @pytest.mark.parametrize("upper", ["cubes", "boxes"])
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
 def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...], upper: str):
-    """Also where places lie exactly on cells' centers: there the mean of both sides' slopes."""
+    """Also where places lie exactly on cells' centers: there the slopes beyond them."""
     heading = torch.nn.functional.normalize(vector(*direction), dim=0)
     for shape in SHAPES:
         corner = (1.25, 1.3, 0.9) if upper == "boxes" else tuple(0.2 * cells for cells in shape)

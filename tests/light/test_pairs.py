@@ -10,9 +10,9 @@ from media import make_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.pairs import follow_pair
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.medium.remaining import backward_fraction
-from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.profile import profile_in
-from ddrecon.renderer import fluence, render
+from ddrecon.lighting import fluence
+from ddrecon.picture import render
 from ddrecon.settings import RenderSettings
 
 AXES = (0.0, 0.0, -1.0), (0.3, -1.0, 0.2), (0.5, 0.4, 1.3)

@@ -16,7 +16,7 @@ from ddrecon.light.lights import DirectionalLight, EnvironmentLight
 from ddrecon.light.reduced import sum_unscattered_sky
 from ddrecon.light.sky import MAX_SUNS, count_suns, decompose_map, fibonacci_sphere
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 
 SHAPE = (5, 4, 6)

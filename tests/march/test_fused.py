@@ -16,7 +16,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.renderer import render_each
+from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
@@ -196,7 +196,7 @@ def test_packets_read_and_write_whole_rows(
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
 def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
-    """There slopes are the mean of both sides; from all sides, by packets of rows or columns."""
+    """There slopes are those beyond centers; from all sides, by packets of rows or columns."""
     camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=False)
     if eye[1]:
         camera = make_camera(size=(9, 7), half_width=0.3, eye=eye)
@@ -219,10 +219,10 @@ def test_hard_cases_are_passed(name: str):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, 0, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
-    several = Layout(3, 3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
-    steep = Layout(1, 1, 1, 0, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
-    packets = [mark_kernel(32), kernels.integral_kernel(steep, False)]
+    one = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
+    several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)
+    by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
+    packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
     packets += [
         kernels.tangent_kernel(one, Case(False, True, True)),
         kernels.adjoint_kernel(several, Case(False)),

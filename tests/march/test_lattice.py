@@ -10,11 +10,12 @@ from torch import Tensor
 from ddrecon.cameras import Rays, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
+from ddrecon.lighting import send, solve_light
 from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
 from ddrecon.march.samplers import choose_way
-from ddrecon.renderer import _emission, render, solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
@@ -81,13 +82,13 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     """Pixels of the lattice's own rays are what marching those rays gives."""
     scene = scene_of(view)
     lattice = lattice_of(scene)[0]
-    emission = _emission(solve_light(scene, SolveMemory()), lattice.rays)
+    outgoing = send(solve_light(scene, SolveMemory()), lattice.rays)
     hit = cross_box(scene.volume.grid, lattice.rays).hit
     places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
     own_places = replace(lattice, places=places)
     monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated = march_rays(emission, lattice.rays, INTERPOLATED)
-    own = march_rays(emission, lattice.rays, OWN)
+    interpolated = march_rays(outgoing, lattice.rays, INTERPOLATED)
+    own = march_rays(outgoing, lattice.rays, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 

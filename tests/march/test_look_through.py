@@ -8,7 +8,7 @@ from media import box_grid, make_camera, make_scene, random_values
 
 from ddrecon.cameras import Camera
 from ddrecon.march.sight import look_through
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values

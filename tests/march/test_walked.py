@@ -13,7 +13,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.march.samplers import planes_across, support_of_planes
 from ddrecon.march.sight import look_through
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values

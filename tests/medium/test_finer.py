@@ -8,10 +8,10 @@ from media import make_scene, random_values
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
+from ddrecon.lighting import fluence
 from ddrecon.medium.coefficients import Coefficient, scale_medium
 from ddrecon.medium.levels import refine_medium
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.renderer import fluence
 
 SHAPE = 4, 1, 5
 GRID = Grid(SHAPE, (-0.4, -0.3, -0.5), (0.4, 0.3, 0.5))

@@ -11,8 +11,8 @@ from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.levels import volume_at_level
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
+from ddrecon.picture import render
 from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, variable_names, with_values
 

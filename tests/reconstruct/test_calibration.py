@@ -11,13 +11,13 @@ from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.picture import render
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.renderer import render
 from ddrecon.scene import View
 from ddrecon.settings import OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.deviations import SHORT, Deviations, Field
+from ddrecon.uncertainty.deviations import RATIO, Deviations, Field
 from ddrecon.uncertainty.experiments import Uncertainty
 
 SHAPE = (12, 14, 10)
@@ -112,11 +112,11 @@ def test_a_truth_stays_within_bounds_and_numbers_stay_as_found(
     torch.testing.assert_close(found.truth["density"], (value.clamp(min=0) - 0.2).clamp(min=0))
     assert float(found.truth["g"]) == 0.3
     numbers = Deviations(found).numbers()
-    assert numbers["g"] == {"value": 0.3, "deviation": pytest.approx(SHORT * 3 * 0.2)}
+    assert numbers["g"] == {"value": 0.3, "deviation": pytest.approx(RATIO * 3 * 0.2)}
     # The mass is the integral over the box, and errs by all cells together.
     mass, volume = numbers["mass of density"], 1.2 * 1.4 * 1.0
     assert mass["value"] == pytest.approx(volume * float(value.clamp(min=0).mean()))
-    assert mass["deviation"] == pytest.approx(SHORT * 3 * 0.2 * volume)
+    assert mass["deviation"] == pytest.approx(RATIO * 3 * 0.2 * volume)
 
 
 def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack() -> None:
@@ -132,7 +132,7 @@ def test_two_thirds_of_errors_are_within_a_deviation_less_what_experiments_lack(
     for name in ("edge", "inside"):
         where = field.classes[name] & field.is_smoke
         errors = torch.stack([error[where] for error in field.errors])
-        share = float((errors.abs() < field.deviation[where] / SHORT).double().mean())
+        share = float((errors.abs() < field.deviation[where] / RATIO).double().mean())
         assert share == pytest.approx(0.68, abs=0.01)
     described = field.describe()["classes"]
     assert sum(each["share"] for each in described.values()) == pytest.approx(1)

@@ -8,8 +8,8 @@ from media import data_product, half_empty, make_camera, make_scene, random_valu
 from torch import Tensor
 
 from ddrecon.losses import LOSSES, Target
+from ddrecon.picture import render
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import ParameterSettings
 from ddrecon.uncertainty.curvature import Curvature

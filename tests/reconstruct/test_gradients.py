@@ -8,8 +8,8 @@ from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.picture import render_each
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings, ParameterSettings
 from ddrecon.variables.values import value_of, with_values

@@ -12,8 +12,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.medium.coefficients import Volume
+from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import optimize
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, ParameterSettings
 from ddrecon.variables.values import value_of, with_values

@@ -9,7 +9,7 @@ import torch
 
 from ddrecon.reconstruct.levels import stage_of
 from ddrecon.reconstruct.schedule import Progress, Schedule, rate_at
-from ddrecon.reconstruct.tuning import FALL, MOST, PLANNED, WINDOW
+from ddrecon.reconstruct.tuning import FALL, MOST_ITERATIONS, PLANNED, WINDOW
 from ddrecon.settings import AUTO, OptimizeSettings, ParameterSettings
 
 LossOf = Callable[[int], float]
@@ -55,9 +55,9 @@ def test_a_loss_that_falls_goes_on_as_planned_and_then_to_the_most() -> None:
     schedule = schedule_of()
     # By a little more in a window than what counts as rest.
     stages = drive(schedule, lambda made: (1 - 1.01 * FALL) ** (made / WINDOW))
-    assert len(stages) == MOST and schedule.ending(MOST)["kind"] == "bound"
-    assert stages == [stage_of(i, PLANNED, (0.4, 0.8)) for i in range(MOST)]
-    assert schedule.rate(MOST - 1, 0.0) == pytest.approx(schedule.final_rate)
+    assert len(stages) == MOST_ITERATIONS and schedule.ending(MOST_ITERATIONS)["kind"] == "bound"
+    assert stages == [stage_of(i, PLANNED, (0.4, 0.8)) for i in range(MOST_ITERATIONS)]
+    assert schedule.rate(MOST_ITERATIONS - 1, 0.0) == pytest.approx(schedule.final_rate)
 
 
 def test_a_loss_at_rest_ends_a_part_after_two_windows() -> None:
@@ -76,7 +76,7 @@ def test_a_window_tells_no_view_from_another() -> None:
 
 
 def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
-    random = torch.rand(MOST, generator=torch.Generator().manual_seed(3)).tolist()
+    random = torch.rand(MOST_ITERATIONS, generator=torch.Generator().manual_seed(3)).tolist()
     whole, parts, made = schedule_of(), schedule_of(), 0
     while not whole.is_over(made):
         assert not parts.is_over(made) and parts.stage(made) == whole.stage(made)

@@ -12,8 +12,8 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
+from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty.deviations import Deviations

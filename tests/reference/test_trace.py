@@ -16,9 +16,9 @@ from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.picture import render
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
-from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 

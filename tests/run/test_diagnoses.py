@@ -11,10 +11,10 @@ import torch
 
 from ddrecon.cameras import twist
 from ddrecon.losses import Target
+from ddrecon.picture import render
 from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import Support
-from ddrecon.renderer import render
 from ddrecon.run.diagnoses import (
     best_shift,
     diagnose,

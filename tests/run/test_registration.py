@@ -9,8 +9,9 @@ from media import box_grid, make_camera, make_scene, random_values
 from ddrecon.cameras import project, twist
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
+from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
-from ddrecon.renderer import solve_light, view_picture
+from ddrecon.picture import view_picture
 from ddrecon.run.registration import register, shift_between
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.io.volumes.table import write_field
+from ddrecon.picture import render
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import render
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import RunFolder
 from ddrecon.scene_file.build import build_scene, load_scene

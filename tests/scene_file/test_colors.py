@@ -11,7 +11,8 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import render, solve_light
+from ddrecon.lighting import solve_light
+from ddrecon.picture import render
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, with_values
 

@@ -73,18 +73,21 @@ def test_aliases_mean_what_yaml_says():
     root = parse(ALIASED, lambda line, column: f"{line}:{column}", Problems())
     assert plain(root) == yaml.safe_load(ALIASED)
     marks = {node.key: node.where for node in root.walk()}
-    assert marks["views.0.camera"] == "4:23" and marks["views.0.camera.fov"] == "2:19"
+    assert marks["views.0.camera"] == "2:7" and marks["views.0.camera.fov"] == "2:19"
     assert marks["views.1.camera.fov"] == "5:42" and marks["views.1.camera.size.1"] == "2:39"
 
 
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("a: 1\nb: [*x]\n", "scene.yaml:2:5: b.0: *x stands for nothing: no &x before"),
-        ("a: &x [*x]\n", "scene.yaml:1:8: a.0: *x stands for nothing: no &x before"),
-        ("a: &x [" + "0, " * 5000 + "0]\nb: [*x, *x]\n", "aliases stand for more than 10,000"),
+        ("a: 1\nb: [*x]\n", "scene.yaml:2:5: not YAML: found undefined alias"),
+        ("a: &x [*x]\n", "nested more than 32 deep"),
+        ("a: &x [" + "0, " * 5000 + "0]\nb: [" + "*x, " * 20 + "0]\n", "more than 100,000 values"),
         ("a: !!python/name:os.system x\n", "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:py"),
-        ("a: 1\n---\nb: 2\n", "scene.yaml:2:1: a second document begins; only one is allowed"),
+        (
+            "a: 1\n---\nb: 2\n",
+            "scene.yaml:2:1: not YAML: expected a single document in the stream, ",
+        ),
         ("? [a]\n: 1\n", "scene.yaml:1:3: ?: a key must be plain text"),
         ("a: [1,\n", "scene.yaml:2:1: not YAML: while parsing a flow node, "),
         ("a: 1\n\tb: 2\n", "scene.yaml:2:1: not YAML: while scanning "),

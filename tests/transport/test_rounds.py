@@ -15,13 +15,14 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import cut
 from ddrecon.light.reduced import receive_light
+from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import render, solve_light
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.transport.rounds import run_rounds
 from ddrecon.transport.sweep import steep_gradient, sweep

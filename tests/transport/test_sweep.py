@@ -15,7 +15,7 @@ from torch import Tensor
 from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.light.moments import fill
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds

@@ -17,7 +17,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
 from ddrecon.run.checkpoint import (
     LAST,
-    MOST,
+    MOST_CHANGES,
     PREVIOUS,
     load_checkpoint,
     require_same,
@@ -165,8 +165,8 @@ def test_an_empty_section_is_a_difference() -> None:
 def test_few_of_many_differences_are_named() -> None:
     with pytest.raises(UsageError) as error:
         require_same(dict.fromkeys("abcdefghijkl", 0), dict.fromkeys("abcdefghijkl", 1), "other")
-    assert len(error.value.problems) == MOST + 1
-    assert error.value.problems[-1] == f"other: {12 - MOST} more differ"
+    assert len(error.value.problems) == MOST_CHANGES + 1
+    assert error.value.problems[-1] == f"other: {12 - MOST_CHANGES} more differ"
 
 
 def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from media import half_empty, make_camera, make_scene
 from torch.autograd import Function
 
 from ddrecon.diffusion import implicit
 from ddrecon.errors import UsageError
+from ddrecon.grid import Grid
 from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 from ddrecon.variables.values import variable_names
@@ -90,6 +92,16 @@ def test_density_passes_in_empty_cells_as_well() -> None:
 def test_forward_peaks_and_backward_scattering_pass(g: str) -> None:
     (result,) = check("g", overrides=(f"optimize.parameters.g.init={g}",))
     assert result.has_passed, result
+
+
+def test_rays_and_beams_along_the_axes_of_the_lattice_pass() -> None:
+    """Through centers of cells, where differences are not what a slope to one side is."""
+    camera = make_camera((0.0, 0.0, 3.0), (9, 7), is_perspective=False)
+    grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
+    scene = make_scene(half_empty(*grid.shape), travel=(0.0, -1.0, 0.0), camera=camera, grid=grid)
+    names = "views.view.camera", "lights.0.direction"
+    for result in check_parameters(scene, names, 2, 0, lambda items, _: items):
+        assert result.has_passed, result
 
 
 def test_an_unknown_parameter_is_refused() -> None:

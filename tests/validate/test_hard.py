@@ -9,9 +9,10 @@ import torch
 from media import make_camera, make_scene, random_values
 from torch import Tensor
 
+from ddrecon.diffusion import solve
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.solvers import multigrid
-from ddrecon.renderer import render, solve_light
+from ddrecon.lighting import solve_light
+from ddrecon.picture import render
 from ddrecon.validate import hard
 from ddrecon.validate.hard import CASES, TOLERANCE, HardCase, HardResult, balance_of, run_case
 
@@ -45,14 +46,14 @@ def test_each_broken_bound_is_told(bound: str, change: dict):
 
 
 def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPatch):
-    name, renderer = "g -0.99, density jumps by 1e6", import_module("ddrecon.renderer")
-    monkeypatch.setattr(renderer, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
+    name, lighting = "g -0.99, density jumps by 1e6", import_module("ddrecon.lighting")
+    monkeypatch.setattr(lighting, "sharpen", lambda _, means: means - 1e3 * means.detach().max())
     assert run_case(name, CASES[name], CPU).failures() == ["radiance"]
 
 
 def test_a_solve_that_gives_up_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(TOLERANCE, torch.float32, 1e-30)
-    monkeypatch.setattr(multigrid, "MAX_ITERATIONS", 8)
+    monkeypatch.setattr(solve, "MAX_ITERATIONS", 8)
     result = run_case("small", SMALL, CPU)
     assert "did not reach its tolerance" in result.failures()[0]
     assert hard.describe([result])["passed"] is False and "did not reach" in hard.table([result])[2]

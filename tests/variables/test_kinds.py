@@ -6,8 +6,8 @@ import pytest
 import torch
 from media import make_scene
 
+from ddrecon.picture import render
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError
-from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.lighting import solve_light
+from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
 from ddrecon.variables.tangents import variation
 from ddrecon.variables.values import value_of, with_values

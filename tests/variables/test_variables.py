@@ -8,7 +8,7 @@ from media import make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.errors import UsageError
-from ddrecon.renderer import render
+from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import name_each, value_of, variable_names, with_values
 

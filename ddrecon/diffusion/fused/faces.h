@@ -48,16 +48,11 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     enum { S, OUTSIDE, A, NUMBERS = 1 + WHAT };
 
     // The row in what is found, or in its cotangents; loss and conductances have `own` colors.
-    template <class F, class P> INLINE static void rows_of(
-        const Row& row, const Mesh<F>& mesh, P* const* arrays, P** found, int own) {
+    template <class P>
+    INLINE static void rows_of(const Row& row, P* const* arrays, P** found, int own) {
         UNROLLED
-        for (int k = 0; k < OUTS; ++k) found[k] = arrays[k] + row.at;
-        if constexpr (IS_SYSTEM) {
-            const int color = own > 1 ? row.color : 0;
-            found[1] = arrays[1] + (own > 1 ? row.at : row.start);
-            UNROLLED
-            for (int a = 0; a < 3; ++a) found[2 + a] = mesh.at_faces(arrays[2 + a], a, color);
-        }
+        for (int k = 0; k < OUTS; ++k)
+            found[k] = arrays[k] + (k == 0 || WHAT == FLUX || own > 1 ? row.at : row.start);
     }
     // Q1 along an axis, where `at` reads: in this cell or beyond its face.
     template <class In, class At> INLINE static auto flux(const In* in, int axis, At at) {
@@ -109,7 +104,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                     along[a] = side ? flow - along[a] : flow;
                     lost += per_h * flow;
                     escape += pick(inside, N(F(0)), N(per_h * c));
-                    above[a] = per_h * per_h * c;
+                    above[a] = pick(inside && mesh.conducts[a], N(per_h * per_h * c), N(F(0)));
                 }
             }
             if constexpr (WHAT == FLUX) {
@@ -129,7 +124,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                     if (is_own) out[1][i] = change_of(loss);
                     UNROLLED
                     for (int a = 0; a < 3; ++a)
-                        if (is_own && mesh.inside(a, 1, i)) out[2 + a][i] = change_of(above[a]);
+                        if (is_own) out[2 + a][i] = change_of(above[a]);
                 }
                 out[0][i] = change_of(right);
             }
@@ -165,7 +160,9 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
                                            : (there - r[i]) * per_h;
                     F c_bar = flow_bar * drive(mesh, in, number, a, side, i);
                     if constexpr (IS_SYSTEM) {
-                        const F face_bar = is_own ? mesh.at_face(bar[2 + a], a, side, i) : F(0);
+                        const F face_bar = is_own && mesh.conducts[a]
+                                               ? mesh.at_face(bar[2 + a], a, side, i)
+                                               : F(0);
                         c_bar += inside ? per_h * per_h * face_bar : per_h * loss_bar;
                     }
                     const F drive_bar = c.value * flow_bar;
@@ -206,7 +203,7 @@ template <class Flow, class N, class F> INLINE void find_values(
     const Inputs<N, Flow::INS, Flow::NUMBERS, F> given(
         row, channels, fields, d_fields, numbers, d_numbers);
     F* out[Flow::OUTS];
-    Flow::rows_of(row, mesh, made, out, own);
+    Flow::rows_of(row, made, out, own);
     mesh.visit([&](const auto& mesh) HERE {
         Flow::find(row, mesh, given.in, given.number, out, row.color < own, times);
     });
@@ -219,7 +216,7 @@ template <class Flow, class F> INLINE void find_cotangents(
     row.in_all<Flow::GIVEN>(fields, channels, in);
     row.of_color<Flow::NUMBERS>(numbers, number);
     row.in_all<Flow::MADE>(made, out);
-    Flow::rows_of(row, mesh, bars, bar, own);
+    Flow::rows_of(row, bars, bar, own);
     mesh.visit([&](const auto& mesh) HERE {
         Flow::find_back(row, mesh, in, number, bar, out, sum, row.color < own, times);
     });

@@ -11,8 +11,8 @@ from ddrecon.kernels.cell_function import RowFunction, Tensors
 from ddrecon.medium.coefficients import Medium
 
 HEADER = "diffusion/fused/faces.h"
-PLACE = "Mesh<F>(row, nz, ny, nx, hz, hy, hx), own, F(sign), "
-GIVEN = "int nz, ny, nx, own, sign; F hz, hy, hx"
+PLACE = "Mesh<F>(row, nz, ny, nx, periodic, hz, hy, hx), own, F(sign), "
+GIVEN = "int nz, ny, nx, periodic, own, sign; F hz, hy, hx"
 
 
 def assemble_system(
@@ -85,9 +85,10 @@ def _find(
     colors = max(colors, *(field.shape[-4] for field in fields))
     shapes: list[tuple[int, ...]] = [(*(several or ()), colors, z, y, x)]
     if several is None:
-        shapes += (own, z, y, x), (own, z - 1, y, x), (own, z, y - 1, x), (own, z, y, x - 1)
+        shapes += [(own, z, y, x)] * 4
     sizes = dict(zip(("hz", "hy", "hx"), medium.grid.spacing, strict=True))
-    more = {"nz": z, "ny": y, "nx": x, "own": own, "sign": sign, **sizes}
+    periodic = sum(1 << axis for axis in medium.grid.periodic)
+    more = {"nz": z, "ny": y, "nx": x, "periodic": periodic, "own": own, "sign": sign, **sizes}
     function = RowFunction(HEADER, flow, tuple(shapes), x, PLACE, GIVEN, more, added, alike)
     numbers = torch.stack([number.reshape(-1).expand(colors) for number in each])
     return function.apply(numbers, fields[0], scattering.field, *fields[1:])

@@ -20,7 +20,7 @@ CICP = re.compile(rb"\x00\x00\x00\x04cICP(....)", re.DOTALL)
 CICP_LINEAR, CICP_SRGB = 8, (1, 6, 13, 14, 15)
 """Curves of ITU-T H.273: of films and their frames, BT.709's is shown as sRGB's is."""
 GAMMAS_SRGB = (0.45455, 0.50994)
-"""Of gAMA: sRGB's, and BT.709's as older ffmpeg wrote it."""
+"""gAMA of sRGB, and of BT.709 as older ffmpeg wrote it."""
 CHROMATICITIES = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
 """x and y of sRGB's white, red, green and blue."""
 ORIENTATION, INTEROPERABILITY = 0x112, 0xA005
@@ -28,9 +28,9 @@ TOP_LEFT = 1
 MUTED = ((200, 100, 100), (100, 200, 100), (100, 100, 200))
 """Colors within every gamut: those at its corners would be clipped."""
 UNABRIDGED: Any = 0x100
-"""To LittleCMS: no tables in place of curves, which are coarse in the dark."""
+"""Asks LittleCMS for curves; its tables are coarse in the dark."""
 NEAR = 3
-"""Of 255, how far a profile's colors may be off. A gamma of 2.2 is off by 9 from sRGB."""
+"""Largest error of a profile's colors, of 255. A gamma of 2.2 is off by 9 from sRGB."""
 
 
 class Encoding(NamedTuple):
@@ -59,7 +59,7 @@ def has_linear_samples(path: Path) -> bool:
 
 
 def _find_encoding(path: Path, picture: Any) -> Encoding:
-    """In the order of the PNG specification (third edition, section 4.3)."""
+    """The encoding, looked for in the order of the PNG specification (third edition, 4.3)."""
     info, header = picture.info, b""
     if picture.format == "PNG":
         with path.open("rb") as stream:

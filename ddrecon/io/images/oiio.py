@@ -34,19 +34,19 @@ BEGINNINGS = {
 """How files of a kind begin: OpenImageIO alone would go on to try all that it knows."""
 FLOATS = ("half", "float", "double")
 GRAY = ("Y", "gray", "grey", "luminance")
-"""What a single channel is called that is a picture: others are depth, a matte, or anything."""
+"""Names of a single channel that is a picture: others are depth, a matte, or anything."""
 BLACK_IS_ZERO, RGB = 1, 2
 HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
 """Its lines, then the size, then how the first row of pixels begins."""
 STACK_MARK = "bounds="
-"""What the description of a volume says that we wrote as TIFF, if it has but one page."""
+"""The mark in the description of a volume that we wrote as TIFF, if it has a single page."""
 
 
 def read_exr(path: Path) -> np.ndarray:
     """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4].
 
-    Of several parts, those of the one with R, G and B. Raises FormatError where it is cropped, or
-    has other channels.
+    The part with R, G and B is taken of several. Raises FormatError where it is cropped, or has
+    other channels.
     """
     with opened(path, "EXR") as (file, spec):
         window = spec.x, spec.y, spec.width, spec.height
@@ -147,8 +147,8 @@ def write_exr(path: Path, pixels: np.ndarray) -> None:
 def opened(path: Path, kind: str) -> Iterator[tuple[Any, Any]]:
     """The file at `path` and what its header says, for a block that reads it.
 
-    Of EXR the part that is a picture. Raises FormatError unless it is of this `kind`, and small
-    enough.
+    An EXR is opened at the part that is a picture. Raises FormatError unless the file is of this
+    `kind`, and small enough.
     """
     module = load_for_file(PACKAGE, path)
     settings = module.ImageSpec()

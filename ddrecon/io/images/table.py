@@ -50,7 +50,7 @@ COLORS = ("LA", "RGB", "RGBA")
 MODES = ("1", "L", "P", "I", "I;16", *COLORS)
 """Pillow's modes that are read: in PNG, I is 16 bits."""
 SPREAD = {"1": 255, "L;2": 85, "L;4": 17}
-"""By what Pillow spreads samples of few bits over 8, but not always the one that is transparent."""
+"""Factors by which Pillow scales samples of few bits to 8; it may forget the transparent one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ def _read_encoded(path: Path) -> np.ndarray:
         check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
         if mode not in MODES:
             raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
-        # Of JPEG others are previews and maps beside the picture.
+        # Further frames of a JPEG are previews and maps.
         if picture.format in ("PNG", "WEBP") and (count := getattr(picture, "n_frames", 1)) > 1:
             raise FormatError(path, f"is an animation of {count} pictures; save a single one")
         if "16B" in str(picture.tile) and mode in COLORS:  # which Pillow reads as 8 bits

@@ -19,11 +19,11 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
 VECTORS = ("velocity",)
-"""What fields are called whose three numbers are along x, y and z, not colors."""
+"""Names of fields whose three numbers are along x, y and z, not colors."""
 SIGNED = ("g", *VECTORS)
-"""What fields are called that may be negative."""
+"""Names of fields that may be negative."""
 EMPTY = 1e-4
-"""Of the largest: cells with less count as empty. An optimization leaves no cell at exactly 0."""
+"""Cells below this part of the largest value count as empty: an optimization leaves none at 0."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def read_stack(path: Path, name: str) -> Field:
         while file.seek_subimage(len(pages), 0):
             pages.append(read_pixels(path, file, "unknown"))
             check_size(4 * pages[0].size * len(pages), path, "the stack")
-        # That no page follows is an error to it too: in OpenImageIO 3.0 the file's name alone.
+        # The end of the pages is an error, too: in OpenImageIO 3.0 the file's name alone.
         error = file.geterror()
         if error and "could not seek" not in error and error != f"Err: {path}":
             raise FormatError(path, f"is damaged: {error}")

@@ -14,10 +14,10 @@ def _with_prefixes(*units: str) -> dict[str, float]:
 
 
 METERS = _with_prefixes("m", "meter", "meters", "metre", "metres")
-"""Of a unit of length, by its spelling."""
+"""Meters in a unit of length, by its spelling."""
 MICROMETERS = {unit: 1e6 * size for unit, size in METERS.items()} | {"micron": 1, "microns": 1}
 GRAMS = _with_prefixes("gm-3", "g/m3")
-"""In a cubic meter."""
+"""Grams in a cubic meter, by the unit's spelling."""
 KELVIN = dict.fromkeys(("k", "kelvin", "kelvins", "degk"), 1.0)
 
 

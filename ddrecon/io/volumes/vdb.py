@@ -31,7 +31,7 @@ ONLY_ACTIVE_VALUES = b"\0"
 LEAF, LOWER, UPPER = 3, 4, 5
 """Log2 of the children along an axis, of a leaf and the nodes above: OpenVDB's standard tree."""
 SIDE, VOXELS = 2**LEAF, 2 ** (3 * LEAF)
-"""Of a leaf."""
+"""Voxels of a leaf: along a side, and in all."""
 POSITIONS = struct.Struct("<3q")
 """Where a grid begins, where its voxels do, and where it ends."""
 HEADER, UUID_LENGTH = struct.Struct("<qIIIB"), 36

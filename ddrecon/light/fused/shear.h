@@ -63,13 +63,15 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
           bound(number[3]) {}
 
     // Cell 0 of slice k among rays.
-    static INLINE Place<N> place(int first, double k, const N& slope) {
-        Place<N> found(less_product(first, k, value_of(slope)));
+    static INLINE Place<N> place(int first, double k, const N& slope, int size) {
+        Place<N> found(less_product(first, k, value_of(slope)), size);
         if constexpr (IS_DUAL<N>) found.a.by[0] = F(-k) * slope.by[0];
         return found;
     }
-    INLINE Place<N> row_place(double k) const { return place(first_row, k, slope_row); }
-    INLINE Place<N> column_place(double k) const { return place(first_column, k, slope_column); }
+    INLINE Place<N> row_place(double k) const { return place(first_row, k, slope_row, rows); }
+    INLINE Place<N> column_place(double k) const {
+        return place(first_column, k, slope_column, columns);
+    }
     INLINE long long window_row(int channel, int k, int m) const {
         return (long long)channel * slices * (height + 3) * (width + 3) +
                (long long)k * window_slice_stride + (long long)m * window_row_stride;
@@ -88,14 +90,8 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
     }
     // Which part of a step around a place is in the box, half a step less than `u` after entry.
     INLINE N inside(const N& u) const {
-        const F x = value_of(u), held = x < F(0) ? F(0) : x > F(1) ? F(1) : x;
-        if constexpr (IS_DUAL<N>) {
-            const F near = KINK<F> * (slices + 1);
-            const bool is_out = x < -near || x > 1 + near, is_in = x > near && x < 1 - near;
-            return u.chain(held, is_out ? F(0) : is_in ? F(1) : F(0.5));
-        } else {
-            return held;
-        }
+        const F x = value_of(u), near = NEARLY<F> * (slices + 1);
+        return pick(x > -near && x < 1 + near, u, N(x < F(0) ? F(0) : F(1)));
     }
 
     // Rays of row i on all slices. From `lo` to `hi` they are in a slice's window, as row m of it.
@@ -113,11 +109,9 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         const N one = entry(own.i - first_row, height, slope_row);
         for (int t = 0; t < own.end - own.begin; ++t) {
             const N other = entry(own.begin + t - first_column, width, slope_column);
-            const F more = value_of(one) - value_of(other), near = KINK<F> * (rows + columns);
-            own.entries[t] = more > F(0) ? one : other;
-            if constexpr (IS_DUAL<N>)
-                if (more < near && more > -near)
-                    own.entries[t].by[0] = F(0.5) * (one.by[0] + other.by[0]);
+            // Through an edge by rows.
+            const F later = value_of(other) - value_of(one);
+            own.entries[t] = pick(later < NEARLY<F> * (rows + columns), one, other);
         }
         return own;
     }
@@ -132,22 +126,19 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
     INLINE void look(const Rays& own, int k, double shift, const N* field, N* found) const {
         const int last = shift > 0 ? k + 1 : k, size = own.hi - own.lo;
         const Place<N> r = row_place(k + shift), c = column_place(k + shift);
-        const Taps<N> row(r, height), column(c, width);
-        N cells[BLOCK + 3];
-        clear(cells, size + 3);
+        const Taps<N> row(r.a), column(c.a);
+        N cells[BLOCK + 1];
+        clear(cells, size + 1);
         for (int s = k; s <= last && last < slices; ++s)
-            for (int t = 0; t < 4; ++t) {
+            for (int t = 1; t < 3; ++t) {
                 const int y = own.i - r.n + 1 - t, held = y < 0 ? 0 : y < height ? y : height - 1;
                 add_even_row(
-                    cells, field + cell_row(own.channel, s, held), own.lo - c.n - 2, size + 3,
+                    cells, field + cell_row(own.channel, s, held), own.lo - c.n - 1, size + 1,
                     width, (last > k ? F(0.5) : F(1)) * row.linear[t]);
             }
         INDEPENDENT
-        for (int t = 0; t < size; ++t) {
-            found[t] = column.linear[1] * cells[t + 2] + column.linear[2] * cells[t + 1];
-            if constexpr (IS_DUAL<N>)
-                found[t] += column.linear[0] * cells[t + 3] + column.linear[3] * cells[t];
-        }
+        for (int t = 0; t < size; ++t)
+            found[t] = column.linear[1] * cells[t + 1] + column.linear[2] * cells[t];
     }
 
     // Cells of one row of slice k, which lie `at` in memory.
@@ -213,7 +204,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
     INLINE void carry_to_cells(int item, const N* masses, N* entered) const {
         const Cells own = cells_of(item);
         const N* rays = masses + window_row(own.channel, own.k, own.row) + own.begin;
-        const Taps<N> row(row_place(own.k), rows), column(column_place(own.k), columns);
+        const Taps<N> row(row_place(own.k).a), column(column_place(own.k).a);
         Blend blend;
         blend.rows(row, rays, window_row_stride, own.count);
         N* __restrict out = entered + own.at;
@@ -228,7 +219,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         int item, const F* masses, const F* entered_bar, F* corrections_bar) const {
         const Cells own = cells_of(item);
         const F* rays = masses + window_row(own.channel, own.k, own.row) + own.begin;
-        const Taps<N> row(row_place(own.k), rows), column(column_place(own.k), columns);
+        const Taps<N> row(row_place(own.k).a), column(column_place(own.k).a);
         Blend blend;
         blend.rows(row, rays, window_row_stride, own.count);
         const F* __restrict bar = entered_bar + own.at;
@@ -249,7 +240,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
             if (!meet(own, k)) continue;
             const Place<F> r = row_place(k), c = column_place(k);
             // Of rays, by gathering from cells: rows first, then columns.
-            const Taps<F> row(r, rows), column(c, columns);
+            const Taps<F> row(r.a), column(c.a);
             const int size = own.hi - own.lo, left = own.lo - c.n - 2;
             clear(linear, size + 3), clear(curved, size + 3);
             for (int t = 0; t < 4; ++t) {
@@ -304,7 +295,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
             const Place<F> r = row_place(s + shift), c = column_place(s + shift);
             const int up = own.row + r.n - row_place(s).n,
                       left = own.begin + c.n - column_place(s).n;
-            const Taps<F> row(r, height), column(c, width);
+            const Taps<F> row(r.a), column(c.a);
             clear(linear, own.count + 2 * MOST + 3);
             for (int y = up - above; y <= up + below; ++y)
                 for (int t = 0; t < 4; ++t)

@@ -14,9 +14,9 @@ struct Lines {
 };
 
 // The four cells around a place on a line, which lies a part `a` of the way from the second to the
-// third; and a (1 - a) / 2, the `excess` of second differences that linear values have. Faces are
-// midway between the outermost cells of a line and the next: values stay beyond them, and are
-// linear up to them.
+// third, a center being the second; and a (1 - a) / 2, the `excess` of second differences that
+// linear values have. Faces are midway between the outermost cells of a line and the next: values
+// stay beyond them, and are linear up to them.
 template <class F, class N> struct Place {
     typedef Packets<F> P;
     typedef typename P::V V;
@@ -27,18 +27,30 @@ template <class F, class N> struct Place {
         const V none = P::all(F(0)), low = P::all(F(0.5)), high = P::all(F(size) - F(1.5));
         // Also where y is not a number.
         const V inside = P::least(P::pick(y > low, y, low), high);
-        const I zero = P::whole(none), i = P::whole(inside);
+        const I zero = P::whole(none), i = P::whole(inside + NEARLY<F> * F(size));
         Place q;
         q.cells[0] = P::pick(i > zero, i - 1, zero);
         q.cells[1] = i;
         q.cells[2] = i + 1;
         q.cells[3] = P::pick(i < zero + (size - 2), i + 2, i + 1);
         q.a = inside - P::real(i);
-        q.excess = P::pick(is_curved(y, size), F(0.5) * q.a * (F(1) - q.a), none);
+        q.excess = P::pick(is_curved(P::real(i), size), F(0.5) * q.a * (F(1) - q.a), none);
         return q;
     }
-    static INLINE typename P::M is_curved(V y, int size) {
-        return (y > P::all(F(1))) & (y < P::all(F(size - 2)));
+    // Whether there are cells, and no faces, on both sides of center n and of the next.
+    static INLINE typename P::M is_curved(V n, int size) {
+        return (n > P::all(F(0))) & (n < P::all(F(size - 2)));
+    }
+    // The same, with its derivative by y along `direction`: on a center, that beyond it.
+    static INLINE Place moving(V y, int size, int direction) {
+        const V none = P::all(F(0)), one = P::all(F(1));
+        const Place<F, V> at = Place<F, V>::at(y, size);
+        Place q = {{at.cells[0], at.cells[1], at.cells[2], at.cells[3]}, N(at.a), N(at.excess)};
+        q.a.by[direction] =
+            P::pick((y > P::all(F(0.5))) & (y < P::all(F(size) - F(1.5))), one, none);
+        q.excess.by[direction] =
+            P::pick(is_curved(P::real(at.cells[1]), size), F(0.5) - at.a, none);
+        return q;
     }
     // The same place of lines that begin `by` cells on.
     INLINE Place behind(I by) const {
@@ -108,35 +120,6 @@ template <class F, bool IS_SLICED, class N> struct Spot {
             return Packets<F>::gather(f, y.cells[r] * lines.row + x.cells[c] * lines.column);
         };
         return is_cubic ? curved(y, x, cell, bend) : linear(y, x, cell);
-    }
-};
-
-// A place as seen from one `side`, where it is a kink: on a cell's center slopes are the mean of
-// both sides (`numerics/third_order.py`).
-template <class F> struct Kink {
-    typedef Packets<F> P;
-    typedef typename P::V V;
-    // How far from it a side is looked at, in units of a line's length.
-    static constexpr F SIDE = 4 * KINK<F>;
-    static INLINE typename P::M is_at(V y, int size) {
-        const V inside = P::least(P::most(y, P::all(F(-2))), P::all(F(size + 1)));
-        return P::size(y - P::real(P::whole(inside + F(0.5)))) < P::all(KINK<F> * F(size));
-    }
-    // Its derivative by y is along `direction`.
-    template <class N> static INLINE Place<F, N> place(V y, int size, F side, int direction) {
-        const V none = P::all(F(0)), low = P::all(F(0.5)), high = P::all(F(size) - F(1.5));
-        const V one = P::all(F(1)), seen = P::pick(is_at(y, size), y + side * SIDE * F(size), y);
-        const Place<F, V> at = Place<F, V>::at(seen, size);
-        const V a = P::least(P::most(y, low), high) - P::real(at.cells[1]);
-        const V live = P::pick((seen > low) & (seen < high), one, none);
-        const V curved = P::pick(Place<F, V>::is_curved(seen, size), one, none);
-        Place<F, N> q = {
-            {at.cells[0], at.cells[1], at.cells[2], at.cells[3]},
-            N(a),
-            N(curved * (F(0.5) * a * (F(1) - a)))};
-        q.a.by[direction] = live;
-        q.excess.by[direction] = curved * (F(0.5) - a);
-        return q;
     }
 };
 

@@ -1,20 +1,19 @@
-"""The fused kernels of multigrid compute what PyTorch's operations compute, as often as those."""
+"""Multigrid's passes as kernels compute what PyTorch's operations compute, as often as those."""
 
 import pytest
 import torch
 from media import assert_near, random_values
-from test_multigrid import FORMS, patchy, patchy_box, uneven
+from test_multigrid import FORMS, cycle_of, patchy, patchy_box, uneven
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.hierarchy import Level
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
-from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.diffusion.solve import Solution, solve_by_multigrid
 from ddrecon.engine import use_engine
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.solvers.fused import multigrid as fused
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
+from as_on_a_gpu import ORDERS, as_on_a_gpu
+
+from ddrecon.diffusion.fused.passes import KernelCycle
 
 pytestmark = pytest.mark.slow
 
@@ -26,35 +25,43 @@ def solve(
 ) -> Solution:
     use_engine(engine)
     return solve_by_multigrid(
-        Operator(operator.conductances, operator.loss), source, guess, tolerance
+        Operator(operator.conductances, operator.loss, operator.periodic), source, guess, tolerance
     )
 
 
-def cycle(operator: Operator, source: Tensor) -> Tensor:
-    """One cycle of the fused kernels for `source` as the residual."""
-    use_engine("warp")
-    run = fused.Run(operator, source / operator.once(Hierarchy.of).scale, None, -1.0)
-    run.iterate(1)
-    return run.vector("P").clone()
+def assert_cycles_agree(operator: Operator, source: Tensor) -> None:
+    """V-cycles and products."""
+    cycle = KernelCycle(operator, source)
+    cycle.direction.copy_(source)
+    cycle.residual.copy_(source)
+    assert_near(cycle.product(), operator.apply(source), 1e-13)
+    assert_near(cycle.cycle(), cycle_of(operator)(source), 1e-12)
 
 
-@pytest.mark.parametrize("shape", SHAPES[1:], ids=str)
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("colors", [1, 2])
-def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int):
-    """But for a single cell, which needs none."""
-    operator = patchy_box(shape)
-    operator = Operator(tuple(c[:colors] for c in operator.conductances), operator.loss[:colors])
-    source = random_values(colors, *shape, seed=4) - 0.5
-    assert_near(cycle(operator, source), Level.of(operator).cycle(source), 1e-12)
+@pytest.mark.parametrize("wraps", [False, True])
+def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int, wraps: bool):
+    operator = patchy_box(shape, wraps)
+    faces = tuple(c[:colors] for c in operator.conductances)
+    operator = Operator(faces, operator.loss[:colors], operator.periodic)
+    assert_cycles_agree(operator, random_values(colors, *shape, seed=4) - 0.5)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("wraps", [False, True])
+def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
+    operator, source = patchy_box((7, 8, 9), wraps), random_values(2, 7, 8, 9, seed=4) - 0.5
+    with as_on_a_gpu(order) as headers:
+        assert_cycles_agree(operator, source)
+    assert "diffusion/fused/passes.h" in headers
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_grids_are_those_of_torch(form: str):
     """The same axes are coarsened on every level, also where cells are not cubes."""
     shape, sides = FORMS[form]
-    operator = uneven(shape, sides)
-    source = random_values(2, *shape, seed=4) - 0.5
-    assert_near(cycle(operator, source), Level.of(operator).cycle(source), 1e-12)
+    assert_cycles_agree(uneven(shape, sides), random_values(2, *shape, seed=4) - 0.5)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -73,14 +80,10 @@ def test_a_million_to_one(patch: int, dtype: torch.dtype):
     operator, source = patchy(patch, 1e6, dtype), random_values(1, 16, 16, 16, dtype=dtype)
     found, known = (solve(engine, operator, source, 1e-6) for engine in ("warp", "torch"))
     assert abs(found.iterations - known.iterations) <= 0.1 * known.iterations
-    exact = solve("torch", Operator(*map(doubled, (operator.conductances, operator.loss))),
-                  source.double(), 1e-12).value  # fmt: skip
+    doubled = Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
+    exact = solve("torch", doubled, source.double(), 1e-12).value
     errors = [float((u.value - exact).norm()) for u in (found, known)]
     assert errors[0] <= 2 * errors[1]
-
-
-def doubled(tensors: Tensor | tuple[Tensor, ...]):
-    return tensors.double() if isinstance(tensors, Tensor) else tuple(c.double() for c in tensors)
 
 
 @pytest.mark.parametrize("losses", [1, 3])

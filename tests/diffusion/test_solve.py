@@ -5,9 +5,9 @@ import torch
 from media import box_grid, make_operator, random_values
 from torch import Tensor
 
+from ddrecon.diffusion import solve
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers import multigrid
-from ddrecon.diffusion.solvers.multigrid import solve_by_multigrid
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.errors import SolveError
 
 SHAPE = (4, 5, 3)
@@ -105,7 +105,7 @@ def test_a_source_makes_light_everywhere(system):
 
 def test_a_solve_that_does_not_converge_says_so(system, monkeypatch):
     operator, source = system(torch.float64)
-    monkeypatch.setattr(multigrid, "MAX_ITERATIONS", 1)
+    monkeypatch.setattr(solve, "MAX_ITERATIONS", 1)
     with pytest.raises(SolveError, match="multigrid did not reach") as caught:
         solve_by_multigrid(operator, source, None, 1e-12)
     assert 0 < caught.value.iterations <= 100 and caught.value.residual > 1e-12
@@ -115,6 +115,6 @@ def test_a_solve_that_does_not_converge_says_so(system, monkeypatch):
 def test_a_system_that_is_not_finite_is_an_error(where: str, system, monkeypatch):
     operator, source = system(torch.float64)
     {"source": source, "loss": operator.loss}[where][0, 0, 0, 0] = float("nan")
-    monkeypatch.setattr(multigrid, "MAX_ITERATIONS", 50)
+    monkeypatch.setattr(solve, "MAX_ITERATIONS", 50)
     with pytest.raises(SolveError):
         solve_by_multigrid(operator, source, None, 1e-8)

@@ -1,0 +1,46 @@
+"""Kernels of iterations are such as a graphics card runs well: compiled without one."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("warp", reason="Warp is not installed (extra `fast`)")
+import warp
+from graphics_cards import ARCHITECTURES, find_resources
+
+from ddrecon.engine import use_engine
+from ddrecon.kernels import launch as launching
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.scene_file.build import load_scene
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+OF_ROWS = "follow_rows", "return_rows"
+"""Kernels of a processor alone."""
+MOST = {"transpose": (192, 1280)}
+"""Registers of a thread and bytes of its stack; of other kernels 128 and 1024, so that two blocks
+of 256 threads have room beside each other.
+"""
+
+
+@pytest.mark.slow
+def test_kernels_of_iterations_fit_into_registers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a plume, and where cameras and lamps are sought as well; each for one generation."""
+    use_engine("warp")
+    kernels, load = dict[Any, None](), launching.load
+    monkeypatch.setattr(launching, "load", lambda *of: (kernels.setdefault(of[0]), load(*of)))
+    for name in ("plume", "capture"):
+        scene = load_scene(CONFIGS / f"{name}.yaml", overrides=["optimize.refine_at=[]"])
+        factor = max(scene.volume.grid.shape) // 8
+        Reconstruction(scene_at_level(scene, factor)).step()
+    monkeypatch.setattr(warp.config, "optimization_level", None)  # as users have them
+    for index, kernel in enumerate(one for one in kernels if one.key not in OF_ROWS):
+        architecture = ARCHITECTURES[index % len(ARCHITECTURES)]
+        registers, stack = find_resources(kernel, architecture, tmp_path)
+        most_registers, most_stack = MOST.get(kernel.key, (128, 1024))
+        assert 0 < registers <= most_registers, (kernel.key, architecture, registers)
+        assert stack <= most_stack, (kernel.key, architecture, stack)
+    assert index > 30
