@@ -28,10 +28,10 @@ template <class F, int CHUNK> struct Receiver {
     // Where moment number a in color c begins.
     INLINE long long moment(int a, int c) const { return ((long long)a * colors + c) * cells; }
 
-    // Writes to moments `made` what is received of at most BEAMS beams; as dual numbers N, given as
-    // `In`, its change.
+    // Writes moments `phi` of what is received of at most BEAMS beams; as dual numbers N, given as
+    // `In`, their changes.
     template <class N, int BEAMS, class In> INLINE void receive(
-        int item, In field, In scale, In entered, In steps, In weights, F* made) const {
+        int item, In field, In scale, In entered, In steps, In weights, F* phi) const {
         const long long begin = (long long)item * CHUNK;
         const int count = count_from(begin);
         for (int c = 0; c < colors; ++c) {
@@ -48,22 +48,22 @@ template <class F, int CHUNK> struct Receiver {
             for (int a = 0; a < moments; ++a) {
                 N sums[CHUNK];
                 for (int t = 0; t < count; ++t) sums[t] = N(F(0));
-                const auto own = [&](int i) HERE { return N(weights[weight(i, a, c)]); };
+                const auto by = [&](int i) HERE { return N(weights[weight(i, a, c)]); };
                 int i = 0;
                 // Of many beams four at a time.
                 for (; i + 4 <= lights; i += 4) {
-                    const N one = own(i), two = own(i + 1), three = own(i + 2), four = own(i + 3);
+                    const N w0 = by(i), w1 = by(i + 1), w2 = by(i + 2), w3 = by(i + 3);
                     INDEPENDENT
                     for (int t = 0; t < count; ++t)
-                        sums[t] += one * seen[i][t] + two * seen[i + 1][t] +
-                                   three * seen[i + 2][t] + four * seen[i + 3][t];
+                        sums[t] += w0 * seen[i][t] + w1 * seen[i + 1][t] + w2 * seen[i + 2][t] +
+                                   w3 * seen[i + 3][t];
                 }
                 for (; i < lights; ++i) {
-                    const N one = own(i);
+                    const N w = by(i);
                     INDEPENDENT
-                    for (int t = 0; t < count; ++t) sums[t] += one * seen[i][t];
+                    for (int t = 0; t < count; ++t) sums[t] += w * seen[i][t];
                 }
-                F* __restrict out = made + moment(a, c) + begin;
+                F* __restrict out = phi + moment(a, c) + begin;
                 for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);
             }
         }
@@ -91,9 +91,9 @@ template <class F, int CHUNK> struct Receiver {
                 F bar[CHUNK], seen[CHUNK], of_scale[CHUNK], of_step[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
-                    const F own = weights[weight(light, a, c)];
+                    const F w = weights[weight(light, a, c)];
                     const F* __restrict from = bars + moment(a, c) + begin;
-                    for (int t = 0; t < count; ++t) bar[t] += own * from[t];
+                    for (int t = 0; t < count; ++t) bar[t] += w * from[t];
                 }
                 for (int t = 0; t < count; ++t) {
                     Dual<F, 2> mass(s * e[t]), depth(step * f[t]);
