@@ -130,7 +130,8 @@ def _choose_rounds(
 
 
 def _glows(volume: Volume) -> bool:
-    return any(one is not None and bool(one.any()) for one in (volume.emission, volume.black_body))
+    glows = volume.emission, volume.black_body
+    return any(field is not None and bool(field.any()) for field in glows)
 
 
 def _turns_back(phase: PhaseFunction) -> bool:
@@ -142,10 +143,11 @@ def _axes_that_vary(media: Iterable[Volume]) -> str:
     along these.
     """
     fields, axes = list[Tensor](), ""
-    for one in media:
-        each = one.density, one.sigma_a, one.sigma_s, one.emission, one.black_body, one.phase.cells
-        fields += [field for field in each if field is not None and field.ndim > 2]
-        extent = one.grid.extent
+    for medium in media:
+        glows = medium.emission, medium.black_body
+        all_fields = medium.density, medium.sigma_a, medium.sigma_s, *glows, medium.phase.cells
+        fields += [field for field in all_fields if field is not None and field.ndim > 2]
+        extent = medium.grid.extent
     for axis in range(3):
         is_long = extent[axis] > LONG * min(extent)
         if not is_long or any(_varies(field, axis) for field in fields):
@@ -162,15 +164,15 @@ def _varies(field: Tensor, axis: int) -> bool:
 def _is_flat(media: Iterable[Volume]) -> bool:
     """Whether `media`, all together, go up to a face of the box."""
     faces, whole = np.zeros(6), 0.0
-    for one in media:
-        size, density = float(one.sigma_a.mean() + one.sigma_s.mean()), one.density
-        ends = (density.select(axis, end) for axis in range(3) for end in (0, -1))
+    for medium in media:
+        size = float(medium.sigma_a.mean() + medium.sigma_s.mean())
+        ends = (medium.density.select(axis, end) for axis in range(3) for end in (0, -1))
         faces += [size * float(face.mean()) for face in ends]
-        whole += size * float(density.mean())
+        whole += size * float(medium.density.mean())
     return bool(faces.max() > FLAT * whole)
 
 
 def count_colors(volume: Volume, media: Iterable[Volume]) -> int:
     """How many colors light has in `volume`, of these `media`."""
-    glows = [len(one) for one in (volume.emission, volume.black_body) if one is not None]
-    return max(volume.phase.colors, *(len(one.sigma_a) for one in media), *glows)
+    glows = [len(field) for field in (volume.emission, volume.black_body) if field is not None]
+    return max(volume.phase.colors, *(len(medium.sigma_a) for medium in media), *glows)

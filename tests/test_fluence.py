@@ -10,13 +10,13 @@ from media import assert_derivatives, box_grid, make_scene, random_values, tenso
 from torch import Tensor
 
 import ddrecon
-from ddrecon.balance import find_balance, lines
 from ddrecon.diffusion.cells import average
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, Light, PointLight
 from ddrecon.scene import Scene
+from ddrecon.validate.balance import find_balance, lines
 from ddrecon.variables.values import value_of, with_values
 
 

@@ -13,13 +13,13 @@ from media import assert_derivatives, make_camera, make_scene, random_values, te
 from torch import Tensor
 
 import ddrecon
-from ddrecon.balance import find_balance
 from ddrecon.cameras import Pane
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
 from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transmitted_moments
 from ddrecon.scene import Scene
+from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
 
 BEAM = tensor(0.1, 2.0, 0.0), tensor(-0.2, -2.0, 0.1), tensor(2.0), tensor(0.3)[0]

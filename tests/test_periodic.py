@@ -13,7 +13,6 @@ from media import half_empty, make_scene, render_tangent, tensor
 from torch import Tensor
 
 from ddrecon import load_scene
-from ddrecon.balance import find_balance
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SceneError
@@ -23,6 +22,7 @@ from ddrecon.light.lights import EnvironmentLight
 from ddrecon.lighting import fluence
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
+from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")

@@ -68,7 +68,7 @@ def check(session: Session, scene: Path) -> None:
 def balance(session: Session, scene: Path) -> None:
     """Print what power enters the box of SCENE, what is absorbed in it and what leaves it."""
     loaded = session.load(scene)
-    from ddrecon.balance import find_balance, lines
+    from ddrecon.validate.balance import find_balance, lines
 
     report = find_balance(loaded)
     session.show(report, lines(report))

@@ -134,63 +134,60 @@ def check_parameters(
             f"{name}: the scene has no such number{suggestion(name, known)}" for name in unknown
         ]
         raise UsageError([f"--parameter {line}" for line in lines])
-    names = tuple(dict.fromkeys(names)) or tuple(
-        scene.optimize.parameters if scene.optimize else density_names(scene)
-    )
-    generator = torch.Generator().manual_seed(seed)
+    optimized = scene.optimize.parameters if scene.optimize else density_names(scene)
+    names, generator = tuple(dict.fromkeys(names or optimized)), torch.Generator().manual_seed(seed)
     point = starting_point(scene, names, generator)
     loss = loss_at(scene, point, generator)
     leaves = {name: point[name].clone().requires_grad_() for name in names}
     bars = torch.autograd.grad(
         loss(leaves), list(leaves.values()), allow_unused=True, materialize_grads=True
     )
-    gradients, values = dict(zip(names, bars, strict=True)), {name: point[name] for name in names}
+    values = {name: (point[name], bar) for name, bar in zip(names, bars, strict=True)}
     checks = [
-        _check(name, loss, {name: values[name]}, gradients, samples, generator)
+        _check(name, loss, {name: values[name]}, samples, generator)
         for name in progress(names, "gradcheck")
     ]
     if len(names) > 1:
-        checks.append(_check(TOGETHER, loss, values, gradients, 0, generator))
+        checks.append(_check(TOGETHER, loss, values, 0, generator))
     return checks
 
 
 def _check(
     label: str,
     loss: Loss,
-    values: Values,
-    gradients: Values,
+    parameters: Mapping[str, tuple[Tensor, Tensor]],
     samples: int,
     generator: torch.Generator,
 ) -> GradientCheck:
-    """The check of `values` along a random direction, and by `samples` entries of each of them."""
+    """The check of `parameters`, values with their gradients, along a random direction, and by
+    `samples` entries of each.
+    """
+    values = {name: value for name, (value, _) in parameters.items()}
     steps = {
         name: [step * (float(value.abs().max()) or 1.0) for step in kind_of(name).difference_steps]
         for name, value in values.items()
     }
-    # The direction is as long as the longest steps: those along it are parts of 1.
+    # The direction is as long as the longest steps: those along it are shares of 1.
     direction = {
         name: 2 * (random_like(value, generator) - 0.5) * steps[name][0]
         for name, value in values.items()
     }
     first = next(iter(steps.values()))
-    parts = [step / first[0] for step in first]
-    adjoint = float(sum((gradients[name] * direction[name]).sum() for name in values))
-    tangent = _tangent(loss, values, direction)
-    tiny = torch.finfo(torch.float64).tiny
-    along = _check_along(loss, values, direction, adjoint, parts, 0.0)
+    shares = [step / first[0] for step in first]
+    adjoint = float(sum((bar * direction[name]).sum() for name, (_, bar) in parameters.items()))
+    along = _check_along(loss, values, direction, adjoint, shares, 0.0)
     entries = [EntryCheck("a random direction", None, adjoint, *along)]
-    for name, value in values.items() if samples else ():
-        floor = NEGLIGIBLE * float(gradients[name].abs().max())
+    for name, (value, bar) in parameters.items() if samples else ():
+        floor = NEGLIGIBLE * float(bar.abs().max())
         for index in pick_entries(name, value, samples, generator):
             unit = torch.zeros_like(value)
             unit.view(-1)[index] = 1
-            of_entry = float(gradients[name].flatten()[index])
-            found = _check_along(loss, values, {name: unit}, of_entry, steps[name], floor)
-            place = entry_name(name, value, index), float(value.flatten()[index])
-            entries.append(EntryCheck(*place, of_entry, *found))
-    return GradientCheck(
-        label, tangent, abs(tangent - adjoint) / max(abs(adjoint), tiny), tuple(entries)
-    )
+            slope, at = float(bar.flatten()[index]), float(value.flatten()[index])
+            numbers = _check_along(loss, values, {name: unit}, slope, steps[name], floor)
+            entries.append(EntryCheck(entry_name(name, value, index), at, slope, *numbers))
+    tangent = _tangent(loss, values, direction)
+    error = abs(tangent - adjoint) / max(abs(adjoint), torch.finfo(torch.float64).tiny)
+    return GradientCheck(label, tangent, error, tuple(entries))
 
 
 def _tangent(loss: Loss, values: Values, direction: Values) -> float:
@@ -293,15 +290,13 @@ def loss_at(
     ones.
     """
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
-    views = [view for view in scene.views if view.image is not None] or scene.views
-    targets = [
-        view.image
-        if view.image is not None
-        else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
-        for view in views
-    ]
-    memory = SolveMemory(is_warm=False)
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
+    targets, memory = dict[str, Target](), SolveMemory(is_warm=False)
+    for view in [view for view in scene.views if view.image is not None] or scene.views:
+        image = view.image
+        if image is None:
+            image = random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
+        targets[view.name] = Target.of(image, view.mask, kind, view.noise)
 
     @functools.cache
     def light_at_point() -> LightField:
@@ -311,10 +306,9 @@ def loss_at(
         changed = with_values(exact, {**point, **values})
         is_of_views = all(name.startswith("views.") for name in values)
         light = light_at_point() if is_of_views else solve_light(changed, memory)
-        images = [view_picture(light, changed, changed.view(view.name)) for view in views]
         losses = [
-            Target.of(target, view.mask, kind, view.noise).loss_of(image)
-            for image, target, view in zip(images, targets, views, strict=True)
+            target.loss_of(view_picture(light, changed, changed.view(name)))
+            for name, target in targets.items()
         ]
         return torch.stack(losses).mean()
 
@@ -336,11 +330,10 @@ def entry_name(name: str, value: Tensor, index: int) -> str:
 
     It is a component, a cell (x, y, z) or a pixel (x, y).
     """
-    # the last axis of a tensor is x, and its first, if there is such, is that of colors
-    place = []
-    for size in reversed(value.shape):
-        place.append(index % size)
-        index //= size
+    # The last axis of a tensor is x, and its first, if there is such, is that of colors.
+    place = [
+        int(number) for number in reversed(torch.unravel_index(torch.tensor(index), value.shape))
+    ]
     components = component_names(name, value)
     color = f"{components[place.pop()]} " if components else ""
     if not components and value.ndim in (1, 4):

@@ -24,9 +24,9 @@ def is_real(value: object) -> bool:
 
 
 def require_form(
-    name: str, value: Tensor, now: Tensor, like: Tensor, cells: tuple[int, ...]
+    name: str, value: Tensor, known: Tensor, like: Tensor, cells: tuple[int, ...]
 ) -> None:
-    """Raises UsageError unless `value` can be the variable `name`, which is `now`, on `cells`.
+    """Raises UsageError unless `value` can be the variable `name`, in place of `known`, on `cells`.
 
     Its precision and device are to be those of `like`. Nothing is read from a GPU.
     """
@@ -39,7 +39,7 @@ def require_form(
             f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
             f"{like.device}; convert it by .to(...)"
         )
-    require_shape(name, value, *shapes_in_place(name, tuple(now.shape), cells))
+    require_shape(name, value, *shapes_in_place(name, tuple(known.shape), cells))
 
 
 def require_range(name: str, value: Tensor) -> None:
@@ -60,17 +60,17 @@ def require_range(name: str, value: Tensor) -> None:
 
 
 def shapes_in_place(
-    name: str, now: tuple[int, ...], cells: tuple[int, ...]
+    name: str, shape: tuple[int, ...], cells: tuple[int, ...]
 ) -> list[tuple[int, ...]]:
-    """The shapes that the variable `name` may have in place of the one it has `now`."""
+    """The shapes that the variable `name` may have in place of its own `shape`."""
     kind, last = kind_of(name), split_name(name)[1]
     if last == "density":
         return [cells]
     if last.startswith(PHASE):
-        return [now, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
+        return [shape, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
     if kind.is_color:
-        tails = [(), cells] if kind.is_cellwise else [now[1:]]
+        tails = [(), cells] if kind.is_cellwise else [shape[1:]]
         return [(color, *tail) for tail in tails for color in (1, 3)]
     if kind.is_cellwise:
         return [(), cells, (1, *cells)]
-    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [now]
+    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [shape]

@@ -99,9 +99,10 @@ def unit_of(scene: Scene, name: str) -> float:
     if volume.media is not None and name.startswith("media."):
         volume = volume.media[name.split(".")[1]]
     if kind == "density" or kind.startswith("sigma_"):
-        parts = volume.sigma_a, volume.sigma_s  # of the cells that have any
-        share = max(float(part.count_nonzero()) / part.numel() for part in parts) or 1.0
-        depth = side * float(sum(part.mean() for part in parts)) / share
+        sigmas = volume.sigma_a, volume.sigma_s
+        # Means count cells that have any.
+        share = max(float(sigma.count_nonzero()) / sigma.numel() for sigma in sigmas) or 1.0
+        depth = side * float(sum(sigma.mean() for sigma in sigmas)) / share
         unit = 1 / depth if depth > 0 else 1.0
         largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
         return unit if kind == "density" else 1 / (side * largest)

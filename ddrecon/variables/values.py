@@ -45,7 +45,7 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    views = [f"views.{view.name}.{part}" for view in scene.views for part in _view_parts(view)]
+    views = [f"views.{view.name}.{key}" for view in scene.views for key in _view_keys(view)]
     ground = [] if scene.ground is None else ["ground.albedo"]
     return [*volume_names(scene.volume), *lights, *ground, *views]
 
@@ -70,7 +70,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
     [1] or [3].
     """
-    if (known := _own_name(scene.volume, name)) not in variable_names(scene):
+    if (known := _stored_name(scene.volume, name)) not in variable_names(scene):
         raise _unknown(scene, name)
     if is_of_volume(known):
         return volume_value(scene.volume, known)
@@ -79,8 +79,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
         return scene.ground.albedo
     section, _, path = name.partition(".")
     if section == "views":
-        view, _, part = path.rpartition(".")
-        return _view_value(scene.view(view), part)
+        view, _, key = path.rpartition(".")
+        return _view_value(scene.view(view), key)
     index, _, attribute = path.partition(".")
     value: Tensor = getattr(scene.lights[int(index)], attribute)
     return value
@@ -95,7 +95,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     Raises UsageError for a name that is none, and for another shape, precision or device than the
     scene's.
     """
-    values = {_own_name(scene.volume, name): value for name, value in values.items()}
+    values = {_stored_name(scene.volume, name): value for name, value in values.items()}
     known = variable_names(scene)
     unknown = [name for name in values if name not in known]
     if unknown:
@@ -135,8 +135,8 @@ def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict
 def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
     """Those that the variable `name` of `scene` may have; raises as `value_of`."""
     is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
-    now = () if is_pair else tuple(value_of(scene, name).shape)
-    return shapes_in_place(_own_name(scene.volume, name), now, scene.volume.grid.shape)
+    shape = () if is_pair else tuple(value_of(scene, name).shape)
+    return shapes_in_place(_stored_name(scene.volume, name), shape, scene.volume.grid.shape)
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
@@ -144,9 +144,7 @@ def _unknown(scene: Scene, name: str) -> UsageError:
     hints = [f"besides views, the scene has {', '.join(names)}"]
     if scene.views:
         view = scene.views[0]
-        hints.append(
-            f"each view has {', '.join(_view_parts(view))}, as in views.{view.name}.camera"
-        )
+        hints.append(f"each view has {', '.join(_view_keys(view))}, as in views.{view.name}.camera")
     if name == "emission":
         hints = ["a volume has one where it is given, be it zero: volume.emission = torch.zeros(1)"]
     return UsageError(f"no variable {name!r}; {'; '.join(hints)}")
@@ -175,42 +173,42 @@ def extinction_of(volume: Volume) -> Tensor:
     return sigma_a + sigma_s
 
 
-def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Both as [C, z, y, x] if either is; a constant then has one cell."""
-    if one.ndim == other.ndim:
-        return one, other
-    return (one, other.view(-1, 1, 1, 1)) if one.ndim == 4 else (one.view(-1, 1, 1, 1), other)
+    axes = max(first.ndim, second.ndim)
+    first, second = (
+        value if value.ndim == axes else value.view(-1, 1, 1, 1) for value in (first, second)
+    )
+    return first, second
 
 
 def _tensors(light: Light) -> list[str]:
-    return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
+    return [key.name for key in fields(light) if isinstance(getattr(light, key.name), Tensor)]
 
 
 def volume_names(volume: Volume) -> list[str]:
     """The variables of `volume`: its phase function has its own numbers, or g alone."""
     if volume.media is not None:
-        return [
-            f"media.{medium}.{name}"
-            for medium, part in volume.media.items()
-            for name in volume_names(part)
-        ]
-    known = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
-    known += ["emission"] if volume.emission is not None else []
+        media = volume.media.items()
+        return [f"media.{owner}.{name}" for owner, medium in media for name in volume_names(medium)]
+    names = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
+    names += ["emission"] if volume.emission is not None else []
     if isinstance(volume.phase, HenyeyGreenstein):
-        return [*known, "g"]
-    return [*known, *(PHASE + name for name in volume.phase.variables)]
+        return [*names, "g"]
+    return [*names, *(PHASE + name for name in volume.phase.variables)]
 
 
-def _own_name(volume: Volume, name: str) -> str:
+def _stored_name(volume: Volume, name: str) -> str:
     """`name`, or `g` for `phase.g` where both are the same."""
-    medium, last = split_name(name)
+    owner, last = split_name(name)
     if last != f"{PHASE}g":
         return name
-    part = (volume.media or {}).get(medium.removeprefix("media.").strip("."), volume)
-    return f"{medium}g" if isinstance(part.phase, HenyeyGreenstein) else name
+    medium = (volume.media or {}).get(owner.removeprefix("media.").strip("."), volume)
+    return f"{owner}g" if isinstance(medium.phase, HenyeyGreenstein) else name
 
 
 def volume_value(volume: Volume, name: str) -> Tensor:
+    """The value of the variable `name` of `volume`."""
     if volume.media is not None:
         _, medium, rest = name.split(".", 2)
         return volume_value(volume.media[medium], rest)
@@ -228,19 +226,17 @@ def volume_value(volume: Volume, name: str) -> Tensor:
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if volume.media is not None:
-        return remix(
-            volume,
-            {
-                medium: _replace_volume(part, _within(f"media.{medium}.", values))
-                for medium, part in volume.media.items()
-            },
-        )
+        media = {
+            name: _replace_volume(medium, _within(f"media.{name}.", values))
+            for name, medium in volume.media.items()
+        }
+        return remix(volume, media)
     density, cells = values.get("density"), volume.grid.shape
     if isinstance(density, Tensor) and density.ndim == 0:
         values = {**values, "density": density.expand(cells)}
     for name, value in values.items():
-        now = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else volume_value(volume, name)
-        require_form(name, value, now, volume.density, cells)
+        like = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else volume_value(volume, name)
+        require_form(name, value, like, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
         sigma_t, albedo = (
@@ -248,9 +244,7 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
             for name in EXTINCTION_AND_ALBEDO
         )
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
-    phase = volume.phase
-    if "g" in stored:
-        phase = HenyeyGreenstein(stored.pop("g"))
+    phase = HenyeyGreenstein(stored.pop("g")) if "g" in stored else volume.phase
     if numbers := _within(PHASE, stored):
         phase = replace(phase, **numbers)
     stored = {name: value for name, value in stored.items() if not name.startswith(PHASE)}
@@ -271,39 +265,36 @@ def _replace_light(light: Light, owner: str, values: Mapping[str, Tensor], scene
     return changed
 
 
-def _view_parts(view: View) -> list[str]:
+def _view_keys(view: View) -> list[str]:
     lens = ["focal", "principal_point"] if view.camera.is_perspective else []
     lens += ["distortion"] if view.camera.distortion is not None else []
     return ["camera", *lens, *RESPONSE]
 
 
-def _view_value(view: View, part: str) -> Tensor:
+def _view_value(view: View, key: str) -> Tensor:
     camera, pose = view.camera, view.camera.pose
-    if part in RESPONSE:
-        value = getattr(view, part)
-        return pose.new_full((1,), RESPONSE[part]) if value is None else value
-    if part == "camera":
+    if key == "camera":
         return pose.new_zeros(6)
-    if part == "focal":
-        return 1 / (2 * torch.as_tensor(camera.half_width, dtype=pose.dtype, device=pose.device))
-    value = getattr(camera, part)
+    if key in RESPONSE:
+        value = getattr(view, key)
+        return pose.new_full((1,), RESPONSE[key]) if value is None else value
+    value = 1 / (2 * camera.half_width) if key == "focal" else getattr(camera, key)
     return torch.as_tensor(value, dtype=pose.dtype, device=pose.device)
 
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
     owner = f"views.{view.name}."
-    known = [part for part in _view_parts(view) if owner + part in values]
-    given: dict[str, Any] = {part: values[owner + part] for part in known}
-    if not given:
+    changes: dict[str, Any] = {
+        key: values[owner + key] for key in _view_keys(view) if owner + key in values
+    }
+    if not changes:
         return view
-    for part, value in given.items():
-        require_form(owner + part, value, _view_value(view, part), view.camera.pose, (0, 0, 0))
-    response = {part: given.pop(part) for part in RESPONSE if part in given}
+    for key, value in changes.items():
+        require_form(owner + key, value, _view_value(view, key), view.camera.pose, (0, 0, 0))
+    response = {key: changes.pop(key) for key in RESPONSE if key in changes}
     camera = view.camera
-    if "camera" in given:
-        camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
-    if "focal" in given:
-        given["half_width"] = 1 / (2 * given.pop("focal"))
-    if given:
-        camera = replace(camera, **given)
-    return replace(view, camera=camera, **response)
+    if "camera" in changes:
+        camera = twist(camera, changes.pop("camera"), scene.volume.grid.center_xyz)
+    if "focal" in changes:
+        changes["half_width"] = 1 / (2 * changes.pop("focal"))
+    return replace(view, camera=replace(camera, **changes) if changes else camera, **response)

@@ -21,11 +21,11 @@ import torch
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from ddrecon.balance import find_balance
 from ddrecon.io.volumes.table import write_field
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.validate.balance import find_balance
 
 Array = NDArray[np.float64]
 Seen = dict[str, Array]

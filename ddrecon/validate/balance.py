@@ -64,52 +64,55 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     follows light that is scattered.
     """
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
-    medium, lit = light_field.medium, light_field.ground
+    medium, lit, received = light_field.medium, light_field.ground, light_field.received.source
     if is_any_nonzero(medium.scattering.scale) and not multiply_scatters(medium, settings):
         raise UsageError("diffusion.model: none follows no light that is scattered: take p1")
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
-    box = _Box(
-        (medium, refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)),
-        DIRECTIONS[settings.angles],
-        lit,
-    )
+    as_it_is = refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)
+    box = _Box((medium, as_it_is), DIRECTIONS[settings.angles], lit)
     crossings = _cross_each(scene, box)
     enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
-    _, outside, passing, unscattered = reduce(torch.add, crossings.values())
-    reflected = outside.sum((0, 1))
-    factors = remaining_moments(medium)[: medium.degree + 1]
-    received = light_field.received.source
-    source = add(weigh(light_field.diffuse, factors), received)
-    light = light_field.diffuse[0] + received[0]
-    rise = steep_gradient(average_cells(medium), light, box.directions)
-    scattered = (
-        passing - unscattered + box.sweep_out(medium, source, rise, light=light_field.diffuse)
+    _, reflected, passing, unscattered = reduce(torch.add, crossings.values())
+    # Light that scatters leaves as one more sweep has it.
+    source = add(weigh(light_field.diffuse, remaining_moments(medium)), received)
+    rise = steep_gradient(
+        average_cells(medium), light_field.diffuse[0] + received[0], box.directions
     )
+    scattered = box.sweep_out(medium, source, rise, light=light_field.diffuse)
+    scattered = scattered + passing - unscattered
     for beam in light_field.turned:
         scattered = scattered + _leave_turned(beam, medium.grid, box.up)
     lost = average_cells(medium).absorption.value * fluence_of(light_field, settings)
-    absorbed = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
-    entered, into_ground = reduce(torch.add, enters.values()), (unscattered + scattered)[0].sum(0)
-    unscattered, scattered = unscattered.sum(0), scattered.sum(0)
-    left = absorbed + reflected + (unscattered + scattered).sum(0)
+    powers: dict[str, Any] = {"enters": enters}
+    if medium.index != 1:
+        powers["reflected"] = reflected.sum((0, 1))
+    powers["absorbed"] = math.prod(medium.grid.spacing) * lost.sum((1, 2, 3), dtype=torch.float64)
+    faces = zip(FACES, unscattered.sum(0), scattered.sum(0), strict=True)
+    powers["leaves"] = {
+        face: {"unscattered": straight, "scattered": turned}
+        for face, straight, turned in faces
+        if "zyx".index(face[1]) not in medium.grid.periodic
+    }
+    if lit:
+        powers["into_ground"] = (unscattered + scattered)[0].sum(0)
+    entered = reduce(torch.add, enters.values())
+    left = powers["absorbed"] + (reflected + unscattered + scattered).sum((0, 1))
+    defect = 100 * (1 - left / entered)
+    return {
+        **_plain(powers, torch.ones_like(entered)),
+        "fractions": _plain(powers, entered),
+        "defect_percent": _plain(defect, torch.ones_like(entered)),
+    }
 
-    def in_units(unit: Tensor) -> dict[str, Any]:
-        return {
-            "enters": {name: _plain(power / unit) for name, power in enters.items()},
-            **({} if medium.index == 1 else {"reflected": _plain(reflected / unit)}),
-            "absorbed": _plain(absorbed / unit),
-            "leaves": {
-                f: {"unscattered": _plain(u / unit), "scattered": _plain(s / unit)}
-                for f, u, s in zip(FACES, unscattered, scattered, strict=True)
-                if "zyx".index(f[1]) not in medium.grid.periodic
-            },
-            **({"into_ground": _plain(into_ground / unit)} if lit else {}),
-        }
 
-    powers, fractions = in_units(torch.ones_like(entered)), in_units(entered)
-    return {**powers, "fractions": fractions, "defect_percent": _plain(100 * (1 - left / entered))}
+def _plain(value: Any, unit: Tensor) -> Any:
+    """Tensors [C] in `value`, over `unit` [C], as plain numbers, or lists of three."""
+    if isinstance(value, dict):
+        return {key: _plain(entry, unit) for key, entry in value.items()}
+    numbers = (value / unit).tolist()
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _cross_each(scene: Scene, box: _Box) -> dict[str, Tensor]:
@@ -123,11 +126,6 @@ def _cross_each(scene: Scene, box: _Box) -> dict[str, Tensor]:
     if medium.emission is not None:
         crossings["emission"] = box.cross_out()
     return crossings
-
-
-def _plain(values: Tensor) -> float | list[float]:
-    numbers: list[float] = values.tolist()
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 @dataclass(frozen=True)
@@ -317,22 +315,16 @@ def lines(report: dict[str, Any]) -> list[str]:
     """The balance as lines of text."""
 
     def text(value: float | list[float], form: str) -> str:
-        return ", ".join(format(one, form) for one in torch.tensor(value).view(-1).tolist())
+        return ", ".join(format(number, form) for number in torch.tensor(value).view(-1).tolist())
 
     parts = report["fractions"]
-    return [
-        *(f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()),
-        *(
-            f"reflected from outside: {text(parts[key], '.2%')}"
-            for key in parts
-            if key == "reflected"
-        ),
-        f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})",
-        *(
-            f"leaves by {face}: unscattered {text(part['unscattered'], '.2%')}, "
-            f"scattered {text(part['scattered'], '.2%')}"
-            for face, part in parts["leaves"].items()
-        ),
-        *(f"into the ground: {text(parts[key], '.2%')}" for key in parts if key == "into_ground"),
-        f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %",
-    ]
+    told = [f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()]
+    if "reflected" in parts:
+        told.append(f"reflected from outside: {text(parts['reflected'], '.2%')}")
+    told.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})")
+    for face, part in parts["leaves"].items():
+        straight, scattered = (text(part[key], ".2%") for key in ("unscattered", "scattered"))
+        told.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
+    if "into_ground" in parts:
+        told.append(f"into the ground: {text(parts['into_ground'], '.2%')}")
+    return [*told, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]
