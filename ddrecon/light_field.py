@@ -173,7 +173,9 @@ def _scatter_light(
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]
     source = [weigh(light, remaining_moments(cells)) for light in unscattered]
-    outside = medium.index**2 * ambient_radiance(lights, cells.g)
+    # As it is where faces do not refract: what is known of a tensor is not known of its product.
+    ambient = ambient_radiance(lights, cells.g)
+    outside = ambient if medium.index == 1 else medium.index**2 * ambient
     # L0 and L1: E2.4 to E2.6.
     scattered = solve_diffuse(
         cells, cut(reduce(add, source, received.source)), outside, settings, memory

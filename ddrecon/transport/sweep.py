@@ -18,6 +18,7 @@ from ddrecon.light.moments import Cut, add, cut, fill, weigh
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -142,8 +143,8 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         from ddrecon.kernels.cell_function import apply_cell
 
         scale = extinction.scale.view(1, -1)
-        depths = scale.new_tensor(steps)[:, None] * scale
-        numbers = torch.cat([depths, (2 * scale.new_tensor(shares)[:, None]).expand_as(depths)])
+        depths = constant(steps, scale)[:, None] * scale
+        numbers = torch.cat([depths, (2 * constant(shares, scale)[:, None]).expand_as(depths)])
         name = "transport/fused/steep.h", "Steep", 3
         return torch.stack(apply_cell(*name, numbers, extinction.field, *gradient))
 

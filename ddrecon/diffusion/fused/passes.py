@@ -19,6 +19,7 @@ from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Pas
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
@@ -31,6 +32,8 @@ long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u
 F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
+TOGETHER = 400
+"""Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
@@ -225,6 +228,28 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
     return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
 
 
+def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
+    """`numbers` where `like` lies."""
+    if may_read():
+        # Without waiting: the numbers have left the processor's memory when this returns.
+        return torch.tensor(numbers).to(like.device, non_blocking=True)
+    # A graph copies nothing from there; it keeps what kernels are given by value.
+    table = like.new_empty(len(numbers), dtype=torch.int64)
+    for start in range(0, len(numbers), TOGETHER):
+        row = [*numbers[start : start + TOGETHER]]
+        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, given, {"table": table})
+    return table
+
+
+@functools.cache
+def table_kernel() -> TextKernel:
+    """Writes numbers that it is given to a table."""
+    text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
+    given = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, given, "table")
+
+
 class Program:
     """A table of passes where kernels see it, with the launches that do them.
 
@@ -235,10 +260,10 @@ class Program:
         self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
         self.kernel, self.is_on_gpu = kernel, passes.like.is_cuda
         names = [*entries_of(PASS)]
-        table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
-        # Without waiting: the numbers have left the processor's memory when this returns.
-        self.table = table.to(passes.like.device, non_blocking=True)
-        self.is_alone = not self.is_on_gpu and thread_count(table) == 1
+        self.table = _write_table(
+            [row.get(name, 0) for row in self.rows for name in names], passes.like
+        )
+        self.is_alone = not self.is_on_gpu and thread_count(passes.like) == 1
 
     def bind(self, work: Tensor) -> Bound:
         """The kernel, for vectors in `work`."""
