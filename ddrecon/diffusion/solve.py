@@ -8,6 +8,7 @@ norms are over the diagonal.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -112,35 +113,35 @@ def _iterate(
         """The inner product of each color, [C, 1, 1, 1]."""
         return torch.mul(a, b, out=scratch).sum((1, 2, 3), keepdim=True)
 
-    def norm(a: Tensor) -> Tensor:
-        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True).sqrt()
+    def square_norm(a: Tensor) -> Tensor:
+        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True)
 
-    source_norm = norm(source).clamp(min=tiny)
+    source_square = square_norm(source).clamp(min=tiny)
     residual.copy_(source)
     if guess is not None and guess.shape == source.shape:
         direction.copy_(guess)
         left = source - cycle.product()
         # A guess that is worse than zero is not used.
-        helps = norm(left) <= source_norm
+        helps = square_norm(left) <= source_square
         u = torch.where(helps, guess, u)
         residual.copy_(torch.where(helps, left, source))
     direction.zero_()
-    square, iteration = torch.ones_like(source_norm), 0
+    power, iteration = torch.ones_like(source_square), 0
     while True:
-        relative = norm(residual) / source_norm
+        relative = square_norm(residual).div_(source_square).double()
         if iteration == count:
-            return Solution(u, iteration, relative.max())
+            return Solution(u, iteration, relative.max().sqrt())
         if count is None:
             worst = float(relative.max())
-            if not worst > tolerance or iteration == MAX_ITERATIONS:
-                return Solution(u, iteration, worst)
+            if not worst > tolerance**2 or iteration == MAX_ITERATIONS:
+                return Solution(u, iteration, math.sqrt(worst))
         # A color that is exact enough is left as it is, whatever the others need.
-        is_open = relative.double() > tolerance
+        is_open = relative > tolerance**2
         preconditioned = cycle.cycle()
-        previous, square = square, inner(residual, preconditioned)
-        direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
+        previous, power = power, inner(residual, preconditioned).clamp_(min=tiny)
+        torch.addcmul(preconditioned, direction, power / previous, out=direction)
         product = cycle.product()
-        step = is_open * square / inner(direction, product).clamp(min=tiny)
+        step = is_open * power / inner(direction, product).clamp_(min=tiny)
         u.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1

@@ -20,7 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.emission import Emission, Inflow
+from ddrecon.march.outgoing import Inflow, OutgoingLight
 from ddrecon.medium.coefficients import for_channels, thinness
 from ddrecon.numerics.remember import remember
 
@@ -76,7 +76,7 @@ class _Shell(NamedTuple):
     outward: Tensor
 
 
-def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
+def extend_fields(emission: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
     """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
@@ -92,7 +92,7 @@ def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
     return extended
 
 
-def _extend_light(emission: Emission, shell: _Shell, name: str, field: Tensor) -> Tensor:
+def _extend_light(emission: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
     """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
     grid, extinction, cells = emission.grid, emission.extinction, field.flatten(1)
     nearest = cells.index_select(1, shell.nearest)
@@ -114,7 +114,7 @@ def _extend_light(emission: Emission, shell: _Shell, name: str, field: Tensor) -
     return longer.view(-1, *(count + 2 for count in grid.shape))
 
 
-def _find_lacks(emission: Emission, inflow: Inflow, shell: _Shell) -> Tensor:
+def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
     """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
     extinction, diffusing, emitted = emission.extinction, emission.diffusing, emission.emitted
 

@@ -48,7 +48,14 @@ from ddrecon.scene_file.schema import (
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
 from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
-from ddrecon.variables.values import component_names, name_each, value_of, variable_names
+from ddrecon.variables.values import (
+    component_names,
+    name_each,
+    value_of,
+    variable_names,
+    volume_names,
+    volume_value,
+)
 
 START_OF_EMISSION = 0.1
 """Emission optimized from nothing shows so many times the pictures' brightness."""
@@ -266,19 +273,14 @@ def _varied(
     name: str, settings: ParameterSettings, media: Mapping[str, Volume], colors: int
 ) -> int:
     """How many numbers a cell the parameter `name` has."""
-    (medium, last), kind = split_name(name), kind_of(name)
-    volume = media.get(medium.removeprefix("media.").strip("."))
-    if last == "density" or not kind.is_cellwise or volume is None:
-        return int(last == "density")
-    sigmas = {"sigma_a": [volume.sigma_a], "sigma_s": [volume.sigma_s]}
-    both = [volume.sigma_a, volume.sigma_s]
-    has_cells = any(sigma.ndim > 1 for sigma in sigmas.get(last, both))
-    if not kind.is_color or last.startswith(PHASE):
-        has_cells = volume.phase.cells is not None
-    if last == "emission" and volume.emission is not None:
-        has_cells = volume.emission.ndim > 1 or _is_dark(volume.emission)
-    is_given = isinstance(settings.init, FieldFile) or has_cells
-    is_field = is_given if settings.field is None else settings.field
+    (owner, last), kind = split_name(name), kind_of(name)
+    medium = media.get(owner.removeprefix("media.").strip("."))
+    if medium is None or not kind.is_cellwise or last not in volume_names(medium):
+        return 0
+    value = volume_value(medium, last)
+    is_field = value.ndim >= 3 or isinstance(settings.init, FieldFile)
+    is_field = is_field or (last == "emission" and _is_dark(value))
+    is_field = is_field if settings.field is None else settings.field
     return is_field * (colors if kind.is_color else 1)
 
 

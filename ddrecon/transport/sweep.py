@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Cut, add, cut, fill, weigh
+from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -114,15 +114,27 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
-    phi = torch.cat(light)
-    scatters = fill(add(weigh(phi, factors), torch.cat(source)), medium.degree)
+    scatters = fill(_scatter(light, source, factors), medium.degree)
     if mirror is not None:
-        mirror.begin(_without(fill(phi, medium.degree), inflow))
+        mirror.begin(_without(fill(torch.cat(light), medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
     if mirror is not None:
         mirror.end(_without(swept, inflow))
     low, high = cut(swept)
-    return add(low, -light[0]), high
+    return low - light[0] if len(low) == len(light[0]) else add(low, -light[0]), high
+
+
+def _scatter(light: Cut, source: Cut, factors: Tensor) -> Tensor:
+    """p_l phi_k + Q_k (E2.8), [K, C, z, y, x]; moments that one of them lacks are zero there."""
+    parts = list[Tensor]()
+    by_part = cut(by_harmonic(factors, len(factors) - 1))
+    for phi, q, factor in zip(light, source, by_part, strict=True):
+        few = min(len(phi), len(q))
+        both = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, factor, phi))
+        parts.append(torch.addcmul(*both) if few else phi[:0])
+        parts.append(q[few:] if len(q) > few else factor[few : len(phi)] * phi[few:])
+    parts = [part.expand(-1, *light[0].shape[1:]) for part in parts if len(part)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _without(light: Tensor, inflow: Tensor | None) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ Kind = IntEnum(
 """What a pass does, as `passes.h` has it."""
 PASS = """
 long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u, source, out;
-F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
+F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *results[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
@@ -70,26 +70,26 @@ class KernelPasses(Passes):
         shape = operator.loss.shape
         inverse, kept = (self.like.new_empty(shape) for _ in range(2))
         ties = self.like.new_empty(3, math.prod(shape) // self._width(shape, 2))
-        self._add("SCALE", shape, operator, made=[inverse, kept, ties])
+        self._add("SCALE", shape, operator, results=[inverse, kept, ties])
         return inverse, kept, ties
 
     def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
         grid = tuple(operator.loss.shape[1:])
         shape = [(n + 1) // 2 if a == axis else n for a, n in enumerate(grid, 1)]
-        faces, loss = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
-        below, above, *made = (self.like.new_empty(faces) for _ in range(5))
-        made.append(self.like.new_empty(loss))
+        faces, cells = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
+        below, above, *results = (self.like.new_empty(faces) for _ in range(5))
+        results.append(self.like.new_empty(cells))
         way = [Coarsening(axis, grid[axis - 1], below, above)]
-        weights = [below, above, made[axis - 1]]
-        self._add_transfer("WEIGH", faces, grid, way, operator, made=weights)
-        self._add("COARSEN", loss, operator, way, grid=grid, rows=1, made=made)
-        z, y, x, loss_made = made
-        return way[0], Operator((z, y, x), loss_made, operator.periodic)
+        weights = [below, above, results[axis - 1]]
+        self._add_transfer("WEIGH", faces, grid, way, operator, results=weights)
+        self._add("COARSEN", cells, operator, way, grid=grid, rows=1, results=results)
+        z, y, x, loss = results
+        return way[0], Operator((z, y, x), loss, operator.periodic)
 
     def matrix(self, operator: Operator) -> Tensor:
         count = operator.loss[0].numel()
         matrix = self.like.new_empty(len(operator.loss), count, count, dtype=torch.float64)
-        self._add("MATRIX", operator.loss.shape, operator, rows=0, made=[matrix])
+        self._add("MATRIX", operator.loss.shape, operator, rows=0, results=[matrix])
         return matrix
 
     def run(self) -> None:
@@ -258,49 +258,51 @@ class Program:
 
     def __init__(self, passes: KernelPasses, kernel: TextKernel):
         self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
-        self.kernel, self.is_on_gpu = kernel, passes.like.is_cuda
+        self.kernel, self.colors, self.is_on_gpu = kernel, passes.colors, passes.like.is_cuda
         names = [*entries_of(PASS)]
         self.table = _write_table(
             [row.get(name, 0) for row in self.rows for name in names], passes.like
         )
-        self.is_alone = not self.is_on_gpu and thread_count(passes.like) == 1
+        self.is_alone = not self.is_on_gpu and thread_count(passes.like) <= passes.colors
 
     def bind(self, work: Tensor) -> Bound:
         """The kernel, for vectors in `work`."""
         return self.kernel.bind({"table": self.table}, {"work": work})
 
-    def cut(self, first: int, last: int) -> list[tuple[int, int, int]]:
-        """The launches that do passes `first` to `last`: items, the first pass, the one after it.
-
-        One item may be several passes: then a thread does them all.
-        """
-        launches = []
+    def cut(self, first: int, last: int) -> list[dict[str, int]]:
+        """Launches of the passes from `first` to `last`: each all of one, or a color of several."""
+        launches = list[dict[str, int]]()
         for number, row in enumerate(self.rows[first:last], first):
             is_large = row["items"] * row["width"] > SMALL and not self.is_alone
             if self.is_on_gpu or is_large:
-                if first < number:
-                    launches.append((1, first, number))
-                launches.append((row["items"], number, number + 1))
-                first = number + 1
-        return [*launches, *([(1, first, last)] if first < last else [])]
+                launches.append(
+                    {"count": row["items"], "begin": number, "end": number + 1, "parts": 0}
+                )
+            elif launches and launches[-1]["parts"]:
+                launches[-1]["end"] = number + 1
+            else:
+                parts = {"count": self.colors, "parts": self.colors}
+                launches.append({"begin": number, "end": number + 1, **parts})
+        return launches
 
 
-def launch(bound: Bound, launches: Sequence[tuple[int, int, int]]) -> None:
+def launch(bound: Bound, launches: Sequence[Mapping[str, int]]) -> None:
     """Does the passes of a `bound` program, as it was `cut`."""
-    for items, begin, end in launches:
-        bound.launch(items, begin=begin, end=end, is_whole=items == 1)
+    for one in launches:
+        bound.launch(**one)
 
 
 def passes_kernel(name: str, bits: int) -> TextKernel:
-    """The passes of a table from `begin` to `end`: an item of each, or all that there are."""
+    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`."""
     text = f"""
     for (int k = begin; k < end; ++k) {{
-        const Work<F> pass = {{((const Pass<F>*)table)[k], work, F({STEPS[0]!r}), F({STEPS[1]!r})}};
-        const Size from = is_whole ? 0 : item, to = is_whole ? pass.p.items : item + 1;
-        for (Size i = from; i < to; ++i) {name}(pass, i);
+        const Pass<F>& pass = ((const Pass<F>*)table)[k];
+        const Size from = parts ? pass.items * item / parts : item;
+        const Size to = parts ? pass.items * (item + 1) / parts : item + 1;
+        for (Size i = from; i < to; ++i) {name}(pass, work, F({STEPS[0]!r}), F({STEPS[1]!r}), i);
     }}
     """
-    given = "long *table; int begin, end; bool is_whole; F *work"
+    given = "long *table; int begin, end, parts; F *work"
     return TextKernel(f"multigrid_{name}", bits, text, given, "work", "diffusion/fused/passes.h")
 
 
@@ -330,7 +332,9 @@ class KernelGrids:
         z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
         loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
         self.operator = Operator((z, y, x), loss, operator.periodic)
-        self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss))
+        # Colors that share nothing are prepared one after another.
+        colors = faces if faces == len(loss) else 1
+        self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss, colors))
         self.programs: dict[int, tuple[Program, list[Vector]]] = {}
 
     def program(self, colors: int) -> tuple[Program, list[Vector]]:

@@ -71,6 +71,13 @@ def _swept(tensors: Any) -> Swept:
     return Swept(*(field.contiguous() for field in fields))
 
 
+def _of_field(bar: Tensor, scale: Tensor, field: Tensor) -> Tensor:
+    """The cotangent of a `field`, of that of `scale` times the field, [C, z, y, x]."""
+    if len(field) == 1:
+        return torch.tensordot(scale, bar, 1)[None]
+    return scale.view(-1, 1, 1, 1) * bar
+
+
 class _Sweep(torch.autograd.Function):
     """The moments of radiance, with derivatives by all tensors of `Swept` and what is entering.
 
@@ -109,18 +116,15 @@ class _Sweep(torch.autograd.Function):
             pairs = (mass, swept.extinction), (scattered, swept.scattering)
             sums = [(bar * field).sum((1, 2, 3), dtype=torch.float64) for bar, field in pairs]
             scales_bar = torch.stack([*(one.to(inflow) for one in sums), inflow])
-        mass, scattered = (
-            bar * scale.view(-1, 1, 1, 1)
-            for bar, scale in zip((mass, scattered), swept.scales, strict=False)
-        )
-        scattering_bar = None
+        bars_of_fields: list[Tensor | None] = [
+            _of_field(bar, scale, field)
+            for bar, scale, field in zip(
+                (mass, scattered), swept.scales, (swept.extinction, swept.scattering), strict=False
+            )
+        ]
         if fields[2] is None:
-            mass = mass + scattered
-        else:
-            scattering_bar = scattered.sum_to_size(swept.scattering.shape)
-        extinction_bar = mass.sum_to_size(swept.extinction.shape)
-        of_fields = scales_bar, extinction_bar, scattering_bar, gradient, source
-        return None, None, *of_fields, returning
+            bars_of_fields = [torch.add(*bars_of_fields), None]
+        return None, None, scales_bar, *bars_of_fields, gradient, source, returning
 
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, Tensor | None]:
