@@ -66,8 +66,7 @@ class FaceLight:
 class LightField:
     """All light inside a medium.
 
-    `beams` are those of directional and point lights, not yet scattered (E2.2); cells have
-    `received` from them.
+    `beams` are of directional and point lights (E2.2), not yet scattered; cells `received` some.
 
     `diffuse` [K, C, z, y, x] is phi of all other light but that of `skies` and `turned`: light that
     was scattered or emitted (E2.4, E2.10), and the unscattered light of a ground, of beams that
@@ -172,12 +171,11 @@ def _scatter_light(
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]
-    source = [weigh(light, remaining_moments(cells)) for light in unscattered]
+    scattering = (weigh(light, remaining_moments(cells)) for light in unscattered)
+    source = cut(reduce(add, scattering, received.source))
     outside = medium.index**2 * ambient_radiance(lights, cells.g)
     # L0 and L1: E2.4 to E2.6.
-    scattered = solve_diffuse(
-        cells, cut(reduce(add, source, received.source)), outside, settings, memory
-    )
+    scattered = solve_diffuse(cells, source, outside, settings, memory)
     # Light of `unscattered` scatters by E2.3 as well; beams by E2.2 on each view ray.
     return LightField(
         medium,
