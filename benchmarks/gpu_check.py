@@ -2,8 +2,8 @@
 
     python benchmarks/gpu_check.py [STAGE]... [--device cuda] [--shrink 1] [--engine warp]
 
-Without names all stages run, in their order: machine, kernels, agree, speed, top, bits, tests,
-optimize, shortage. Each prints its table and the seconds it took; what fails says so, and the next
+Without names all stages run, in their order: machine, kernels, agree, speed, graphs, top, bits,
+tests, optimize, shortage. Each prints its table and the seconds it took; what fails says so, and the next
 stage goes on. `--device cpu --shrink 4` tries the script where there is no GPU: grids and images
 are four times smaller. Stages that take longest are `agree`, which computes all scenes of `configs`
 on the processor as well, and `speed`.
@@ -258,6 +258,29 @@ def measure(check: Check, run: Reconstruction) -> str:
     return f"{seconds:.4f} | {1 / seconds:.1f} | {' | '.join(seen)} | {solves}"
 
 
+def graphs(check: Check) -> Iterator[str]:
+    """Replayed iterations beside plain ones: seconds of both, and how far apart both runs end.
+
+    A replayed solve makes an iteration more than a plain one: runs differ by as much as solves may.
+    """
+    for name in ("64 x 96 x 64, 512^2, no round (the paper: 22.5/s)", "plume.yaml, 16 x 24 x 16"):
+        ends, seconds = [], []
+        for is_plain in (True, False):
+            torch.manual_seed(0)
+            run = check.runs()[name]()
+            if is_plain:
+                run.replays.record = None
+            taken = [check.time_of(run.step, 1) for _ in range(6)]
+            ends.append(run.parameters[0].value.detach())
+            seconds.append(median(taken[1:]))
+        is_recorded = run.replays.recording is not None
+        apart = float((ends[0] - ends[1]).norm() / ends[0].norm())
+        yield (
+            f"{name}: {seconds[0]:.4f} s plainly, {seconds[1]:.4f} s replayed "
+            f"(recorded: {is_recorded}), apart {apart:.1e}"
+        )
+
+
 def top(check: Check) -> Iterator[str]:
     """Which kernels take the device's time, of the plume at full resolution."""
     run = check.runs()["plume.yaml, 64 x 96 x 64"]()
@@ -324,7 +347,7 @@ def shortage(check: Check) -> Iterator[str]:
     yield f"exit {end.returncode}: {end.stderr[-900:]}"
 
 
-STAGES = (machine, kernels, agree, speed, top, bits, tests, optimize, shortage)
+STAGES = (machine, kernels, agree, speed, graphs, top, bits, tests, optimize, shortage)
 
 
 def main() -> None:

@@ -25,7 +25,7 @@ TORCH_ALONE: dict[str, frozenset[str]] = {
     "view rays": frozenset(),
     "light": frozenset(),
     "diffusion": frozenset({"printed", "flux_limited"}),
-    "transport rounds": frozenset({"gpu", "periodic", "refracting"}),
+    "transport rounds": frozenset(),
 }
 """Each part of the renderer, and the traits of a scene with any of which torch runs it."""
 CACHE = "WARP_CACHE_PATH"

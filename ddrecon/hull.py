@@ -43,7 +43,7 @@ fits if it holds more than ALL."""
 
 
 OUTSIDE = "no overlap", "hardly any overlap"
-"""What `doubt_box` begins with where a box is elsewhere."""
+"""Beginnings of `doubt_box` where a box is elsewhere."""
 
 
 class HullError(SceneError):

@@ -164,7 +164,7 @@ def _scatter_light(
 ) -> LightField:
     """Light that scatters any number of times; `cells` are means of `medium`.
 
-    `unscattered` are phi [K, C, z, y, x] of light besides that of `lights`.
+    `unscattered`: phi [K, C, z, y, x] of light besides that of `lights`.
     """
     name_kernels(medium.extinction.field)
     # Q0 and Q1 are of light not yet scattered; skies' mean enters through the faces (E2.6).
@@ -173,7 +173,9 @@ def _scatter_light(
     unscattered = unscattered if sky is None else [sky, *unscattered]
     scattering = (weigh(light, remaining_moments(cells)) for light in unscattered)
     source = cut(reduce(add, scattering, received.source))
-    outside = medium.index**2 * ambient_radiance(lights, cells.g)
+    # As it is where faces do not refract: what is known of a tensor is not known of its product.
+    ambient = ambient_radiance(lights, cells.g)
+    outside = ambient if medium.index == 1 else medium.index**2 * ambient
     # L0 and L1: E2.4 to E2.6.
     scattered = solve_diffuse(cells, source, outside, settings, memory)
     # Light of `unscattered` scatters by E2.3 as well; beams by E2.2 on each view ray.

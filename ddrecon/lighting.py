@@ -19,8 +19,8 @@ from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towa
 from ddrecon.light.reduced import ambient_radiance, scatter_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.light_field import LightField, find_light, fluence_of, medium_of, multiply_scatters
-from ddrecon.march.emission import Emission, Inflow
 from ddrecon.march.ground import light_evenly, light_texels, reflect, upwards
+from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import transmitted_moments
 from ddrecon.medium.levels import resample, volume_at_level
@@ -79,7 +79,7 @@ def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
 
 def send(
     light_field: LightField, rays: Rays, unrolled: tuple[Unrolled, LightField] | None = None
-) -> Emission:
+) -> OutgoingLight:
     """What the medium sends along `rays` towards their camera (E2.2, E2.3, E2.11).
 
     `unrolled`: that of `light_field`, where it is known.
@@ -90,27 +90,30 @@ def send(
         towards = rays.towards_eye(medium.grid)
         sky = scatter_sky(light_field.medium, light_field.skies, towards, period)
     diffuse = scatter_towards(medium, wide.diffuse, rays, wide.turned, sky)
-    emission = Emission(
+    is_periodic = bool(light_field.medium.grid.periodic)
+    unlit = OutgoingLight(
         medium.grid,
         medium.extinction,
         medium.scattering,
-        wide.beams,
+        (),
         diffuse if wide.at_faces is None else sharpen(medium, diffuse),
         medium.seen,
         medium.peak,
         medium.remaining if medium.is_cellwise else None,
         medium.support,
         medium.emission,
+        period=period if is_periodic else None,
         inflow=_find_inflow(wide, rays),
     )
-    if not light_field.medium.grid.periodic:
-        return emission
+    outgoing = light_up(unlit, wide.beams)
+    if not is_periodic:
+        return outgoing
 
-    def from_eye(eye: Tensor) -> Emission:
+    def from_eye(eye: Tensor) -> OutgoingLight:
         return send(light_field, replace(rays, eye=eye), (period, wide))
 
     depends_on_eye = len(light_field.diffuse) > 1 or light_field.skies
-    return replace(emission, period=period, from_eye=from_eye if depends_on_eye else None)
+    return replace(outgoing, from_eye=from_eye if depends_on_eye else None)
 
 
 def _find_inflow(light_field: LightField, rays: Rays) -> Inflow | None:
@@ -132,7 +135,7 @@ def _unpeaked_share(medium: Medium) -> Tensor:
 
 def send_down(
     light_field: LightField, plane: Plane, is_diffuse: bool, bundles: Sequence[Rays]
-) -> Emission:
+) -> OutgoingLight:
     """What the medium sends down to a ground, along `bundles` of rays into directions `upwards`.
 
     Its `diffuse` light is that along one bundle after another, [N C, z, y, x]. Where light

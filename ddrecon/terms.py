@@ -51,13 +51,9 @@ def needed_terms(scene: Scene) -> list[str]:
 
 def engine_of_scene(scene: Scene) -> dict[str, str]:
     """The engine that runs each part of rendering `scene`."""
-    volume, settings = scene.volume, scene.diffusion
+    settings = scene.diffusion
     return engine_of_parts(
-        gpu=volume.density.is_cuda,
-        periodic=bool(volume.grid.periodic),
-        refracting=volume.index != 1,
-        printed=settings.scheme == "printed",
-        flux_limited=settings.model == "flux_limited",
+        printed=settings.scheme == "printed", flux_limited=settings.model == "flux_limited"
     )
 
 

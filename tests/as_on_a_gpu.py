@@ -49,7 +49,11 @@ def as_on_a_gpu(order: str = "forward") -> Iterator[set[str]]:
         headers.update(re.findall('#line 1 "ddrecon/(.*)"', _preamble(kernel)))
         wp.launch(_reordered(kernel), count, [ORDERS[order](count), count, record], device="cpu")
 
-    with patch.object(Tensor, "is_cuda", True), patch.object(text, "launch", launch):
+    with (
+        patch.object(Tensor, "is_cuda", True),
+        patch.object(Tensor, "is_cpu", False),
+        patch.object(text, "launch", launch),
+    ):
         yield headers
 
 

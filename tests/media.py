@@ -13,8 +13,8 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductanc
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.lighting import solve_light
-from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
@@ -98,10 +98,12 @@ def make_scene(
     return Scene(volume, lights, [View("view", camera)], *settings)
 
 
-def march_rays(emission: Emission, rays: Rays, settings: RenderSettings) -> tuple[Tensor, Tensor]:
+def march_rays(
+    outgoing: OutgoingLight, rays: Rays, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
     """Radiance and transmittance [C, R] along `rays`, a camera's or any others."""
-    sight = look_along(emission.grid, rays, settings)
-    radiance, seen = (march(emission, sight, settings, one) for one in (None, torch.ones(())))
+    sight = look_along(outgoing.grid, rays, settings)
+    radiance, seen = (march(outgoing, sight, settings, one) for one in (None, torch.ones(())))
     return radiance, seen - radiance
 
 

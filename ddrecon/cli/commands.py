@@ -16,7 +16,7 @@ from ddrecon.engine import engine_versions
 from ddrecon.errors import DdreconError
 
 DRIVERS = "/dev/nvidiactl", "/dev/dxg", "/dev/kfd"
-"""One is there where torch may see a GPU; elsewhere it is not loaded to look for one."""
+"""Devices of which one exists where torch may see a GPU; else torch is not loaded to look."""
 
 
 class Commands(click.Group):

@@ -77,7 +77,7 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     masses = [(term.scale, adaptive_avg_pool3d(term.field, coarse.shape)) for term in weight]
     like = masses[0][1]
     potentials = even * _even_potential(coarse, like.dtype, like.device)
-    total = like.new_tensor(even * coarse.cells)
+    total: float | Tensor = even * coarse.cells
     for scale, mass in masses:
         potentials = potentials + scale * potential(mass, coarse)
         total = total + scale * mass.sum((1, 2, 3), keepdim=True)

@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.diffusion.operator import AXES, Operator, difference
+from ddrecon.numerics.reads import may_read
 
 FEW_CELLS = 128
 """So many cells are solved directly."""
@@ -225,7 +226,7 @@ class Hierarchy:
         """All grids of `operator`.
 
         Which axes are strong is read once all grids are there, of axes that were strong the last
-        time: reading makes a processor wait for a GPU.
+        time: reading makes a processor wait for a GPU. Where nothing may be read, these are taken.
         """
         shape = tuple(operator.loss.shape[1:])
         guess = _usual_axes.get(shape, [])
@@ -243,8 +244,9 @@ class Hierarchy:
                 grid = coarse
             matrix = passes.matrix(grid)
             passes.run()
-            guess = _strong_axes_of(levels, ties)
-            if guess == [[c.axis for c in level.coarsenings] for level in levels]:
+            if may_read():
+                guess = _strong_axes_of(levels, ties)
+            if not may_read() or guess == [[c.axis for c in level.coarsenings] for level in levels]:
                 _usual_axes[shape] = guess
                 # Of no medium it is not finite; no error.
                 inverse = torch.linalg.inv_ex(matrix).inverse.to(operator.loss.dtype)

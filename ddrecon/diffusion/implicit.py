@@ -23,6 +23,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solve import Solution
 from ddrecon.numerics.autodiff import keep, run_plainly
+from ddrecon.numerics.reads import may_read
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class SolveMemory:
     """What solves remember between renders: last solutions, to start from, and a record of each.
 
     `last` is by kind and transport round. With `is_warm` False every solve starts from zero.
+    `iterations` are those of the last solve, likewise; where nothing may be read, a solve makes so
+    many.
     `tolerance_floor`: by kind, the tolerance below which nothing is gained; no solve goes below it,
     whatever it is asked for.
     """
@@ -51,6 +54,7 @@ class SolveMemory:
     last: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
     tolerance_floor: dict[str, float] = field(default_factory=dict)
+    iterations: dict[tuple[str, int], int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class SolverWithMemory:
     negative of the next round's, since a round takes away what it begins with (E2.10).
     """
 
-    solver: Callable[[Any, Tensor, Tensor | None, float], Solution]
+    solver: Callable[..., Solution]
     tolerance: float
     memory: SolveMemory
     round_index: int = 0
@@ -77,7 +81,9 @@ class SolverWithMemory:
         if guess is None and kind == "adjoint":
             next_one = self.last_solution(kind, later=1)
             guess = None if next_one is None else -next_one
-        solution = self.solver(operator, source, guess, self.tolerance_of(kind))
+        memory, key = self.memory, (kind, self.round_index)
+        count = [] if may_read() else [memory.iterations[key]]
+        solution = self.solver(operator, source, guess, self.tolerance_of(kind), *count)
         self.remember(kind, solution, began)
         return solution.value
 
@@ -99,6 +105,8 @@ class SolverWithMemory:
         seconds = perf_counter() - began
         record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
         self.memory.records.append(record)
+        if may_read():
+            self.memory.iterations[kind, self.round_index] = solution.iterations
         if self.memory.is_warm:
             # Without the graph that the solution is about to get.
             self.memory.last[kind, self.round_index] = solution.value.detach()
@@ -131,9 +139,12 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
-        # E3.2: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
-        # several solves may share it, and with the last of them its memory is free again.
-        prepared, ctx.prepared = ctx.prepared, {}
+        # E3.2: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time,
+        # unless this is recorded: several solves may share it, and with the last of them its memory
+        # is free again.
+        prepared = ctx.prepared
+        if may_read():
+            ctx.prepared = {}
         operator = ctx.assemble(prepared, *tensors).linearized(u)
         adjoint = ctx.solve("adjoint", operator.transposed(), u_bar)
         del prepared, operator

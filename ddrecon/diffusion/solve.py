@@ -8,6 +8,7 @@ norms are over the diagonal.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,20 +27,28 @@ MAX_ITERATIONS = 2_000
 class Solution:
     """`value` [C, z, y, x] solves the system, reached in so many `iterations`.
 
-    `residual`: how exactly, relative to the right side, largest over the colors.
+    `residual`: how exactly, relative to the right side, largest over the colors; a tensor, which is
+    not read, where the number of iterations was fixed.
     """
 
     value: Tensor
     iterations: int
-    residual: float
+    residual: float | Tensor
 
 
 def solve_by_multigrid(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
+    operator: Operator,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    count: int | None = None,
 ) -> Solution:
-    """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached."""
-    solution = _iterate(operator, source, guess, tolerance)
-    if not solution.residual <= tolerance:
+    """u of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError if not reached.
+
+    With a `count` it makes so many iterations, whatever they reach, and reads nothing.
+    """
+    solution = _iterate(operator, source, guess, tolerance, count)
+    if count is None and not solution.residual <= tolerance:
         raise SolveError(
             "multigrid did not reach its tolerance",
             solution.iterations,
@@ -89,38 +98,50 @@ def _cycle_of(operator: Operator, source: Tensor) -> Any:
 
 
 def _iterate(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
+    operator: Operator,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    count: int | None,
 ) -> Solution:
-    """The solution after at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
+    """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     cycle, tiny = _cycle_of(operator, source), torch.finfo(source.dtype).tiny
-    inverse = cycle.hierarchy.inverse_diagonal
-    source_norm = _inner(source * inverse, source).sqrt().clamp(min=tiny)
-    u, direction, residual = torch.zeros_like(source), cycle.direction.zero_(), cycle.residual
+    inverse, scratch = cycle.hierarchy.inverse_diagonal, torch.empty_like(source)
+    u, direction, residual = torch.zeros_like(source), cycle.direction, cycle.residual
+
+    def inner(a: Tensor, b: Tensor) -> Tensor:
+        """The inner product of each color, [C, 1, 1, 1]."""
+        return torch.mul(a, b, out=scratch).sum((1, 2, 3), keepdim=True)
+
+    def square_norm(a: Tensor) -> Tensor:
+        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True)
+
+    source_square = square_norm(source).clamp(min=tiny)
     residual.copy_(source)
     if guess is not None and guess.shape == source.shape:
+        direction.copy_(guess)
+        left = source - cycle.product()
         # A guess that is worse than zero is not used.
-        left = source - operator.apply(guess)
-        helps = _inner(left * inverse, left).sqrt() <= source_norm
+        helps = square_norm(left) <= source_square
         u = torch.where(helps, guess, u)
         residual.copy_(torch.where(helps, left, source))
-    square, iteration = torch.ones_like(source_norm), 0
+    direction.zero_()
+    power, iteration = torch.ones_like(source_square), 0
     while True:
-        relative = _inner(residual * inverse, residual).sqrt() / source_norm
-        worst = float(relative.max())
-        if not worst > tolerance or iteration == MAX_ITERATIONS:
-            return Solution(u, iteration, worst)
+        relative = square_norm(residual).div_(source_square).double()
+        if iteration == count:
+            return Solution(u, iteration, relative.max().sqrt())
+        if count is None:
+            worst = float(relative.max())
+            if not worst > tolerance**2 or iteration == MAX_ITERATIONS:
+                return Solution(u, iteration, math.sqrt(worst))
         # A color that is exact enough is left as it is, whatever the others need.
-        is_open = relative.double() > tolerance
+        is_open = relative > tolerance**2
         preconditioned = cycle.cycle()
-        previous, square = square, _inner(residual, preconditioned)
-        direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
+        previous, power = power, inner(residual, preconditioned).clamp_(min=tiny)
+        torch.addcmul(preconditioned, direction, power / previous, out=direction)
         product = cycle.product()
-        step = is_open * square / _inner(direction, product).clamp(min=tiny)
+        step = is_open * power / inner(direction, product).clamp_(min=tiny)
         u.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1
-
-
-def _inner(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product per color, `[C, 1, 1, 1]`."""
-    return (a * b).sum((1, 2, 3), keepdim=True)

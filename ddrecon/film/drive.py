@@ -105,7 +105,7 @@ def _export(film: Film, kind: str) -> None:
 
 
 def share_out(numbers: Sequence[int]) -> Sequence[int]:
-    """Those of the frames `numbers` that are this rank's, one after another; the first has some."""
+    """This rank's share of the frames `numbers`, one after another; the first rank has some."""
     begin, end = (-(-len(numbers) * (own_rank() + more) // rank_count()) for more in (0, 1))
     return numbers[begin:end]
 
@@ -116,7 +116,7 @@ def _report(film: Film) -> dict[str, Any]:
 
 
 def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
-    """Those of the frames `numbers` of `film` that are done, each when it is.
+    """Yields the frames `numbers` of `film` as they are finished.
 
     A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
     again, its error is raised when all others are done.
@@ -203,6 +203,6 @@ def _drive_frame(film: Film, number: int, is_second: bool) -> None:
 
 
 def spread_out(numbers: Sequence[int], count: int) -> list[int]:
-    """As many as `count` of `numbers`, spread evenly from the first to the last."""
+    """`count` of the `numbers`, spread evenly from the first to the last."""
     last = len(numbers) - 1
     return [numbers[round(at)] for at in np.linspace(0, last, min(count, len(numbers)))]

@@ -38,17 +38,17 @@ from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
 FEWER = 6
-"""A frame that begins with another makes so many times fewer iterations: the last of its run."""
+"""How many times fewer iterations a frame makes that starts from another: the last of a run."""
 FINAL_RATE = 0.05
 """The part of their value to which learning rates fall; with a larger one films flicker more."""
 MIXED = 0.2
-"""It keeps this part of its start: noise of its pictures becomes less, and films flicker less."""
+"""The part of a frame's start that is mixed into its result: less noise and less flicker."""
 MOST_APART = 3
 """Frames farther from each other know nothing of each other's motion."""
 VELOCITY = "velocity"
 """The name of a frame's motion, and of its file."""
 PART = "part"
-"""What the locks of parts are called, `part.0000-0011.lock`."""
+"""The beginning of the names of parts' locks, `part.0000-0011.lock`."""
 SEQUENCE = "sequence"
 """The folder of exported volumes, `film_0000.vdb` and so on."""
 
@@ -84,7 +84,7 @@ class Film:
     def claim(
         self, *, overwrite: bool = False, resume: bool = True
     ) -> AbstractContextManager[Folder]:
-        """Its folder for the one of several parts that begins, calibrates or reports."""
+        """The film's folder, for the one of several parts that begins, calibrates or reports."""
         tell = self._tell if resume else None
         return claim_folder(self.path, FILM, overwrite=overwrite, resume=resume, tell=tell)
 

@@ -1,4 +1,4 @@
-"""What a film has come to, of all frames that are done, whoever did them: its record and page."""
+"""The record and page of a film, of all finished frames, whichever process made them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ddrecon.run.run_folder import REPORT, SUMMARY
 
 RECORD, MOVIE = "film.json", "movie.png"
 KEYS = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
-"""What of a run's summary is kept of each frame."""
+"""Entries of a run's summary that a film's record keeps of each frame."""
 SHOWN = 48
 """Frames whose pictures are on the page; all are in their folders."""
 WIDEST = 768

@@ -1,4 +1,4 @@
-"""What does not change in a film, cameras, exposures and lights: found once, and then fixed.
+"""Cameras, exposures and lights, which do not change in a film: found once, and then fixed.
 
 It is found from several frames together; `shared.json` keeps it, with what is known of it: by how
 much the frames disagree.

@@ -15,7 +15,6 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
 from ddrecon.medium.coefficients import Medium, along_colors
-from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -44,7 +43,7 @@ class Beam:
     profile: Tensor | None = None
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
     ) -> Tensor:
         """The integral of `scattering` p over each segment of view rays, `[N - 1, K or C, R]`.
 
@@ -52,8 +51,7 @@ class Beam:
         unit of its scale, at the `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
         """
         cosine = -(nodes.direction @ self.direction)
-        phase = seen.value(cosine) if peak is None else seen.along(peak, cosine)
-        return nodes.integral(scattering * phase)
+        return nodes.integral(scattering * seen.along(peak, cosine))
 
 
 def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Beam]:

@@ -12,8 +12,7 @@ from ddrecon.cameras import Rays
 from ddrecon.light.moments import radiance_along, weigh
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase_cells import turned_in_cells
-from ddrecon.medium.remaining import remaining_moments, turned_table
+from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.remember import remember

@@ -24,7 +24,6 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import beam_moments
 from ddrecon.medium.coefficients import Medium, along_colors
-from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
@@ -53,7 +52,7 @@ class PointBeam:
     least_square: float
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
     ) -> Tensor:
         """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`.
 

@@ -176,7 +176,7 @@ def scatter_sky(
         """p E tau of the light that goes along `travel`."""
         (visible,) = attenuate_few(medium, travel[None], irradiance[None, None])
         z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-        return period.extend(visible) * medium.seen.value(torch.atleast_3d(z + y + x))
+        return period.extend(visible) * medium.seen.phase.value(torch.atleast_3d(z + y + x))
 
     total = period.extend(torch.zeros_like(medium.extinction.value))
     for sky in _lit_skies(skies):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
 from ddrecon.numerics.slicing import Slicing, across
@@ -93,7 +94,7 @@ def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
 
     There it goes a `step` [u] and drifts by `slope` [2], in rows and columns.
     """
-    speed = direction / direction.new_tensor(grid.spacing)
+    speed = direction / constant(grid.spacing, direction)
     slicing = Slicing.of(speed.tolist())
     slope = (
         torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()

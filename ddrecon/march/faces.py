@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import Inflow, OutgoingLight
 from ddrecon.medium.coefficients import for_channels, thinness
 from ddrecon.numerics.remember import remember
 
@@ -35,76 +35,118 @@ cells' means; and the optical depth of cells in which half of it is within the o
 OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
 FACES = tuple(product(range(3), range(2)))
-"""Axis and side, 0 the lower one, in the order in which layers are added."""
-NOWHERE = (False,) * len(FACES)
-"""At none of them."""
+"""Axis and side, 0 the lower one, in the order of what differs from face to face."""
+_Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Along an axis, for each place: of two cells, which and how much of it."""
+_Entries = tuple[Tensor, Tensor, Tensor]
+"""Rows, columns and parts of a sparse matrix."""
 
 
-def extend_fields(emission: Emission, axis: int | None) -> dict[str, Tensor]:
+class _Table(NamedTuple):
+    """A sparse matrix: `parts` [E] in its `rows` [E] and `columns` [E]."""
+
+    rows: Tensor
+    columns: Tensor
+    parts: Tensor
+
+    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
+        """`total` [C, rows], to which the product with `values` [C, columns] is added in place."""
+        return total.index_add_(1, self.rows, values.index_select(1, self.columns) * self.parts)
+
+
+class _Shell(NamedTuple):
+    """The M places of the layer around a box, and the S places on those faces where lines end.
+
+    `nearest` [M]: the cell nearest to each place. `line` [M, cells]: light on faces, on the line
+    through the two outermost centers. `faces` [3, M]: beyond which of `FACES` a place lies, by
+    axis; 6 for none. `inner` [M, cells] and `around` [places of an extended field, M]: what stands
+    beyond faces, less what `inner` makes of cells, is `around` times light on faces; `places` [M]
+    says where. `lacking` [places of an extended field, S]: what that changes by where light lacks
+    on faces. `outermost` [S]: the cells there, with their `width` and normals `outward` [3, S].
+    """
+
+    nearest: Tensor
+    line: _Table
+    faces: Tensor
+    inner: _Table
+    around: _Table
+    lacking: _Table
+    outermost: Tensor
+    width: Tensor
+    outward: Tensor
+
+
+def extend_fields(emission: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
     """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
     outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
-    grid, extinction = emission.grid, emission.extinction
-    is_line = tuple(grid.shape[axis] > 1 for axis, _ in FACES)
-    extended, matter = dict[str, Tensor](), list[Tensor]()
+    grid, field = emission.grid, emission.extinction.field
+    shell, extended = _surround(grid, axis, field.dtype, field.device), dict[str, Tensor]()
     for name, field in emission.fields.items():
-        is_light = any(is_line) and (name == "diffuse" or name.startswith("mass "))
-        outside = _Outside.apply(field, NOWHERE)
-        matter = matter or [outside]
-        if is_light:
-            line = _Outside.apply(field, is_line)
-            if name == "diffuse":
-                scale = extinction.scale[: len(field)].view(-1, 1)
-                share = thinness(grid, scale * matter[0][: len(field)], OPAQUE)
-                outside = torch.lerp(outside, line, for_channels(share, len(field)))
-            else:
-                lit = shine_through(emission.beams[int(name.split()[1])], grid)
-                shade = _shade(grid, 1 - lit * lit.new_tensor(is_line))
-                outside = shade * _limit(outside, line, extinction.mass_bound)
-        lines = is_line if is_light else NOWHERE
-        lacks = _find_lacks(emission, is_line) if name == "diffuse" else [None] * len(FACES)
-        extended[name] = _WithOutside.apply(axis, lines, field, outside.to(field), *lacks)
+        if name == "diffuse" or name.startswith("mass "):
+            extended[name] = _extend_light(emission, shell, name, field)
+        else:
+            extended[name] = pad(field[None], [1] * 6, mode="replicate")[0]
     return extended
 
 
-def _find_lacks(emission: Emission, is_line: Sequence[bool]) -> list[Tensor | None]:
-    """By how much diffuse light on faces is less than on the line to there (E2.17).
+def _extend_light(emission: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
+    """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
+    grid, extinction, cells = emission.grid, emission.extinction, field.flatten(1)
+    nearest = cells.index_select(1, shell.nearest)
+    line = shell.line.add_to(torch.zeros_like(nearest), cells)
+    if name == "diffuse":
+        matter = extinction.field[: len(field)].flatten(1).index_select(1, shell.nearest)
+        share = thinness(grid, extinction.scale[: len(field)].view(-1, 1) * matter, OPAQUE)
+        on_faces = torch.lerp(nearest, line, for_channels(share, len(field)))
+    else:
+        lit = shine_through(emission.beams[int(name.split()[1])], grid)
+        z, y, x = pad(1 - lit, (0, 1), value=1.0).index_select(0, shell.faces.flatten()).chunk(3)
+        on_faces = z * y * x * _limit(nearest, line, extinction.mass_bound)
+    beyond = shell.inner.add_to(torch.zeros_like(nearest), cells)
+    values = torch.cat([on_faces.to(field), beyond], 1)
+    longer = shell.around.add_to(pad(field, [1] * 6).flatten(1), values)
+    if name == "diffuse" and emission.inflow is not None and len(shell.outermost):
+        lacks = _find_lacks(emission, emission.inflow, shell)
+        longer = shell.lacking.add_to(longer, lacks.expand(len(field), -1))
+    return longer.view(-1, *(count + 2 for count in grid.shape))
 
-    By face [C, rows + 2, columns + 2], or None: less of it comes in than medium sends out.
-    """
-    inflow, grid = emission.inflow, emission.grid
-    if inflow is None:
-        return [None] * len(FACES)
-    extinction, diffusing, lacks = emission.extinction, emission.diffusing, list[Tensor | None]()
-    mean, *first = inflow.received.unbind()
-    for (axis, side), is_so, backward in zip(FACES, is_line, inflow.backward, strict=True):
-        if not is_so:
-            lacks.append(None)
-            continue
 
-        def layer(field: Tensor, axis: int = axis, side: int = side) -> Tensor:
-            return field.select(1 + axis, -side)
+def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
+    """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
+    extinction, diffusing, emitted = emission.extinction, emission.diffusing, emission.emitted
 
-        width, normal = grid.spacing[axis], 2 * side - 1
-        received = layer(mean)
-        if first:
-            flux = flux_along_axes([layer(moment) for moment in first])
-            received = received - 0.5 * normal * flux[axis]
-        kept = inflow.kept.view(-1, 1, 1)
-        light = layer(emission.diffuse) + kept * received
-        lost = layer(extinction.scale) * layer(extinction.field)
-        scattered = layer(diffusing.scale) * layer(diffusing.field)
-        sent = scattered * light - lost * layer(inflow.outside)
-        if emission.emitted is not None:
-            sent = sent + layer(emission.emitted)
-        part = width * kept * backward
-        lack = part * sent / (UNEVEN + width * lost + part * scattered)
-        if emission.emitted is not None:
-            lack = layer(diffusing.scale) * lack
-        lacks.append(pad(lack, (1, 1, 1, 1), mode="replicate"))
-    return lacks
+    def outermost(field: Tensor) -> Tensor:
+        return field.flatten(1).index_select(1, shell.outermost)
+
+    # Moments beside colors: along a third axis torch takes entries one by one.
+    moments = outermost(inflow.received.flatten(0, 1))
+    received, *first = moments.unflatten(0, inflow.received.shape[:2]).unbind()
+    if first:
+        flux = torch.stack(flux_along_axes(first))
+        received = received - 0.5 * (shell.outward[:, None] * flux).sum(0)
+    kept, scale = inflow.kept.view(-1, 1), diffusing.scale.view(-1, 1)
+    light = outermost(emission.diffuse) + kept * received
+    lost = extinction.scale.view(-1, 1) * outermost(extinction.field)
+    scattered = scale * outermost(diffusing.field)
+    sent = scattered * light - lost * inflow.outside.view(-1, 1)
+    if emitted is not None:
+        sent = sent + outermost(emitted)
+    backward = [
+        one.expand(-1, *_layer_of(emission.grid, axis)).flatten(1)
+        for one, (axis, _) in zip(inflow.backward, FACES, strict=True)
+        if emission.grid.shape[axis] > 1
+    ]
+    part = shell.width * kept * torch.cat(backward, 1)
+    lack = part * sent / (UNEVEN + shell.width * lost + part * scattered)
+    return lack if emitted is None else scale * lack
+
+
+def _layer_of(grid: Grid, axis: int) -> tuple[int, ...]:
+    """The shape of a layer of cells across `axis`."""
+    return tuple(count for other, count in enumerate(grid.shape) if other != axis)
 
 
 def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
@@ -129,155 +171,103 @@ def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
 
 
 @remember
-def _places(shape: tuple[int, ...], device: torch.device) -> Tensor:
-    """Where cells outside of those of `shape` stand in a field with a layer more [M]."""
-    is_outside = torch.ones([count + 2 for count in shape], dtype=torch.bool, device=device)
+def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
+    """The places around the box of `grid`; across `axis` those that are extended are on faces."""
+    wide = tuple(count + 2 for count in grid.shape)
+    cells = torch.arange(grid.cells).view(1, *grid.shape)
+    nearest = pad(cells.double()[None], [1] * 6, mode="replicate").long()[0, 0]
+    is_outside = torch.ones(wide, dtype=torch.bool)
     is_outside[1:-1, 1:-1, 1:-1] = False
-    return is_outside.flatten().nonzero()[:, 0]
+    places = is_outside.flatten().nonzero()[:, 0]
+    number = torch.zeros(math.prod(wide), dtype=torch.long)
+    number[places] = torch.arange(len(places))
 
-
-@remember
-def _parts(
-    shape: tuple[int, ...], lines: Sequence[bool], dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Which of cells of `shape` [E] those outside [E] are made of, of `_places`, and how much [E].
-
-    They are as the nearest, and on `lines` on the one through that and the one before it.
-    """
-    near, much = list[list[Tensor]](), list[list[Tensor]]()
-    for count, ends in zip(shape, (lines[:2], lines[2:4], lines[4:]), strict=True):
-        nearest = torch.arange(-1, count + 1, device=device).clamp(0, count - 1)
-        before, line = nearest.clone(), torch.zeros(count + 2, dtype=dtype, device=device)
-        before[0], before[-1] = min(1, count - 1), max(count - 2, 0)
-        line[0], line[-1] = ends[0] / 2, ends[1] / 2
-        near.append([nearest, before])
-        much.append([1 + line, -line])
-    outside, found = _places(shape, device), list[Tensor]()
-    for z, y, x in product(range(2), repeat=3):
-        cells = near[0][z][:, None, None] * shape[1] + near[1][y][:, None]
-        cells = (cells * shape[2] + near[2][x]).flatten()[outside]
-        parts = (much[0][z][:, None, None] * much[1][y][:, None] * much[2][x]).flatten()[outside]
-        places = parts.nonzero()[:, 0]
-        found += [cells[places], places, parts[places]]
-    return torch.cat(found[::3]), torch.cat(found[1::3]), torch.cat(found[2::3])
-
-
-def _shade(grid: Grid, shares: Tensor) -> Tensor:
-    """The product of the `shares` [6] of the faces beyond which cells outside lie, [M]."""
-    z, y, x = (
-        torch.cat([low.view(1), shares.new_ones(count), high.view(1)])
-        for count, (low, high) in zip(grid.shape, shares.view(3, 2), strict=True)
+    # Along an axis, places and where each goes on from: value + share (value - value before).
+    on_line, beyond, faces = list[_Along](), list[_Along](), list[Tensor]()
+    for along, count in enumerate(grid.shape):
+        place = torch.arange(count + 2)
+        cell, low, high = (place - 1).clamp(0, count - 1), place == 0, place == count + 1
+        share = (low | high).double() * (count > 1)
+        before = (cell + low.long() - high.long()).clamp(0, count - 1)
+        on_line.append(((cell, 1 + share / 2), (before, -share / 2)))
+        share = share * (along != axis)
+        beyond.append(((place, 1 + share), (place.clamp(1, count), -share)))
+        face = torch.where(low, 2 * along, 2 * along + 1)
+        faces.append(torch.where((low | high) & (count > 1), face, len(FACES)))
+    line = _multiply(on_line, grid.shape, places)
+    rows, columns, parts = _multiply(beyond, wide, places)
+    is_inner = ~is_outside.flatten()[columns]
+    inner = rows[is_inner], nearest.flatten()[columns[is_inner]], parts[is_inner]
+    rows, columns, parts = (one[~is_inner] for one in (rows, columns, parts))
+    # Light on faces, then what is made of cells.
+    around = (
+        torch.cat([places[rows], places]),
+        torch.cat([number[columns], len(places) + torch.arange(len(places))]),
+        torch.cat([parts, torch.ones(len(places), dtype=torch.float64)]),
     )
-    every = z[:, None, None] * y[:, None] * x
-    return every.flatten()[_places(tuple(grid.shape), shares.device)]
+    by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)[:, places]
+    lacking, outermost, width, outward = _find_layers(grid, axis, nearest)
+
+    def on_device(entries: _Entries) -> _Table:
+        rows, columns, parts = (one.to(device) for one in entries)
+        return _Table(rows, columns, parts.to(dtype))
+
+    return _Shell(
+        nearest.flatten()[places].to(device),
+        on_device(line),
+        by_axis.to(device),
+        on_device(inner),
+        on_device(around),
+        on_device(lacking),
+        outermost.to(device),
+        width.to(device, dtype),
+        outward.to(device, dtype),
+    )
 
 
-class _Outside(torch.autograd.Function):
-    """What stands outside of `cells` [C, z, y, x], [C, M]: linear, and what is nearest but on
-    `lines`.
+def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _Entries:
+    """The product of three matrices with two entries a row, one an axis: rows that are `places`.
+
+    `size`: how many columns each matrix has.
     """
-
-    @staticmethod
-    def forward(cells: Tensor, lines: Sequence[bool]) -> Tensor:
-        shape = tuple(cells.shape[1:])
-        near, places, parts = _parts(shape, lines, cells.dtype, cells.device)
-        return _add_up(cells.flatten(1), near, places, parts, len(_places(shape, cells.device)))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.shape, ctx.lines = inputs[0].shape, inputs[1]
-
-    @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
-        shape = tuple(ctx.shape[1:])
-        near, places, parts = _parts(shape, ctx.lines, bar.dtype, bar.device)
-        return _add_up(bar, places, near, parts, math.prod(shape)).view(ctx.shape), None
-
-    @staticmethod
-    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
-        return _Outside.forward(change, ctx.lines)
+    rows, columns, parts = list[Tensor](), list[Tensor](), list[Tensor]()
+    for (z, a), (y, b), (x, c) in product(*axes):
+        column = (z[:, None, None] * size[1] + y[:, None]) * size[2] + x
+        part = (a[:, None, None] * b[:, None] * c).flatten()[places]
+        row = part.nonzero()[:, 0]
+        rows.append(row)
+        columns.append(column.flatten()[places[row]])
+        parts.append(part[row])
+    return torch.cat(rows), torch.cat(columns), torch.cat(parts)
 
 
-def _add_up(values: Tensor, taken: Tensor, put: Tensor, parts: Tensor, count: int) -> Tensor:
-    """`parts` [E] of the `values` [C, ...] that are `taken` [E], summed where they are `put`."""
-    total = values.new_zeros(len(values), count)
-    return total.scatter_add_(1, put.expand(len(values), -1), values.index_select(1, taken) * parts)
+def _find_layers(
+    grid: Grid, axis: int | None, nearest: Tensor
+) -> tuple[_Entries, Tensor, Tensor, Tensor]:
+    """`lacking`, `outermost`, `width` and `outward` of a `_Shell`.
 
-
-class _WithOutside(torch.autograd.Function):
-    """`cells` with those `outside` [C, M]: beyond faces where they are on `lines`, not on these.
-
-    But those across `axis` are on faces. Linear. On faces they are less by what each one `lacks`,
-    and the outermost cells' more by the part `RAISED` of it.
+    `nearest` [z + 2, y + 2, x + 2]: the cell nearest to each place.
     """
-
-    @staticmethod
-    def forward(
-        axis: int | None,
-        lines: Sequence[bool],
-        cells: Tensor,
-        outside: Tensor,
-        *lacks: Tensor | None,
-    ) -> Tensor:
-        longer = cells.new_empty(len(cells), *(count + 2 for count in cells.shape[1:]))
-        longer[:, 1:-1, 1:-1, 1:-1] = cells
-        places = _places(tuple(cells.shape[1:]), cells.device).expand(len(cells), -1)
-        longer.view(len(cells), -1).scatter_(1, places, outside.expand(len(cells), -1))
-        for face, is_line in zip(FACES, lines, strict=True):
-            if is_line and face[0] != axis:
-                outer, last = _layers(longer, face)
-                outer.mul_(2).sub_(last)
-        for face, lack in zip(FACES, lacks, strict=True):
-            if lack is not None:
-                outer, last = _layers(longer, face)
-                outer.sub_(lack, alpha=_weight(axis, face))
-                last[:, 1:-1, 1:-1].add_(lack[:, 1:-1, 1:-1], alpha=RAISED)
-        return longer
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.axis, ctx.lines, ctx.shape = *inputs[:2], inputs[2].shape
-        ctx.has = [lack is not None for lack in inputs[4:]]
-
-    @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Any, ...]:
-        longer, bars = bar.clone(), list[Tensor | None]()
-        for face, has in zip(FACES, ctx.has, strict=True):
-            outer, last = _layers(bar, face)
-            bars.append(-_weight(ctx.axis, face) * outer if has else None)
-            if (one := bars[-1]) is not None:
-                one[:, 1:-1, 1:-1].add_(last[:, 1:-1, 1:-1], alpha=RAISED)
-        for face, is_line in reversed(list(zip(FACES, ctx.lines, strict=True))):
-            if is_line and face[0] != ctx.axis:
-                outer, last = _layers(longer, face)
-                last -= outer
-                outer *= 2
-        outside = _places(tuple(ctx.shape[1:]), bar.device)
-        found = longer.flatten(1).index_select(1, outside)
-        return None, None, longer[:, 1:-1, 1:-1, 1:-1], found, *bars
-
-    @staticmethod
-    def jvp(
-        ctx: Any,
-        _axis: None,
-        _lines: None,
-        cells: Tensor | None,
-        outside: Tensor | None,
-        *lacks: Tensor | None,
-    ) -> Tensor:
-        like = next(one for one in (cells, outside, *lacks) if one is not None)
-        count = len(_places(tuple(ctx.shape[1:]), like.device))
-        cells = like.new_zeros(ctx.shape) if cells is None else cells
-        outside = like.new_zeros(len(cells), count) if outside is None else outside
-        return _WithOutside.forward(ctx.axis, ctx.lines, cells, outside, *lacks)
-
-
-def _weight(axis: int | None, face: tuple[int, int]) -> float:
-    """How much less is what stands for a face, where that lacks 1 and the last cell has more."""
-    return 1.0 if face[0] == axis else 2.0 + RAISED
-
-
-def _layers(longer: Tensor, face: tuple[int, int]) -> list[Tensor]:
-    """The layer on a face and the one before it, as views."""
-    axis, side = face
-    return [longer.select(1 + axis, -1 - k if side else k) for k in range(2)]
+    place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
+    number = torch.zeros(grid.cells, dtype=torch.long)
+    none = torch.zeros(0, dtype=torch.long)
+    found = [(none, none, none.double(), none, none.double(), none.double().view(3, 0))]
+    for along, side in FACES:
+        if grid.shape[along] == 1:
+            continue
+        outer, last = (place.select(along, -1 - k if side else k) for k in range(2))
+        last = last[1:-1, 1:-1].flatten()
+        rows, cells = torch.cat([outer.flatten(), last]), nearest.flatten()[last]
+        number[cells] = count + torch.arange(len(cells))
+        count += len(cells)
+        # What stands for a face is less by what that lacks, and by what the last cell has more.
+        less = -1.0 if along == axis else -2.0 - RAISED
+        parts = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
+        width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
+        outward = torch.zeros(3, len(cells), dtype=torch.float64)
+        outward[along] = 2 * side - 1
+        found.append((rows, number[nearest.flatten()[rows]], parts, cells, width, outward))
+    rows, columns, parts, cells, width, outward = (
+        torch.cat(many, -1) for many in zip(*found, strict=True)
+    )
+    return (rows, columns, parts), cells, width, outward

@@ -21,9 +21,9 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import Sky, Source
 from ddrecon.march.direct import Beamed, rays_against, shine_on, transmittance
-from ddrecon.march.emission import Emission
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.integral import march
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import Sight, look_along
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
@@ -69,7 +69,7 @@ def light_texels(
     lit: LitGround,
     sources: Sequence[Source],
     medium: Medium,
-    glow: Callable[[Sequence[Rays]], Emission],
+    glow: Callable[[Sequence[Rays]], OutgoingLight],
     settings: RenderSettings,
 ) -> LitGround:
     """What is `lit` evenly by `sources`, under `medium` and in its light (E5.1).

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -15,13 +16,11 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.engine import has_kernels
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission
 from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
-from ddrecon.medium.phase_cells import SeenNodes
-from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
@@ -38,7 +37,7 @@ backward pass fills an array of all cells.
 
 
 def march(
-    emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
+    outgoing: OutgoingLight, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
 ) -> Tensor:
     """Radiance [C, R] along the rays of a camera, with that `behind` [C, R] the volume (E2.1).
 
@@ -47,26 +46,25 @@ def march(
     order. A pixel that this might change by more than `settings.tolerance` of the image's root
     mean square keeps its own ray.
     """
-    first, *others = emission.parts()
-    radiance = _march_part(first, sight, settings, behind)
-    for part in others:
-        radiance = radiance + _march_part(part, sight, settings, None)
+    radiance = _march_alone(outgoing, sight, settings, behind)
+    for light in outgoing.lit:
+        radiance = radiance + _march_alone(light, sight, settings, None)
     return radiance
 
 
-def _march_part(
-    emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None
+def _march_alone(
+    outgoing: OutgoingLight, sight: Sight, settings: RenderSettings, behind: Tensor | None
 ) -> Tensor:
-    """As `march`, of an `emission` whose beams have no profile."""
+    """As `march`, of `outgoing` light without that of beams with a profile, its `lit`."""
     if sight.way is None:
-        nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
+        nothing = outgoing.diffuse.new_zeros(outgoing.colors, len(sight.rays.direction))
         return nothing if behind is None else nothing + behind
-    sampler = Sampler(emission, sight.way, settings.steps)
+    sampler = Sampler(outgoing, sight.way, settings.steps)
 
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
         """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""
         radiance, mass = _march_by_engine(sampler, rays, crossing)
-        return radiance if behind is None else torch.cat([radiance, opacity_of(emission, mass)])
+        return radiance if behind is None else torch.cat([radiance, opacity_of(outgoing, mass)])
 
     if sight.lattice is None:
         values = _spread(march_these(sight.rays, sight.crossing), sight)
@@ -80,7 +78,7 @@ def _march_part(
             values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
     if behind is None:
         return values
-    scattered, opacity = values.split(emission.colors)
+    scattered, opacity = values.split(outgoing.colors)
     return scattered + (1 - opacity) * behind
 
 
@@ -89,7 +87,7 @@ def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[
     march_own = march_rays
     if has_kernels("view rays"):
         from ddrecon.march.fused.integrate import march_rays as march_own
-    if sampler.emission.period is not None:
+    if sampler.outgoing.period is not None:
         return march_periods(march_own, sampler, rays, crossing)
     return march_own(sampler, rays, crossing)
 
@@ -127,7 +125,7 @@ def march_rays(
 
     `front` [K, P] is the mass between the camera and where they enter, 0 if left out.
     """
-    emission, hitting, values = sampler.emission, rays.select(crossing.hit), sampler.values
+    outgoing, hitting, values = sampler.outgoing, rays.select(crossing.hit), sampler.values
     sizes = {name: len(field) for name, field in sampler.fields.items()}
 
     def run(chunk: Tensor) -> Tensor:
@@ -137,22 +135,25 @@ def march_rays(
         nodes = Nodes(chosen.origin, chosen.direction, distance)
         before = None if front is None else front[:, chunk]
         at_nodes = dict(zip(sizes, sampled.split([*sizes.values()], 1), strict=True))
-        return torch.cat(integrate_segments(emission, at_nodes, nodes, before))
+        return torch.cat(integrate_segments(outgoing, at_nodes, nodes, before))
 
-    count = max(CHUNK_NODES, emission.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
+    count = max(CHUNK_NODES, outgoing.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
     chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(max(1, count))
     found = torch.cat([recompute(run, chunk) for chunk in chunks], 1)
-    return found[: emission.colors], found[emission.colors :]
+    return found[: outgoing.colors], found[outgoing.colors :]
 
 
-def opacity_of(emission: Emission, mass: Tensor) -> Tensor:
+def opacity_of(outgoing: OutgoingLight, mass: Tensor) -> Tensor:
     """1 - tau [C, R] of rays that pass `mass` [K, R]."""
-    scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
+    scale = outgoing.extinction.scale.view(-1, 1).expand(outgoing.colors, 1)
     return -torch.expm1(-scale * mass)
 
 
 def integrate_segments(
-    emission: Emission, at_nodes: Mapping[str, Tensor], nodes: Nodes, front: Tensor | None = None
+    outgoing: OutgoingLight,
+    at_nodes: Mapping[str, Tensor],
+    nodes: Nodes,
+    front: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Scattered radiance [C, R] from fields `at_nodes` [N, channels, R], and mass [K, R].
 
@@ -160,7 +161,7 @@ def integrate_segments(
     """
     extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
     scattering = extinction if scattering is None else scattering
-    scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
+    scale = outgoing.extinction.scale.view(-1, 1).expand(outgoing.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
     own = nodes.integral(extinction).cumsum(0)
     first = torch.zeros_like(own[:1]) if front is None else front[None]
@@ -170,21 +171,19 @@ def integrate_segments(
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
     diffuse = diffuse + at_nodes["emitted"] if "emitted" in at_nodes else diffuse
     scattered = decayed_sum(nodes.integral(diffuse), begin, end, scale)
-    scattered = scattered * emission.diffuse_scale.view(-1, 1)
-    seen: SeenPhase | SeenNodes = emission.seen
-    if "number" in at_nodes:
-        seen = SeenNodes(seen.phase, at_nodes["number"], seen.degree)
-    for index, beam in enumerate(emission.beams):
+    scattered = scattered * outgoing.diffuse_scale.view(-1, 1)
+    seen = replace(outgoing.seen, number=at_nodes.get("number"))
+    for index, beam in enumerate(outgoing.beams):
         # E8.7: the depth of the forward peak, from where the light enters to the camera.
         # On faces that are lit it is 0 but for rounding, whose exponential may overflow.
-        least = -4 / emission.extinction.mass_bound.detach()
+        least = -4 / outgoing.extinction.mass_bound.detach()
         to_light, depth = torch.maximum(at_nodes[f"mass {index}"], least), None
-        if emission.peak is not None:
-            peak = at_nodes["peak"] if "peak" in at_nodes else emission.peak.view(-1, 1)
+        if outgoing.peak is not None:
+            peak = at_nodes["peak"] if "peak" in at_nodes else outgoing.peak.view(-1, 1)
             depth = peak * (passed + to_light)
         # E2.2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
         weight = beam.scatter(scattering, nodes, seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
-        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + arriving * strength.view(-1, 1)
     return scattered, own[-1]

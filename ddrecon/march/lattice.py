@@ -58,8 +58,11 @@ class Lattice:
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     """The lattice across `axis` in place of rays of one camera, all `hitting` the box.
 
-    None where these are no more work themselves, or the camera is not beyond the slices.
+    None where these are no more work themselves, or the camera is not beyond the slices; and on a
+    GPU, which has threads for all of them, and would wait for which pixels are rough.
     """
+    if hitting.direction.is_cuda:
+        return None
     eye = hitting.eye
     low, high, margin = grid.lower[axis], grid.upper[axis], grid.spacing[axis]
     if eye is not None and low - margin < float(eye[axis].detach()) < high + margin:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import Sampler, next_node
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.periods import unroll
@@ -28,12 +28,12 @@ OPAQUE = 40.0
 """Optical depths behind which nothing is seen."""
 
 
-def absorb(medium: Medium) -> Emission:
+def absorb(medium: Medium) -> OutgoingLight:
     """What view rays meet in `medium` that sends nothing."""
     period, is_periodic = unroll(medium.grid, HALO), bool(medium.grid.periodic)
     medium = medium.put(period.wide, period.extend) if is_periodic else medium
     extinction, dark = medium.extinction, torch.zeros_like(medium.extinction.field[:1])
-    absorbing = Emission(
+    absorbing = OutgoingLight(
         medium.grid, extinction, extinction, (), dark, medium.seen, None, support=medium.support
     )
     return replace(absorbing, period=period) if is_periodic else absorbing
@@ -46,28 +46,28 @@ def march_periods(
     crossing: Crossing,
 ) -> tuple[Tensor, Tensor]:
     """As `integral.march_rays`, period by period, by `march_own` in each."""
-    emission, period = sampler.emission, sampler.emission.period
+    outgoing, period = sampler.outgoing, sampler.outgoing.period
     assert period is not None
-    grid, scale = period.grid, emission.extinction.scale.view(-1, 1)
+    grid, scale = period.grid, outgoing.extinction.scale.view(-1, 1)
     longest = min(sampler.way.longest, math.hypot(*grid.extent))
     sampler = replace(sampler, way=replace(sampler.way, longest=longest))
     samplers = dict[tuple[int, ...], Sampler]()
 
     def from_copy(copy: list[int]) -> Sampler:
         """What the eye sees of a copy, whose cells it sees from another side."""
-        if rays.eye is None or emission.from_eye is None:
+        if rays.eye is None or outgoing.from_eye is None:
             return sampler
         key = tuple(copy)
         if key not in samplers:
-            seen = emission.from_eye(rays.eye - extent * extent.new_tensor(copy))
-            samplers[key] = replace(sampler, emission=seen)
+            seen = outgoing.from_eye(rays.eye - extent * extent.new_tensor(copy))
+            samplers[key] = replace(sampler, outgoing=seen)
         return samplers[key]
 
     extent, lower, upper = map(rays.origin.new_tensor, (grid.extent, grid.lower, grid.upper))
     repeats = extent.new_tensor([float(axis in grid.periodic) for axis in range(3)])
     number = (crossing.far > crossing.near).nonzero()[:, 0]
-    radiance = emission.diffuse.new_zeros(emission.colors, len(crossing.hit))
-    mass = radiance.new_zeros(len(emission.extinction.field), len(crossing.hit))
+    radiance = outgoing.diffuse.new_zeros(outgoing.colors, len(crossing.hit))
+    mass = radiance.new_zeros(len(outgoing.extinction.field), len(crossing.hit))
     rays, near, far = rays.select(crossing.hit[number]), crossing.near[number], crossing.far[number]
     begin = (rays.origin + near[:, None] * rays.direction).detach()
     copy = repeats * ((begin - lower) / extent).floor()
@@ -77,12 +77,12 @@ def march_periods(
         faces = torch.where(direction > 0, upper, lower)
         ends = torch.where(repeats > 0, (faces - own.origin) / direction, torch.inf)
         leave, axis = ends.min(1)
-        end = torch.minimum(next_node(emission.grid, own, leave, sampler), far)
+        end = torch.minimum(next_node(outgoing.grid, own, leave, sampler), far)
         # The node may be one that lies before the ray enters.
         end = torch.where(leave < far, torch.maximum(end, near), far)
         is_there = end > near
         which, group = copy[is_there].unique(dim=0, return_inverse=True)
-        if emission.from_eye is None or rays.eye is None:
+        if outgoing.from_eye is None or rays.eye is None:
             which, group = which[:1], torch.zeros_like(group)
         for index, one in enumerate(which.long().tolist()):
             chosen = is_there.nonzero()[:, 0][group == index]

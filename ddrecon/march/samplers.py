@@ -16,8 +16,8 @@ from torch.nn.functional import normalize, pad
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission
 from ddrecon.march.faces import extend_fields
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, along_colors
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
 from ddrecon.numerics.remember import remember
@@ -62,9 +62,9 @@ def choose_way(grid: Grid, rays: Rays, crossing: Crossing) -> Way:
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """Fields of an `emission` at nodes of rays, `steps` a cell, in the `way` that these run."""
+    """Fields of `outgoing` light at nodes of rays, `steps` a cell, in the `way` that these run."""
 
-    emission: Emission
+    outgoing: OutgoingLight
     way: Way
     steps: int
 
@@ -76,7 +76,7 @@ class Sampler:
     @functools.cached_property
     def planes(self) -> Tensor:
         """Where nodes are [N]: planes across the axis of slices [u], or parts of a ray's way."""
-        grid, like = self.emission.grid, self.emission.diffuse
+        grid, like = self.outgoing.grid, self.outgoing.diffuse
         if self.way.axis is not None:
             return planes_across(grid, self.way, self.steps, like.dtype, like.device)
         nodes = self.steps * math.ceil(self.way.longest / min(grid.spacing)) + 1
@@ -84,8 +84,8 @@ class Sampler:
 
     @functools.cached_property
     def fields(self) -> Mapping[str, Tensor]:
-        """Those of the emission up to the faces of the box, [channels, z + 2, y + 2, x + 2]."""
-        return self.emission.extended or extend_fields(self.emission, self.way.axis)
+        """Those of `outgoing` up to the faces of the box, [channels, z + 2, y + 2, x + 2]."""
+        return self.outgoing.extended or extend_fields(self.outgoing, self.way.axis)
 
     @functools.cached_property
     def values(self) -> Tensor:
@@ -96,14 +96,14 @@ class Sampler:
         row, column = across(self.way.axis)
         slices = cells.permute(1 + self.way.axis, 0, 1 + row, 1 + column)
         order = order_of_slices(cells.shape[1 + self.way.axis], self.way, cells.device)
-        return subdivide(slices.index_select(0, order), self.steps, self.emission.third_order)
+        return subdivide(slices.index_select(0, order), self.steps, self.outgoing.third_order)
 
     def sample(
         self, values: Tensor, rays: Rays, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
         """`values` as [N, channels, R], and distances [N, R], at the nodes of `rays`."""
-        axis, planes, grid = self.way.axis, self.planes[:, None], self.emission.grid
-        third_order = self.emission.third_order
+        axis, planes, grid = self.way.axis, self.planes[:, None], self.outgoing.grid
+        third_order = self.outgoing.third_order
         axes: tuple[int, ...] = (0, 1, 2) if axis is None else across(axis)
         if axis is None:
             distance = near + planes * (far - near)

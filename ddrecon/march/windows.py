@@ -13,8 +13,8 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import fill
 from ddrecon.march.box import cross_box
-from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import Sight, look_along, parts_of
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import reflectance, refract
@@ -105,7 +105,7 @@ def _open(rays: Rays, grid: Grid, index: float, settings: RenderSettings) -> tup
 
 def see_through(
     window: Window,
-    emission: Emission,
+    outgoing: OutgoingLight,
     light: Tensor,
     medium: Medium,
     background: Tensor | None,
@@ -127,4 +127,4 @@ def see_through(
     behind = window.reflected * along.sum(0).clamp(min=0)
     if background is not None:
         behind = behind + (1 - window.reflected) * medium.index**2 * background
-    return window.passed * march(emission, window.sight, settings, behind)
+    return window.passed * march(outgoing, window.sight, settings, behind)

@@ -12,9 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import PhaseFunction, remember_of_phase
+from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
+from ddrecon.medium.phase_cells import count_powers, is_scaled, number_place, number_table
 from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
-from ddrecon.numerics.chebyshev import evaluate_positive, extrema
+from ddrecon.numerics.chebyshev import (
+    COEFFICIENTS,
+    depth_at,
+    depth_place,
+    evaluate,
+    extrema,
+    sum_series,
+)
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.legendre import even_angles, legendre_at_even_angles, series_weights
 
@@ -24,43 +32,50 @@ class SeenPhase:
     """A phase function as view rays see light of beams scattered by it.
 
     `phase`: the function; `degree`: light is known to this degree in angle, and peaks beyond it
-    count as not scattered.
+    count as not scattered. Where `phase` differs from cell to cell, `number` [N, 1 or C, R] is that
+    of its numbers which does, at N nodes of R rays.
     """
 
     phase: PhaseFunction
     degree: int
+    number: Tensor | None = None
 
-    @property
-    def colors(self) -> int:
-        """How many colors have a phase function of their own: 1 where all share one."""
-        return self.phase.colors
+    def along(self, depth: Tensor | None, cosine: Tensor) -> Tensor:
+        """S at `depth` [N, C, R], or p where that is None, along rays of one `cosine` [R] each.
 
-    def value(self, cosine: Tensor) -> Tensor:
-        """p, [C, *cosine.shape]: what is scattered where no peak was scaled out."""
-        return self.phase.value(cosine)
-
-    def along(self, depth: Tensor, cosine: Tensor) -> Tensor:
-        """S at `depth` [N, C, R] along R rays, each with one `cosine` [R]."""
-        return evaluate_positive(self.polynomials(cosine)[:, None], depth)
-
-    def polynomials(self, cosine: Tensor) -> Tensor:
-        """Coefficients [COEFFICIENTS, C, R] of S along rays, each with one `cosine` [R]."""
-        found = look_up(self.table(has_peak=True).to(cosine.dtype), angle_of(cosine))
-        return found.permute(2, 0, 1)
+        It is [N, C, R], or without depth and number [C, R].
+        """
+        if depth is None and self.number is None:
+            return self.phase.value(cosine)
+        return self._look_up(angle_of(cosine)[None], depth, cosine)
 
     def at_angles(self, depth: Tensor | None, angle: Tensor) -> Tensor:
         """S, or p where `depth` is None, [N, C, R] at `depth` [N, C, R] and `angle` [N, R]."""
-        found = look_up(self.table(depth is not None).to(angle.dtype), angle.double())
-        if depth is None:
-            return found[..., 0].movedim(0, 1)
-        return evaluate_positive(found.permute(3, 1, 0, 2), depth)
+        return self._look_up(angle, depth, angle.cos()[:, None])
+
+    def _look_up(self, angle: Tensor, depth: Tensor | None, cosine: Tensor) -> Tensor:
+        """As `at_angles`, with one `angle` [1, R] for all nodes of a ray as well."""
+        has_peak, terms = depth is not None, 1 if depth is None else COEFFICIENTS
+        coefficients = look_up(self.table(has_peak).to(cosine.dtype), angle.double())
+        rows = coefficients.permute(3, 1, 0, 2).unflatten(0, (-1, terms))
+        seen = [row[0] if depth is None else evaluate(row, depth_place(depth)) for row in rows]
+        if self.number is None:
+            return seen[0].clamp(min=0) if has_peak else seen[0]
+        kind = self.phase.kind
+        value = sum_series(seen, number_place(kind, self.number))
+        value = value.clamp(min=0) if has_peak else value
+        return henyey_greenstein(cosine, self.number) * value if is_scaled(kind) else value
 
     def table(self, has_peak: bool) -> Tensor:
-        """Of S its polynomials, [C, steps + 1, 2, COEFFICIENTS], or of p the values, [..., 1].
+        """Of S its coefficients, [C, steps + 1, 2, K], or without a peak of p the values.
 
-        At even angles, with slopes by the angle (`numerics.angle_table`), in double precision.
+        At even angles, with slopes by the angle (`numerics.angle_table`), in double precision. Of a
+        phase function that differs from cell to cell K is as `number_table` has it.
         """
-        return peak_table(self.phase, self.degree) if has_peak else _plain_table(self.phase)
+        make, degree = (peak_table, (self.degree,)) if has_peak else (_plain_table, ())
+        if self.phase.cells is None:
+            return make(self.phase, *degree)
+        return number_table(self.phase, make, count_powers(self.phase, has_peak), 1, *degree)
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
@@ -96,9 +111,9 @@ def _plain_table(phase: PhaseFunction) -> Tensor:
 @remember_of_phase
 def peak_table(phase: PhaseFunction, degree: int) -> Tensor:
     """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of a phase function."""
-    depths, inverse = (each.to(phase.numbers[0].device) for each in extrema())
+    places, inverse, _ = (array.to(phase.numbers[0].device) for array in extrema(COEFFICIENTS))
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].
-    series = peaked_series(in_double(phase), degree, depths[None, :, None])
+    series = peaked_series(in_double(phase), degree, depth_at(places)[None, :, None])
     coefficients = (inverse @ series).mT
     curves = legendre_at_even_angles(STEPS, coefficients.shape[1])
     return torch.stack([rows.to(coefficients) @ coefficients for rows in curves], 2)

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import P1_DEGREE, Medium
-from ddrecon.medium.phase import PhaseFunction, remember_of_phase
-from ddrecon.numerics.angle_table import STEPS
-from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
+from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
+from ddrecon.medium.phase_cells import count_powers, is_scaled, number_place, number_table
+from ddrecon.numerics.angle_table import STEPS, look_up
+from ddrecon.numerics.chebyshev import sum_series
+from ddrecon.numerics.legendre import legendre, legendre_at_even_angles, series_weights
 from ddrecon.numerics.remember import is_any_nonzero
 
 
@@ -75,3 +77,20 @@ def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
     weights = series_weights((phase.moments(count).double() - forward) * spread**turns)
     curves = legendre_at_even_angles(STEPS, count)
     return torch.stack([weights @ rows.to(weights).T for rows in curves], -1)[..., None]
+
+
+def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
+    """How light turned so often scatters by `angle` [z, y, x] in cells, [C, z, y, x] (E8.12)."""
+    phase, degree = medium.seen.phase, medium.seen.degree
+    number, kind, cosine = phase.cells, phase.kind, angle.cos().to(phase.numbers[-1])
+    assert number is not None
+    powers = count_powers(phase, has_peak=True)
+    table = number_table(phase, turned_table, powers, -1, degree, turns).to(number)
+    coefficients = look_up(table, angle.double()).unbind(-1)
+    if not is_scaled(kind):
+        return sum_series(coefficients, number_place(kind, number))
+    turned = sum_series(coefficients, number_place(kind, -number))
+    # Where g is positive nothing is turned back, and the forward peak counts as not scattered.
+    rest = (phase.moments(degree + 1) - phase.peak_tail(degree, 1)).movedim(1, -1)
+    forward = (series_weights(rest) * legendre(cosine, degree + 1)).sum(-1)
+    return torch.where(number < 0, henyey_greenstein(cosine, number) * turned, forward)

@@ -32,31 +32,18 @@ def look_up(table: Tensor, angle: Tensor) -> Tensor:
     The two entries are value and slope by the angle. Values have the precision of `table`.
     """
     colors, steps = len(table), table.shape[1] - 1
-    rows, weights = _cubic(angle.flatten(), steps, math.pi / steps, table.dtype)
+    rows, weights = _cubic(angle.flatten(), steps, table.dtype)
     found = torch.stack([_weigh(curves.flatten(0, 1), rows, weights) for curves in table])
     return found.view(colors, *angle.shape, table.shape[-1])
 
 
-def look_up_between(table: Tensor, place: Tensor, angle: Tensor) -> Tensor:
-    """Values [*angle.shape, K] at `angle`, between the functions of a row of them at `place`.
-
-    `place`, of the shape of `angle`, is 0 at the first function and 1 at the second. `table` [n, 2,
-    steps + 1, 2, K] has each function as `look_up` has it, and its slope by the place.
-    """
-    count, steps = len(table), table.shape[2] - 1
-    rungs, between = _cubic(place.flatten(), count - 1, 1.0, table.dtype)
-    rows, weights = _cubic(angle.flatten(), steps, math.pi / steps, table.dtype)
-    rows = (rungs[:, :, None] * (2 * (steps + 1)) + rows[:, None]).flatten(1)
-    weights = (between[:, :, None] * weights[:, None]).flatten(1)
-    return _weigh(table.flatten(0, 3), rows, weights).view(*angle.shape, table.shape[-1])
-
-
-def _cubic(place: Tensor, steps: int, step: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Rows [N, 4] and weights of Hermite's cubic at `place` [N], of `steps` from 0 on.
+def _cubic(angle: Tensor, steps: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Rows [N, 4] and weights of Hermite's cubic at `angle` [N], of `steps` from 0 to pi.
 
     Values and slopes at both ends of a step, which stand beside each other, are those rows.
     """
-    place = place / step
+    step = math.pi / steps
+    place = angle / step
     first = place.detach().long().clamp(0, steps - 1)
     part = (place - first).to(dtype)
     rest = 1 - part

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -25,23 +26,41 @@ DEEPEST = 1e6
 """Stands for infinite depth."""
 
 
-def evaluate_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
-    """Polynomials of `coefficients` [COEFFICIENTS, ...] at `depth` >= 0, held at zero.
+def depth_place(depth: Tensor) -> Tensor:
+    """x from -1 at a `depth` of 0 to 1 at infinity."""
+    return 1 - 2 * SCALE / (depth + SCALE)
 
-    The others of their axes broadcast against those of `depth`, [N, C, R].
-    """
-    x = 1 - 2 * SCALE / (depth + SCALE)
-    value = coefficients[-1].expand_as(x)
+
+def depth_at(place: Tensor) -> Tensor:
+    """The depth at `place` x."""
+    return (SCALE * (1 + place) / (1 - place)).clamp(max=DEEPEST)
+
+
+def evaluate(coefficients: Tensor, place: Tensor) -> Tensor:
+    """The polynomial of `coefficients` [K, ...], from the constant one on, at `place`."""
+    value = coefficients[-1]
     for coefficient in coefficients[:-1].flip(0):
-        value = torch.addcmul(coefficient, value, x)
-    return value.clamp(min=0)
+        value = torch.addcmul(coefficient, value, place)
+    return value
+
+
+def sum_series(coefficients: Sequence[Tensor], place: Tensor) -> Tensor:
+    """The sum of `coefficients` times Chebyshev's polynomials at `place`, by Clenshaw's rule."""
+    value, before = torch.zeros_like(place), torch.zeros_like(place)
+    for coefficient in reversed(coefficients[1:]):
+        value, before = coefficient + 2 * place * value - before, value
+    return coefficients[0] + place * value - before
 
 
 @functools.cache
 @torch.inference_mode(False)
-def extrema() -> tuple[Tensor, Tensor]:
-    """Depths [COEFFICIENTS] at Chebyshev's extrema, and the matrix from values to coefficients."""
-    angle = torch.arange(COEFFICIENTS, dtype=torch.float64) * (math.pi / (COEFFICIENTS - 1))
-    x = -torch.cos(angle)
-    depths = (SCALE * (1 + x) / (1 - x)).clamp(max=DEEPEST)
-    return depths, torch.linalg.inv(torch.linalg.vander(x))
+def extrema(count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Chebyshev's extrema x [`count`], -1 first, and two matrices from values there.
+
+    They give coefficients of powers, for `evaluate`, and of Chebyshev's series, for `sum_series`.
+    """
+    degrees = torch.arange(count, dtype=torch.float64)
+    angle = degrees.flip(0) * (math.pi / max(1, count - 1)) if count > 1 else degrees + math.pi
+    x = torch.cos(angle)
+    series = torch.linalg.inv(torch.cos(degrees * angle[:, None]))
+    return x, torch.linalg.inv(x[:, None] ** degrees), series

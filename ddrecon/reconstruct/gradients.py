@@ -7,7 +7,7 @@ not grow with the number of views, and the adjoint (E3.2) is solved once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -34,6 +34,15 @@ class Differentiated:
     gradients: dict[str, Tensor]
 
 
+@dataclass(frozen=True)
+class Cut:
+    """A light field cut off from its graph: `leaves` stand for those `tensors` that have one."""
+
+    light_field: LightField
+    tensors: list[Tensor]
+    leaves: list[Tensor]
+
+
 def differentiate(
     scene: Scene,
     names: Sequence[str],
@@ -47,28 +56,27 @@ def differentiate(
     The views are shared out over ranks, which sum what reaches the light field; its way back is the
     same on all of them.
     """
-    # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
-    tensors, leaves = list[Tensor](), list[Tensor]()
-    light_field = _cut(solve_light(with_values(scene, values), memory), tensors, leaves)
+    cut = follow_light(scene, values, memory)
     outside = {name: value for name, value in values.items() if not is_of_volume(name)}
-    inputs = [*values.values(), *leaves]
-    # Views share what is made of values: so that each has a graph of its own, it is made anew.
-    worlds = ((with_values(scene, outside), name) for name in own_views(scene, names))
-    images, loss, sums = _differentiate_views(worlds, light_field, inputs, loss_of)
-    (total, *sums) = sum_present([loss, *sums], [loss, *inputs])
-    direct, leaf_bars = sums[: len(values)], sums[len(values) :]
-    # What reached the leaves goes back through the light field, and so through the solve (E3.2).
-    pairs = zip(tensors, leaf_bars, strict=True)
-    reached = [(tensor, bar) for tensor, bar in pairs if bar is not None]
-    # Nobody else holds it on its way: its memory is free as soon as it has been of use.
-    del light_field, tensors, leaves, inputs, sums, leaf_bars, pairs
-    if reached:
-        # As cotangents of their own, bars would have torch import a system for algebra.
-        product = torch.stack([(bar * tensor).sum() for tensor, bar in reached]).sum()
-        reached.clear()
-        through_light = torch.autograd.grad(product, list(values.values()), allow_unused=True)
-        # The derivative is the sum of both ways.
-        direct = _add(direct, through_light)
+    inputs = [*values.values(), *cut.leaves]
+    sums: list[Tensor | None] = [None] * len(inputs)
+    images, loss = list[Tensor](), cut.light_field.diffuse.new_zeros(())
+    added = set[int]()
+    for name in own_views(scene, names):
+        # Views share what is made of values: so that each has a graph of its own, it is made anew.
+        world = with_values(scene, outside)
+        image, view_loss, bars = differentiate_view(cut.light_field, world, name, loss_of, inputs)
+        images.append(image)
+        loss = loss + view_loss
+        _accumulate(sums, bars, added)
+        del bars
+    total, *sums = sum_present([loss, *sums], [loss, *inputs])
+    direct, leaf_bars, tensors = sums[: len(values)], sums[len(values) :], cut.tensors
+    # Only `tensors` holds the light field on the way back: its memory is free once it was of use.
+    del cut, inputs, sums
+    through_light = follow_back(tensors, leaf_bars, list(values.values()))
+    # The derivative is the sum of both ways.
+    direct = _add(direct, through_light)
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -76,39 +84,71 @@ def differentiate(
     return Differentiated(images, loss if total is None else total, agree_on(gradients))
 
 
-def _differentiate_views(
-    worlds: Iterable[tuple[Scene, str]],
-    light_field: LightField,
-    inputs: Sequence[Tensor],
-    loss_of: Callable[[View, Tensor], Tensor],
-) -> tuple[list[Tensor], Tensor, list[Tensor | None]]:
-    """The images of views, the sum of their losses, and its derivatives by `inputs`.
+def follow_light(scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory) -> Cut:
+    """The light in `scene` with `values`, held for views as if it were given."""
+    tensors, leaves = list[Tensor](), list[Tensor]()
+    light_field = _cut(solve_light(with_values(scene, values), memory), tensors, leaves)
+    return Cut(light_field, tensors, leaves)
 
-    `worlds` are scenes, and which of their views is rendered. Each view's derivative is added up at
-    once; None is zero.
+
+def differentiate_view(
+    light_field: LightField,
+    scene: Scene,
+    name: str,
+    loss_of: Callable[[View, Tensor], Tensor],
+    inputs: Sequence[Tensor],
+) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
+    """The image and the loss of the view called `name`, and the derivatives by `inputs`.
+
+    None is zero.
     """
-    sums: list[Tensor | None] = [None] * len(inputs)
-    owned = set[int]()
-    images, loss = list[Tensor](), light_field.diffuse.new_zeros(())
-    for scene, name in worlds:
-        view = scene.view(name)
-        derivatives = scene.optimize.derivatives if scene.optimize else "all"
-        image = view_picture(light_field, scene, view, derivatives)
-        view_loss = loss_of(view, image)
-        if view_loss.requires_grad:
-            for i, bar in enumerate(torch.autograd.grad(view_loss, inputs, allow_unused=True)):
-                known = sums[i]
-                if known is None or bar is None:
-                    sums[i] = bar if known is None else known
-                elif i in owned:
-                    known += bar
-                else:
-                    # autograd may hand out one tensor for two inputs: what is added to is a sum
-                    sums[i] = known + bar
-                    owned.add(i)
-        images.append(image.detach())
-        loss = loss + view_loss.detach()
-    return images, loss, sums
+    view = scene.view(name)
+    derivatives = scene.optimize.derivatives if scene.optimize else "all"
+    image = view_picture(light_field, scene, view, derivatives)
+    loss = loss_of(view, image)
+    bars: Sequence[Tensor | None] = [None] * len(inputs)
+    if loss.requires_grad:
+        bars = torch.autograd.grad(loss, inputs, allow_unused=True)
+    return image.detach(), loss.detach(), bars
+
+
+def follow_back(
+    tensors: list[Tensor],
+    bars: Sequence[Tensor | None],
+    values: Sequence[Tensor],
+    is_last: bool = True,
+) -> Sequence[Tensor | None]:
+    """The derivatives by `values` of what reached `tensors` of the light, through the solve (E3.2).
+
+    Where it `is_last`, the graph of the light goes, and `tensors` are forgotten.
+    """
+    pairs = zip(tensors, bars, strict=True)
+    reached = [(tensor, bar) for tensor, bar in pairs if bar is not None]
+    if is_last:
+        tensors.clear()
+    if not reached:
+        return [None] * len(values)
+    # As cotangents of their own, bars would have torch import a system for algebra.
+    product = torch.stack([(bar * tensor).sum() for tensor, bar in reached]).sum()
+    reached.clear()
+    return torch.autograd.grad(product, values, allow_unused=True, retain_graph=not is_last)
+
+
+def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]) -> None:
+    """Adds `bars` to `sums`, entry by entry; None is zero.
+
+    In place where a sum is one of ours, as those numbered `added` are: autograd may hand out one
+    tensor for two inputs.
+    """
+    for i, bar in enumerate(bars):
+        known = sums[i]
+        if known is None or bar is None:
+            sums[i] = bar if known is None else known
+        elif i in added:
+            known += bar
+        else:
+            sums[i] = known + bar
+            added.add(i)
 
 
 def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:

@@ -1,4 +1,4 @@
-"""What a reconstruction comes to: its log, one row an iteration, their sum, and the result."""
+"""The log of a reconstruction, one row an iteration, their sum, and the result."""
 
 from __future__ import annotations
 

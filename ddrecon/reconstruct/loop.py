@@ -21,11 +21,12 @@ from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
-from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
+from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row
 from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.recording import Replays
 from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
 from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene
@@ -205,7 +206,8 @@ class Reconstruction:
         self.stage, self.level = stage, self.problem.at(stage)
         volume = self.level.train.volume
         # These belong to another resolution.
-        self.memory.last, self.numbers.curvatures = {}, {}
+        self.memory.last, self.memory.iterations, self.numbers.curvatures = {}, {}, {}
+        self.replays = Replays(self.level.train)
         for parameter in self.parameters:
             if parameter.grid != volume.grid:
                 parameter.refine(volume.grid)
@@ -216,9 +218,8 @@ class Reconstruction:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
-        names = [view.name for view in compared.views]
         try:
-            return differentiate(self.level.train, names, values, compared, self.memory)
+            return self.replays.differentiate(values, compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
             compared.require_finite()

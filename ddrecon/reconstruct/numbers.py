@@ -35,7 +35,7 @@ from ddrecon.variables.values import with_values
 
 
 def single_numbers(parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Those of `parameters` that are no field and no map."""
+    """The `parameters` that are neither fields nor maps."""
     return [p for p in parameters if not p.is_field and p.value.ndim < 2]
 
 

@@ -46,14 +46,28 @@ class Comparison:
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its `image` add to the objective: its share, by weight, of the mean."""
-        target, seen = self.targets[view.name], image.detach()
-        self.pictures[view.name] = seen
-        value = self.share(view) * target.loss_of(image)
-        self.metrics["loss"].append(value.detach())
-        self.metrics["psnr"].append(target.psnr_of(seen))
+        loss = self.loss_of(view, image)
+        self.note(view, image.detach(), loss.detach())
+        return loss
+
+    def loss_of(self, view: View, image: Tensor) -> Tensor:
+        """The same, of which nothing is kept."""
+        return self.share(view) * self.targets[view.name].loss_of(image)
+
+    def note(self, view: View, image: Tensor, loss: Tensor) -> None:
+        """Keeps the `image` of `view`, the `loss` that it adds, and its quality."""
+        target = self.targets[view.name]
+        self.pictures[view.name] = image
+        self.metrics["loss"].append(loss)
+        self.metrics["psnr"].append(target.psnr_of(image))
         if "ssim" in self.metrics:
-            self.metrics["ssim"].append(target.ssim_of(seen))
-        return value
+            self.metrics["ssim"].append(target.ssim_of(image))
+
+    def forget(self) -> None:
+        """Forgets all images."""
+        self.pictures.clear()
+        for numbers in self.metrics.values():
+            numbers.clear()
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""

@@ -1,4 +1,4 @@
-"""What is optimized: a value with its bounds and penalties, its Adam state and its resolution."""
+"""A parameter: a value with its bounds and penalties, its Adam state and its resolution."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Parameter:
 
     @property
     def largest_rate(self) -> float:
-        """Its learning rate, or the largest of its entries."""
+        """The learning rate, or the largest of its entries."""
         return self.rate if isinstance(self.rate, float) else float(self.rate.max())
 
     def step(self, gradient: Tensor, rate: float, power: float = 0.0) -> None:

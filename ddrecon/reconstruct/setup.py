@@ -1,4 +1,4 @@
-"""What a reconstruction starts from: its views, its parameters, and whether they are of use."""
+"""The start of a reconstruction: its views, its parameters, and whether they are usable."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Problem:
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 
     def at(self, stage: int) -> Level:
-        """It at the resolution of `stage`."""
+        """The problem at the resolution of `stage`."""
         factor = self.factors[stage]
         train, test = (scene_at_level(scene, factor) for scene in (self.train, self.test))
         if self.support is not None:

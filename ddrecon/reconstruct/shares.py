@@ -13,7 +13,7 @@ from ddrecon.scene import Scene, View
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
-    """Those of the views of `scene` called `names` that this rank renders, in their order.
+    """The views of `scene` called `names` that this rank renders, in their order.
 
     One that is named twice is rendered twice, by the same rank.
     """

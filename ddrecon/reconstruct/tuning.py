@@ -13,12 +13,12 @@ BETAS = (0.9, 0.99)
 """How much Adam's moments keep of themselves in a step; the second less than customary, since runs
 are short."""
 FLOOR = 0.3
-"""What is added to the size of a cell's derivative, as a part of the root mean square of all.
+"""Added to the size of a cell's derivative, as a part of the root mean square of all.
 
-So cells that no picture says much of are not moved as far as any by what noise says.
+So noise moves cells of which pictures say little less far than others.
 """
 STIFFNESS = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
-"""What part of smoothing's stiffness is added to it besides. Derived, not chosen: half of it
+"""The part of smoothing's stiffness that is added as well. Derived, not chosen: half of it
 is where steps neither swell nor fade, in a field that smoothing alone moves."""
 WARM_UP = 5
 """Iterations at a resolution over which rates rise to their value: Adam's first steps are all of
@@ -33,7 +33,7 @@ LARGEST_STEP = 4.0
 LEVEL_RATE = 0.05
 """The rate of a field's level, as a part of it."""
 REFRESH = 16
-"""Iterations after which a picture's curvature is found anew: sooner, early at a resolution. With 4
+"""Iterations after which a picture's curvature is renewed: sooner, early at a resolution. With 4
 results are the same, and take longer."""
 APART, CLOSE = 0.5, 1e-5
 """Parts of a default rate by which differences of pictures are taken, and the largest tolerance of
@@ -53,8 +53,7 @@ PLANNED, MOST_ITERATIONS = 300, 1000
 """A run that ends by itself refines and slows down as one of so many iterations, or sooner; and
 makes at most so many."""
 WINDOW, FALL = 20, 0.01
-"""Iterations over which the loss has to fall, by more than this part of itself; else it has come to
-rest."""
+"""Iterations over which the loss must fall by more than this part of itself, or it is at rest."""
 FEWEST_CELLS, FEWEST_PIXELS = 8, 16
 """No side of a grid or image longer than these is coarsened below them."""
 GRADIENT_ERROR = 0.01

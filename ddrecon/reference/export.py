@@ -37,7 +37,7 @@ KINDS = {plugin: kind for kind, plugins in PLUGINS.items() for plugin in plugins
 VECTORS = {"position": "point", "direction": "vector"}
 NUMBERS: dict[type, str] = {bool: "boolean", int: "integer", float: "float", str: "string"}
 Arrays = dict[Path, np.ndarray]
-"""What belongs in files beside the XML."""
+"""Kinds that are written to files beside the XML."""
 
 
 def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:

@@ -15,7 +15,7 @@ from ddrecon.turntable import upright_axis
 HEIGHT = 600
 """Pixels of the frame."""
 SIDEWAYS = (0.5, 0.4, 1.0)
-"""Where a volume without cameras is looked at from."""
+"""The direction from which a volume without cameras is seen."""
 FIELDS = ("density", "sigma_a", "sigma_s")
 
 

@@ -16,9 +16,9 @@ from ddrecon.io.files.atomic import replace_file
 
 ASSETS = resources.files("ddrecon.report") / "assets"
 SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "film.js", "page.js")
-"""What makes a page alive, in the order in which one needs the other."""
+"""Scripts of a live page, in the order in which one needs the other."""
 REFRESH = '<meta http-equiv="refresh" content="30">'
-"""What has a browser load a page again and again."""
+"""Makes a browser reload a page."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\

@@ -23,12 +23,12 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
 FORMAT = 8
-"""What a checkpoint holds; counts up when that changes."""
+"""The version of a checkpoint's contents."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
 ANEW = "start anew with --overwrite"
 UNUSABLE = f"not a usable checkpoint; {ANEW}"
-"""What is wrong with a damaged checkpoint, and what to do."""
+"""The fault of a damaged checkpoint, and what to do."""
 MOST_CHANGES = 5
 """Differences that are named."""
 LONGEST_VALUE = 80

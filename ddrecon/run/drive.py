@@ -26,7 +26,7 @@ from ddrecon.scene_file.load import SceneFile, referenced_files
 from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
-"""What the progress bar of a run is called that is no frame of a film."""
+"""The title of the progress bar of a run that is no frame of a film."""
 
 
 def open_run(

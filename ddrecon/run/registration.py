@@ -25,7 +25,7 @@ from ddrecon.variables.kinds import pose_rate
 from ddrecon.variables.values import extinction_of, with_values
 
 STEPS = 8
-"""At most; they end when one makes nothing better."""
+"""The most steps; they end when one improves nothing."""
 DAMPING = 1e-3
 """Curvature added to all, as a part of the largest: what a picture does not show stays."""
 LARGEST_STEP = 40.0

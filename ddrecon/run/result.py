@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ddrecon.scene import Scene
 
 RESULT = "result.yaml"
-"""What the file is called in a run's folder."""
+"""The name of the file in a run's folder."""
 
 
 def require_no_film(folder: Path, more: str = "") -> None:

@@ -12,7 +12,7 @@ All but the recurrence I_out = passed I_in + source is computed at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,10 +36,8 @@ Ends = tuple[Tensor, Tensor, Tensor]
 """
 DOUBLINGS, MOST_LAPS = 10, 64
 """Light that goes around is followed for 2^10 periods where it keeps to whole cells; else until
-nothing more comes, or for so many.
+nothing more comes but rounding, or for so many.
 """
-LEFT = 1e-9
-"""What is nothing, as a part of the most light."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +48,14 @@ class Course:
     `drift`: by how many rows and columns light moves from one slice to the next, with signs, at
     most 1; `step`: the length of its path between them [u]. Both are numbers, or tensors of a
     direction that may be varied. `wraps`: whether what leaves the last slice, row or column enters
-    the first.
+    the first. `count`: that of slices.
     """
 
     order: tuple[int, int, int, int]
     forward: int
     drift: tuple[Any, Any]
     step: Any
+    count: int
     wraps: tuple[bool, bool, bool] = (False, False, False)
 
     @staticmethod
@@ -73,13 +72,15 @@ class Course:
             slicing.order[dim] - 1 in grid.periodic for dim in (SLICES, ROWS, COLUMNS)
         )
         forward, wraps = -1 if slicing.is_reversed else 1, (slices, rows, columns)
-        return Course(slicing.order, forward, (row, column), 1 / fastest, wraps)
+        count = grid.shape[slicing.axis]
+        return Course(slicing.order, forward, (row, column), 1 / fastest, count, wraps)
 
     @staticmethod
     def along(grid: Grid, direction: Tensor) -> Course:
         """The same of unit `direction` [3], which may be varied."""
         slicing, (row, column), step = cross_grid(grid, direction)
-        return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), step)
+        forward = -1 if slicing.is_reversed else 1
+        return Course(slicing.order, forward, (row, column), step, grid.shape[slicing.axis])
 
     @property
     def axes(self) -> list[int]:
@@ -148,9 +149,15 @@ def follow(
     Slice after slice I_out = `passed` I_in + `source`. Through the box's faces enters what is at
     the `ends`, None for nothing.
     """
-    across, *sides = ends or (torch.zeros_like(source[0]), None, None)
+    nothing = torch.zeros_like(source[0])
+    across, *sides = ends or (nothing, None, None)
+
+    def leave(entering: Sequence[Tensor], is_dark: bool = False) -> list[Tensor]:
+        emitted, besides = (0 * source, (None, None)) if is_dark else (source, sides)
+        return [_follow_once(passed, emitted, course, entering[0], besides)[1][0]]
+
     if course.wraps[0]:
-        across = _enter_again(passed, source, course)
+        (across,) = enter_again(leave, [course], [nothing])
     entered, gone = _follow_once(passed, source, course, across, sides)
     return torch.stack(entered[:: course.forward]), gone
 
@@ -185,20 +192,49 @@ def _follow_once(
     return entered, (arriving, rows, columns)
 
 
-def _enter_again(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-    """What enters the first slice where the last comes before it: light from all periods."""
-    nothing, count = torch.zeros_like(source[0]), len(passed)
-    _, (entering, *_) = _follow_once(passed, source, course, nothing)
-    if any(drift % 1 for drift in course.drift):
-        for _ in range(MOST_LAPS):
-            before = entering
-            _, (entering, *_) = _follow_once(passed, source, course, before)
-            if bool((entering - before).abs().max() <= LEFT * entering.abs().max()):
-                break
+def enter_again(
+    leave: Callable[..., list[Tensor]], courses: Sequence[Course], nothing: Sequence[Tensor]
+) -> list[Tensor]:
+    """What enters the first slices of `courses` where the last come before them, of all periods.
+
+    `leave` tells what leaves the last slices for what enters the first; if it `is_dark`, without
+    what is emitted. `nothing`: where none enters, [C, rows, columns] each.
+    """
+    first = entering = leave(nothing)
+    is_whole = [not any(drift % 1 for drift in course.drift) for course in courses]
+    # Each goes around until it is at rest, whatever the others do.
+    rests = list(is_whole)
+    for _ in range(MOST_LAPS):
+        if all(rests):
+            break
+        before, after = entering, leave(entering)
+        entering = [
+            old if rest else new for old, new, rest in zip(before, after, rests, strict=True)
+        ]
+        rests = [
+            rest or _is_at_rest(old, new)
+            for rest, old, new in zip(rests, before, after, strict=True)
+        ]
+    if not any(is_whole):
         return entering
     # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
-    _, (share, *_) = _follow_once(passed, 0 * source, course, torch.ones_like(nothing))
-    moved = [count * int(drift) for drift in course.drift]
+    shares = leave([torch.ones_like(one) for one in nothing], is_dark=True)
+    return [
+        _double(one, share, course) if is_so else slanted
+        for one, share, course, is_so, slanted in zip(
+            first, shares, courses, is_whole, entering, strict=True
+        )
+    ]
+
+
+def _is_at_rest(before: Tensor, after: Tensor) -> bool:
+    rounding = torch.finfo(after.dtype).eps
+    return bool((after - before).abs().max() <= rounding * after.abs().max())
+
+
+def _double(entering: Tensor, share: Tensor, course: Course) -> Tensor:
+    """Light of 2^DOUBLINGS periods, of what is `entering` after one and the `share` that passes."""
+    moved = [course.count * int(drift) for drift in course.drift]
     for _ in range(DOUBLINGS):
         entering = entering + share * entering.roll(moved, (1, 2))
         share = share * share.roll(moved, (1, 2))

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
-from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Cut, add, cut, fill, weigh
+from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.constants import constant
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.periods import apply_around
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -52,6 +52,8 @@ def sweep(
     `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
     grid, (count, colors) = medium.grid, source.shape[:2]
+    if is_fused():
+        return _sweep_fused(medium, source, gradient, inflow, directions, mirror)
     courses, weights, values = sweep_rule(directions, count)
     values = values.to(source)
     moments = source.new_zeros(count, colors * grid.cells)
@@ -72,6 +74,28 @@ def sweep(
     return moments.view(count, colors, *grid.shape)
 
 
+def _sweep_fused(
+    medium: Medium,
+    source: Tensor,
+    gradient: Tensor,
+    inflow: Tensor | None,
+    directions: int,
+    mirror: Mirror | None,
+) -> Tensor:
+    """The same by fused kernels."""
+    from ddrecon.transport.fused.faces import sweep_faces
+    from ddrecon.transport.fused.sweep import sweep_fused
+
+    given = medium, source, gradient, inflow, directions
+    if mirror is None:
+        if not medium.grid.periodic:
+            return sweep_fused(*given)
+        return sweep_faces(*given, None)[0]
+    moments, gone = sweep_faces(*given, [mirror.entering(n) for n in range(directions)])
+    mirror.left.extend(gone)
+    return moments
+
+
 def sweep_change(
     medium: Medium,
     light: Cut,
@@ -90,24 +114,27 @@ def sweep_change(
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
     gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
-    traits = {"periodic": bool(medium.grid.periodic), "refracting": mirror is not None}
-    if has_kernels("transport rounds", gpu=light[0].is_cuda, **traits):
-        from ddrecon.transport.fused.sweep import sweep_fused
-
-        if medium.is_cellwise:
-            # the kernels' factors are the same everywhere: what scatters is summed before
-            source = cut(add(weigh(torch.cat(light), factors), torch.cat(source)))
-            factors = torch.zeros_like(factors[..., :1, :1, :1])
-        return sweep_fused(medium, light, factors, source, gradient, inflow, directions)
-    phi = torch.cat(light)
-    scatters = fill(add(weigh(phi, factors), torch.cat(source)), medium.degree)
+    scatters = fill(_scatter(light, source, factors), medium.degree)
     if mirror is not None:
-        mirror.begin(_without(fill(phi, medium.degree), inflow))
+        mirror.begin(_without(fill(torch.cat(light), medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
     if mirror is not None:
         mirror.end(_without(swept, inflow))
     low, high = cut(swept)
-    return add(low, -light[0]), high
+    return low - light[0] if len(low) == len(light[0]) else add(low, -light[0]), high
+
+
+def _scatter(light: Cut, source: Cut, factors: Tensor) -> Tensor:
+    """p_l phi_k + Q_k (E2.8), [K, C, z, y, x]; moments that one of them lacks are zero there."""
+    parts = list[Tensor]()
+    by_part = cut(by_harmonic(factors, len(factors) - 1))
+    for phi, q, factor in zip(light, source, by_part, strict=True):
+        few = min(len(phi), len(q))
+        both = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, factor, phi))
+        parts.append(torch.addcmul(*both) if few else phi[:0])
+        parts.append(q[few:] if len(q) > few else factor[few : len(phi)] * phi[few:])
+    parts = [part.expand(-1, *light[0].shape[1:]) for part in parts if len(part)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _without(light: Tensor, inflow: Tensor | None) -> Tensor:
@@ -128,8 +155,8 @@ def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
         from ddrecon.kernels.cell_function import apply_cell
 
         scale = extinction.scale.view(1, -1)
-        depths = scale.new_tensor(steps)[:, None] * scale
-        numbers = torch.cat([depths, (2 * scale.new_tensor(shares)[:, None]).expand_as(depths)])
+        depths = constant(steps, scale)[:, None] * scale
+        numbers = torch.cat([depths, (2 * constant(shares, scale)[:, None]).expand_as(depths)])
         name = "transport/fused/steep.h", "Steep", 3
         return torch.stack(apply_cell(*name, numbers, extinction.field, *gradient))
 

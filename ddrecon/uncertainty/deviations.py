@@ -1,4 +1,4 @@
-"""What experiments say of each cell and number: deviations, and how often they held (E11.4).
+"""Deviations of each cell and number by experiments, and how often they held (E11.4).
 
 A cell's deviation is the root mean square of the experiments' errors in the cells around it, times
 a factor for its class, times `RATIO`.

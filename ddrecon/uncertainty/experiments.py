@@ -32,7 +32,7 @@ MOST_ROUNDS = 16
 PROBES = 3
 """Random pictures by which it is found what pictures tell of each cell."""
 STATE = ("count", "errors", "truth", "information")
-"""What a checkpoint keeps besides the experiment that goes on."""
+"""The state that a checkpoint keeps besides the current experiment."""
 
 
 class Uncertainty:

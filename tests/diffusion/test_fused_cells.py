@@ -1,6 +1,7 @@
 """Fused kernels of D, system and flux compute what torch does: values and cotangents."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -29,16 +30,22 @@ each_colors = pytest.mark.parametrize("colors", COLORS, ids=str)
 
 
 def make_medium(
-    shape: Shape, colors: int, *, has_fields: bool, dtype: torch.dtype, shift: float = 0.0
+    shape: Shape,
+    colors: int,
+    *,
+    has_fields: bool,
+    dtype: torch.dtype,
+    periodic: tuple[int, ...] = (),
 ) -> tuple[Medium, list[Tensor]]:
     """A medium, empty in parts, and its leaves: density and, last, cross sections and g."""
     cells = shape if has_fields else ()
     sigma_a, sigma_s = (random_values(colors, *cells, seed=s, dtype=dtype) for s in (7, 8))
-    density = 5 * half_empty(*shape, dtype=dtype) - shift
+    density = 5 * half_empty(*shape, dtype=dtype)
     leaves = [density, sigma_a, 6 * sigma_s, density.new_tensor(0.4)]
     for leaf in leaves:
         leaf.requires_grad_()
-    return scale_medium(Volume(box_grid(shape), *leaves)), leaves
+    grid = replace(box_grid(shape), periodic=periodic)
+    return scale_medium(Volume(grid, *leaves)), leaves
 
 
 def make_problem(
@@ -69,11 +76,18 @@ def weigh(results: list[Tensor], leaves: list[Tensor]) -> Found:
 
 
 def problem_of(
-    engine: str, shape: Shape, colors: tuple[int, int], kind: tuple[bool, bool], dtype: torch.dtype
+    engine: str,
+    shape: Shape,
+    colors: tuple[int, int],
+    kind: tuple[bool, bool],
+    dtype: torch.dtype,
+    periodic: tuple[int, ...] = (),
 ) -> Found:
     """System and flux, with the derivatives by density, sections, g, Q0, Q1, outside and L0."""
     use_engine(engine)
-    medium, leaves = make_medium(shape, colors[0], has_fields=kind[0], dtype=dtype)
+    medium, leaves = make_medium(
+        shape, colors[0], has_fields=kind[0], dtype=dtype, periodic=periodic
+    )
     problem, more = make_problem(medium, colors[1], kind[1], dtype)
     operator, right = problem.system
     mean = random_values(*right.shape, seed=5, dtype=dtype).requires_grad_()
@@ -105,6 +119,12 @@ def test_systems_and_fluxes_agree(
     assert_equal(lambda e: problem_of(e, shape, colors, kind, torch.float64), 1e-12)
     if colors == COLORS[-1] and kind == (False, True):
         assert_equal(lambda e: problem_of(e, shape, colors, kind, torch.float32), 1e-5)
+
+
+@pytest.mark.parametrize(("shape", "periodic"), [((5, 4, 9), (0, 2)), ((3, 4, 1), (1, 2))])
+def test_around_a_period_they_agree(shape: Shape, periodic: tuple[int, ...]):
+    kind = False, True
+    assert_equal(lambda e: problem_of(e, shape, (1, 3), kind, torch.float64, periodic), 1e-12)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

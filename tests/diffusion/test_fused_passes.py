@@ -11,6 +11,8 @@ from ddrecon.diffusion.solve import Solution, solve_by_multigrid
 from ddrecon.engine import use_engine
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from as_on_a_gpu import ORDERS, as_on_a_gpu
+
 from ddrecon.diffusion.fused.passes import KernelCycle
 
 pytestmark = pytest.mark.slow
@@ -44,6 +46,15 @@ def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int, wrap
     faces = tuple(c[:colors] for c in operator.conductances)
     operator = Operator(faces, operator.loss[:colors], operator.periodic)
     assert_cycles_agree(operator, random_values(colors, *shape, seed=4) - 0.5)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("wraps", [False, True])
+def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
+    operator, source = patchy_box((7, 8, 9), wraps), random_values(2, 7, 8, 9, seed=4) - 0.5
+    with as_on_a_gpu(order) as headers:
+        assert_cycles_agree(operator, source)
+    assert "diffusion/fused/passes.h" in headers
 
 
 @pytest.mark.parametrize("form", FORMS)

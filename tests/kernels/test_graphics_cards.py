@@ -16,7 +16,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-OF_ROWS = "follow_rows", "return_rows", "multigrid", "prepare"
+OF_ROWS = "follow_rows", "return_rows"
 """Kernels of a processor alone."""
 MOST = {"transpose": (192, 1280)}
 """Registers of a thread and bytes of its stack; of other kernels 128 and 1024, so that two blocks

@@ -14,7 +14,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import follow_point_light, receive_point_light
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.picture import render
 from ddrecon.settings import RenderSettings
@@ -100,8 +100,8 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     beams = (follow_point_light(medium, light_at(position)),)
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
     matter = medium.extinction, medium.scattering
-    emission = Emission(grid, *matter, beams, dark, medium.seen, medium.peak)
-    radiance = media.march_rays(emission, bundle, RenderSettings())[0][0]
+    outgoing = OutgoingLight(grid, *matter, beams, dark, medium.seen, medium.peak)
+    radiance = media.march_rays(outgoing, bundle, RenderSettings())[0][0]
     light = tensor(*position[::-1])
     low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
     one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))

@@ -12,8 +12,8 @@ from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
-from ddrecon.march.emission import Emission, Inflow
 from ddrecon.march.faces import FACES, extend_fields, shine_through
+from ddrecon.march.outgoing import Inflow, OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.settings import RenderSettings
 
@@ -22,7 +22,7 @@ TRAVEL = torch.tensor([-0.6, 0.8, 0.0], dtype=torch.float64)
 POSITION = torch.tensor([0.0, 0.1, 4.0], dtype=torch.float64)
 
 
-def emission_of(diffuse: Tensor, *masses: Tensor) -> Emission:
+def emission_of(diffuse: Tensor, *masses: Tensor) -> OutgoingLight:
     """A thin medium with some diffuse light, one directional and one point light."""
     one = torch.ones(1, dtype=torch.float64)
     density = torch.ones(GRID.shape, dtype=torch.float64)
@@ -33,7 +33,7 @@ def emission_of(diffuse: Tensor, *masses: Tensor) -> Emission:
     ]
     beams = tuple(kind(mass, *rest) for mass, (kind, *rest) in zip(masses, lights, strict=False))
     matter = medium.extinction, medium.scattering
-    return Emission(GRID, *matter, beams, diffuse, medium.seen, medium.peak)
+    return OutgoingLight(GRID, *matter, beams, diffuse, medium.seen, medium.peak)
 
 
 def linear(*point: Tensor) -> Tensor:
@@ -103,13 +103,13 @@ def test_extended_fields_have_both_derivatives(axis: int | None):
 
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
-        emission = emission_of(diffuse, *masses)
+        outgoing = emission_of(diffuse, *masses)
         coming = Inflow(0.2 * depth, rest[5].expand(4, -1, -1, -1, -1), 0.9 * depth, backward)
-        matter = replace(emission.extinction, scale=depth)
-        emission = replace(emission, extinction=matter, scattering=matter, inflow=coming)
-        beam, point = emission.beams
+        matter = replace(outgoing.extinction, scale=depth)
+        outgoing = replace(outgoing, extinction=matter, scattering=matter, inflow=coming)
+        beam, point = outgoing.beams
         beams = replace(beam, direction=places[0]), replace(point, position=places[1])
-        fields = extend_fields(replace(emission, beams=beams), axis)
+        fields = extend_fields(replace(outgoing, beams=beams), axis)
         return fields["diffuse"], fields["mass 0"], fields["mass 1"]
 
     depth = TRAVEL.new_tensor(4.0)

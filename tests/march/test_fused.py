@@ -219,10 +219,10 @@ def test_hard_cases_are_passed(name: str):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, 0, 0, 0, 1, "SAME", 0, 1, 0, (False, True), 32)
-    several = Layout(3, 3, 3, 3, 3, 3, 3, "EVEN", 1, 3, 3, (False, True), 64)
-    steep = Layout(1, 1, 1, 0, 0, 1, 1, "STEEP", 1, 1, 1, (True,), 32)
-    packets = [mark_kernel(32), kernels.integral_kernel(steep, False)]
+    one = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
+    several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)
+    by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
+    packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
     packets += [
         kernels.tangent_kernel(one, Case(False, True, True)),
         kernels.adjoint_kernel(several, Case(False)),

@@ -82,13 +82,13 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     """Pixels of the lattice's own rays are what marching those rays gives."""
     scene = scene_of(view)
     lattice = lattice_of(scene)[0]
-    emission = send(solve_light(scene, SolveMemory()), lattice.rays)
+    outgoing = send(solve_light(scene, SolveMemory()), lattice.rays)
     hit = cross_box(scene.volume.grid, lattice.rays).hit
     places = torch.stack([hit // lattice.shape[1], hit % lattice.shape[1]], -1).double()
     own_places = replace(lattice, places=places)
     monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: own_places)
-    interpolated = march_rays(emission, lattice.rays, INTERPOLATED)
-    own = march_rays(emission, lattice.rays, OWN)
+    interpolated = march_rays(outgoing, lattice.rays, INTERPOLATED)
+    own = march_rays(outgoing, lattice.rays, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 

@@ -14,7 +14,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
-from ddrecon.march.emission import Emission
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
 from ddrecon.scene import Scene
@@ -30,14 +30,14 @@ CAMERAS = {
 each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
 
 
-def emission_of(grid: Grid, density: Tensor) -> Emission:
+def emission_of(grid: Grid, density: Tensor) -> OutgoingLight:
     """A medium under one oblique beam and some smooth diffuse light that grows along x."""
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
     numbers = map(density.new_tensor, ([0.5], [2.0, 3.0], 0.3))
     medium = scale_medium(Volume(grid, density, *numbers))
     diffuse = (1 + grid.centers(density)[2]).expand(2, *grid.shape)
     matter, beams = (medium.extinction, medium.scattering), follow_lights(medium, [light])
-    return Emission(grid, *matter, beams, diffuse, medium.seen, medium.peak)
+    return OutgoingLight(grid, *matter, beams, diffuse, medium.seen, medium.peak)
 
 
 def every_ray(steps: int) -> RenderSettings:
@@ -66,11 +66,11 @@ def chords(grid: Grid, bundle: Rays) -> Tensor:
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera(size=(7, 6), **view))
-    emission = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
-    transmittance = march_rays(emission, bundle, every_ray(steps))[1]
+    outgoing = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
+    transmittance = march_rays(outgoing, bundle, every_ray(steps))[1]
     lengths = chords(grid, bundle)
     assert bool((lengths > 0).any())
-    expected = torch.exp(-emission.extinction.value[:, 0, 0, :1] * lengths)
+    expected = torch.exp(-outgoing.extinction.value[:, 0, 0, :1] * lengths)
     torch.testing.assert_close(transmittance, expected, rtol=1e-12, atol=0)
 
 
@@ -78,8 +78,8 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
 def test_rays_that_miss_the_box_see_nothing(view: dict):
     grid = box_grid((3, 5, 4))
     bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
-    emission = emission_of(grid, 0.1 + half_empty(*grid.shape))
-    scattered, transmittance = march_rays(emission, bundle, every_ray(1))
+    outgoing = emission_of(grid, 0.1 + half_empty(*grid.shape))
+    scattered, transmittance = march_rays(outgoing, bundle, every_ray(1))
     is_miss = chords(grid, bundle) == 0
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
@@ -89,8 +89,8 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
 def test_a_box_behind_the_camera_is_not_seen():
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera())
     away = Rays(bundle.origin, -bundle.direction, bundle.eye)
-    emission = emission_of(grid, 0.1 + half_empty(*grid.shape))
-    scattered, transmittance = march_rays(emission, away, every_ray(1))
+    outgoing = emission_of(grid, 0.1 + half_empty(*grid.shape))
+    scattered, transmittance = march_rays(outgoing, away, every_ray(1))
     assert not scattered.any() and bool((transmittance == 1).all())
 
 

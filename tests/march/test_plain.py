@@ -27,8 +27,8 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.light.point_light import PointBeam
 from ddrecon.lighting import send, solve_light
 from ddrecon.march.box import intersect_box
-from ddrecon.march.emission import Emission
 from ddrecon.march.faces import extend_fields
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
@@ -67,13 +67,19 @@ NUMBERS: dict[type, tuple[str, ...]] = {
 def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
     """Masses are interpolated linearly, and E8.7 is summed itself, in the fast march as well."""
 
-    def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
+    def along(seen: SeenPhase, depth: Tensor | None, cosine: Tensor) -> Tensor:
+        if seen.number is not None:
+            cells = seen.phase.with_cells(seen.number.movedim(1, 0)[..., None])
+            seen = SeenPhase(cells, seen.degree)
+        elif depth is None:
+            return seen.phase.value(cosine)
+        if depth is None:
+            return seen.phase.value(cosine[..., None])[..., 0].movedim(0, 1)
         return summed_series(seen, depth.movedim(1, 0), cosine).movedim(0, 1)
 
     def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
-        if depth is None:
-            return seen.value(angle.cos()).movedim(0, 1)
-        return summed_series(seen, depth.movedim(1, 0), angle.cos()).movedim(0, 1)
+        found = along(seen, depth, angle.cos())
+        return found.movedim(0, 1) if depth is None and seen.number is None else found
 
     monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
     monkeypatch.setattr(SeenPhase, "along", along)
@@ -89,39 +95,39 @@ def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scen
     return replace(scene, lights=lights)
 
 
-def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+def march_plainly(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
     """Radiance [C, R] along `rays` and transmittance [C, R] (E2.1), by so many equal steps each."""
-    grid = emission.grid
+    grid = outgoing.grid
     near, far = intersect_box(grid, rays)
     part = torch.linspace(0, 1, steps + 1, dtype=near.dtype, device=near.device)
     distance = near + part[:, None] * (far - near).clamp(min=0)
     points = rays.origin + distance[..., None] * rays.direction
     # What is between the camera and each node: the integral of the extinction's field, and tau.
-    fields = extend_fields(emission, None)
+    fields = extend_fields(outgoing, None)
     extinction = interpolate(grid, fields["extinction"], points)
     passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
-    scale = emission.extinction.scale.view(-1, 1, 1)
+    scale = outgoing.extinction.scale.view(-1, 1, 1)
     # E2.3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
     field = fields.get("scattering", fields["extinction"])
-    scattering = interpolate(grid, emission.scattering.scale * field, points)
-    by = emission.remaining or emission.scattering
+    scattering = interpolate(grid, outgoing.scattering.scale * field, points)
+    by = outgoing.remaining or outgoing.scattering
     remaining = interpolate(grid, by.scale * fields.get("remaining", field), points)
     emitted = remaining * interpolate(grid, fields["diffuse"], points)
-    seen, number = emission.seen, emission.seen.phase.cells
+    seen, number = outgoing.seen, outgoing.seen.phase.cells
     if number is not None:
         # The number of the phase function that differs from cell to cell, as one of each node.
         at_nodes = interpolate(grid, fields["number"], points)
         seen = replace(seen, phase=seen.phase.with_cells(at_nodes[..., None]))
-    for index, beam in enumerate(emission.beams):
+    for index, beam in enumerate(outgoing.beams):
         # E2.2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
         travel, irradiance = unattenuated(beam, points, rays.direction)
         cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
         mass = interpolate(grid, fields[f"mass {index}"], points)
-        if emission.peak is None:
-            phase = seen.value(cosine[..., None])[..., 0]
+        if outgoing.peak is None:
+            phase = seen.phase.value(cosine[..., None])[..., 0]
         else:
             # E8.7: the forward peak spreads the light on its way to the node and to the camera.
-            peak = interpolate(grid, fields.get("peak", emission.peak), points)
+            peak = interpolate(grid, fields.get("peak", outgoing.peak), points)
             depth = peak * (passed + mass)
             phase = summed_series(seen, depth, cosine)
         arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
@@ -152,17 +158,17 @@ def unattenuated(
     return offset / square.sqrt()[..., None], beam.irradiance[..., 0] / square
 
 
-def emit(scene: Scene) -> tuple[Emission, Rays]:
+def emit(scene: Scene) -> tuple[OutgoingLight, Rays]:
     rays = cast_rays(scene.views[0].camera)
     return send(solve_light(scene, SolveMemory()), rays), rays
 
 
-def march_fast(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
-    return march_rays(emission, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
+def march_fast(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    return march_rays(outgoing, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
 
 
-def march_twin(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
-    return march_plainly(emission, rays, 12 * steps)
+def march_twin(outgoing: OutgoingLight, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    return march_plainly(outgoing, rays, 12 * steps)
 
 
 def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
@@ -201,8 +207,8 @@ CASES += [("a point inside", "oblique", phase) for phase in PHASES]
 def test_images_agree_in_the_limit(lights: str, view: str, medium: str):
     scene = lit_scene(LIGHTS[lights], VIEWS[view], **MEDIA.get(medium, {}))
     scene.volume.phase = PHASES.get(medium, scene.volume.phase)
-    emission, rays = emit(scene)
-    for errors in differences(lambda marcher, steps: list(marcher(emission, rays, steps))):
+    outgoing, rays = emit(scene)
+    for errors in differences(lambda marcher, steps: list(marcher(outgoing, rays, steps))):
         assert_order(errors, 1e-3, 1.6)
 
 
@@ -216,8 +222,8 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
         density = 2 * torch.exp(-2 * (x**2 + y**2 + z**2)).double()
         grid = replace(scene.volume.grid, shape=density.shape)
         volume = replace(scene.volume, density=density, grid=grid)
-        emission, rays = emit(replace(scene, volume=volume))
-        fast, plain = march_fast(emission, rays, 4)[0], march_twin(emission, rays, 16)[0]
+        outgoing, rays = emit(replace(scene, volume=volume))
+        fast, plain = march_fast(outgoing, rays, 4)[0], march_twin(outgoing, rays, 16)[0]
         errors.append(float((fast - plain).norm() / plain.norm()))
     assert errors[-1] < 2e-3 and convergence_order([1 / 8, 1 / 16, 1 / 32], errors) > 1.5, errors
 
@@ -235,11 +241,11 @@ def test_derivatives_agree_in_the_limit(name: str, view: str):
     for index, light in enumerate(lights):
         names += [f"lights.{index}.{number}" for number in NUMBERS[type(light)]]
     leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    emission, rays = emit(with_values(scene, leaves))
+    outgoing, rays = emit(with_values(scene, leaves))
     weights = random_values(2, 3, len(rays.direction), seed=5)
 
     def gradients(marcher: Callable[..., Any], steps: int) -> list[Tensor]:
-        loss = (weights * torch.stack(marcher(emission, rays, steps))).sum()
+        loss = (weights * torch.stack(marcher(outgoing, rays, steps))).sum()
         return list(torch.autograd.grad(loss, list(leaves.values()), retain_graph=True))
 
     for name, errors in zip(names, differences(gradients), strict=True):

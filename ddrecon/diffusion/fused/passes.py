@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -18,7 +18,8 @@ from torch import Tensor
 from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
-from ddrecon.kernels.text import TextKernel, declarations
+from ddrecon.kernels.text import Bound, TextKernel, declarations
+from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
@@ -28,9 +29,11 @@ Kind = IntEnum(
 """What a pass does, as `passes.h` has it."""
 PASS = """
 long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u, source, out;
-F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *made[4]
+F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *results[4]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
+TOGETHER = 400
+"""Numbers of a table that one launch writes: what a kernel is given has at most 4 KB."""
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
@@ -67,32 +70,31 @@ class KernelPasses(Passes):
         shape = operator.loss.shape
         inverse, kept = (self.like.new_empty(shape) for _ in range(2))
         ties = self.like.new_empty(3, math.prod(shape) // self._width(shape, 2))
-        self._add("SCALE", shape, operator, made=[inverse, kept, ties])
+        self._add("SCALE", shape, operator, results=[inverse, kept, ties])
         return inverse, kept, ties
 
     def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
         grid = tuple(operator.loss.shape[1:])
         shape = [(n + 1) // 2 if a == axis else n for a, n in enumerate(grid, 1)]
-        faces, loss = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
-        below, above, *made = (self.like.new_empty(faces) for _ in range(5))
-        made.append(self.like.new_empty(loss))
+        faces, cells = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
+        below, above, *results = (self.like.new_empty(faces) for _ in range(5))
+        results.append(self.like.new_empty(cells))
         way = [Coarsening(axis, grid[axis - 1], below, above)]
-        weights = [below, above, made[axis - 1]]
-        self._add_transfer("WEIGH", faces, grid, way, operator, made=weights)
-        self._add("COARSEN", loss, operator, way, grid=grid, rows=1, made=made)
-        z, y, x, loss_made = made
-        return way[0], Operator((z, y, x), loss_made, operator.periodic)
+        weights = [below, above, results[axis - 1]]
+        self._add_transfer("WEIGH", faces, grid, way, operator, results=weights)
+        self._add("COARSEN", cells, operator, way, grid=grid, rows=1, results=results)
+        z, y, x, loss = results
+        return way[0], Operator((z, y, x), loss, operator.periodic)
 
     def matrix(self, operator: Operator) -> Tensor:
         count = operator.loss[0].numel()
         matrix = self.like.new_empty(len(operator.loss), count, count, dtype=torch.float64)
-        self._add("MATRIX", operator.loss.shape, operator, rows=0, made=[matrix])
+        self._add("MATRIX", operator.loss.shape, operator, rows=0, results=[matrix])
         return matrix
 
     def run(self) -> None:
-        kernel = prepare_kernel(8 * self.like.itemsize)
-        program = Program(self, kernel, self.like.new_empty(1))
-        program.launch(program.cut(0, len(self.rows)))
+        program = Program(self, prepare_kernel(8 * self.like.itemsize))
+        launch(program.bind(self.like.new_empty(1)), program.cut(0, len(self.rows)))
         self.rows.clear()
 
     def product(self, operator: Operator, u: Vector) -> Vector:
@@ -226,51 +228,81 @@ def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
     return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
 
 
-class Program:
-    """Passes in a table where kernels see it, and launches that do them on vectors in `work`."""
-
-    def __init__(self, passes: KernelPasses, kernel: TextKernel, work: Tensor):
-        self.rows, self.kept = [*passes.rows], [*passes.kept]
-        names = [*entries_of(PASS)]
-        table = torch.tensor([[row.get(name, 0) for name in names] for row in self.rows])
+def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
+    """`numbers` where `like` lies."""
+    if may_read():
         # Without waiting: the numbers have left the processor's memory when this returns.
-        table = table.to(work.device, non_blocking=True)
-        self.bound = kernel.bind({"table": table}, {"work": work})
-        self.is_alone = not work.is_cuda and thread_count(work) == 1
-        self.is_shared = work.is_cuda
+        return torch.tensor(numbers).to(like.device, non_blocking=True)
+    # A graph copies nothing from there; it keeps what kernels are given by value.
+    table = like.new_empty(len(numbers), dtype=torch.int64)
+    for start in range(0, len(numbers), TOGETHER):
+        row = [*numbers[start : start + TOGETHER]]
+        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, given, {"table": table})
+    return table
 
-    def cut(self, first: int, last: int) -> list[tuple[int, int, int]]:
-        """The launches that do passes `first` to `last`: items, the first pass, the one after it.
 
-        One item may be several passes: then a thread does them all.
-        """
-        launches = []
-        for number in range(first, last):
-            row = self.rows[number]
+@functools.cache
+def table_kernel() -> TextKernel:
+    """Writes numbers that it is given to a table."""
+    text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
+    given = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, given, "table")
+
+
+class Program:
+    """A table of passes where kernels see it, with the launches that do them.
+
+    `kept`: what the table points to; `size`: how many numbers vectors take.
+    """
+
+    def __init__(self, passes: KernelPasses, kernel: TextKernel):
+        self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
+        self.kernel, self.colors, self.is_on_gpu = kernel, passes.colors, passes.like.is_cuda
+        names = [*entries_of(PASS)]
+        self.table = _write_table(
+            [row.get(name, 0) for row in self.rows for name in names], passes.like
+        )
+        self.is_alone = not self.is_on_gpu and thread_count(passes.like) <= passes.colors
+
+    def bind(self, work: Tensor) -> Bound:
+        """The kernel, for vectors in `work`."""
+        return self.kernel.bind({"table": self.table}, {"work": work})
+
+    def cut(self, first: int, last: int) -> list[dict[str, int]]:
+        """Launches of the passes from `first` to `last`: each all of one, or a color of several."""
+        launches = list[dict[str, int]]()
+        for number, row in enumerate(self.rows[first:last], first):
             is_large = row["items"] * row["width"] > SMALL and not self.is_alone
-            if self.is_shared or is_large:
-                if first < number:
-                    launches.append((1, first, number))
-                launches.append((row["items"], number, number + 1))
-                first = number + 1
-        return [*launches, *([(1, first, last)] if first < last else [])]
+            if self.is_on_gpu or is_large:
+                launches.append(
+                    {"count": row["items"], "begin": number, "end": number + 1, "parts": 0}
+                )
+            elif launches and launches[-1]["parts"]:
+                launches[-1]["end"] = number + 1
+            else:
+                parts = {"count": self.colors, "parts": self.colors}
+                launches.append({"begin": number, "end": number + 1, **parts})
+        return launches
 
-    def launch(self, launches: Sequence[tuple[int, int, int]]) -> None:
-        """Does what was `cut`."""
-        for items, begin, end in launches:
-            self.bound.launch(items, begin=begin, end=end, is_whole=items == 1)
+
+def launch(bound: Bound, launches: Sequence[Mapping[str, int]]) -> None:
+    """Does the passes of a `bound` program, as it was `cut`."""
+    for one in launches:
+        bound.launch(**one)
 
 
 def passes_kernel(name: str, bits: int) -> TextKernel:
-    """The passes of a table from `begin` to `end`: an item of each, or all that there are."""
+    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`."""
     text = f"""
     for (int k = begin; k < end; ++k) {{
-        const Work<F> pass = {{((const Pass<F>*)table)[k], work, F({STEPS[0]!r}), F({STEPS[1]!r})}};
-        const Size from = is_whole ? 0 : item, to = is_whole ? pass.p.items : item + 1;
-        for (Size i = from; i < to; ++i) {name}(pass, i);
+        const Pass<F>& pass = ((const Pass<F>*)table)[k];
+        const Size from = parts ? pass.items * item / parts : item;
+        const Size to = parts ? pass.items * (item + 1) / parts : item + 1;
+        for (Size i = from; i < to; ++i) {name}(pass, work, F({STEPS[0]!r}), F({STEPS[1]!r}), i);
     }}
     """
-    given = "long *table; int begin, end; bool is_whole; F *work"
+    given = "long *table; int begin, end, parts; F *work"
     return TextKernel(f"multigrid_{name}", bits, text, given, "work", "diffusion/fused/passes.h")
 
 
@@ -292,40 +324,51 @@ def name_kernels(like: Tensor) -> None:
         launch_later(kernel(8 * like.itemsize).kernel, like)
 
 
-def prepare(operator: Operator) -> tuple[Operator, Hierarchy]:
-    """`operator` as kernels take it, and its grids."""
-    faces = max(map(len, operator.conductances))
-    z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
-    loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
-    operator = Operator((z, y, x), loss, operator.periodic)
-    return operator, Hierarchy.of(operator, KernelPasses(loss))
+class KernelGrids:
+    """The grids of an operator, and the program of products and cycles for each count of colors."""
+
+    def __init__(self, operator: Operator):
+        faces = max(map(len, operator.conductances))
+        z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
+        loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
+        self.operator = Operator((z, y, x), loss, operator.periodic)
+        # Colors that share nothing are prepared one after another.
+        colors = faces if faces == len(loss) else 1
+        self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss, colors))
+        self.programs: dict[int, tuple[Program, list[Vector]]] = {}
+
+    def program(self, colors: int) -> tuple[Program, list[Vector]]:
+        """The program, a product before a cycle; direction and residual, product and solution."""
+        if colors not in self.programs:
+            loss = self.operator.loss
+            passes = KernelPasses(loss, colors)
+            given = [passes.new_vector(loss.shape[1:]) for _ in range(2)]
+            product = passes.product(self.operator, given[0])
+            solution = self.hierarchy.cycle(passes, given[1])
+            program = Program(passes, cycle_kernel(8 * loss.itemsize))
+            self.programs[colors] = program, [*given, product, solution]
+        return self.programs[colors]
 
 
 class KernelCycle:
     """Products and V-cycles of an operator, of vectors like `source`, by kernels."""
 
     def __init__(self, operator: Operator, source: Tensor):
-        operator, self.hierarchy = operator.once(prepare)
-        passes = KernelPasses(source, len(source))
-        direction, residual = (passes.new_vector(source.shape[1:]) for _ in range(2))
-        product = passes.product(operator, direction)
-        u = self.hierarchy.cycle(passes, residual)
-        work = source.new_empty(passes.size)
-        self.direction, self.residual, self._product, self._u = (
-            work[vector.place :][: source.numel()].view_as(source)
-            for vector in (direction, residual, product, u)
-        )
-        self._program = Program(passes, cycle_kernel(8 * source.itemsize), work)
-        self._first, self._others = (
-            self._program.cut(*ends) for ends in ((0, 1), (1, len(passes.rows)))
+        grids = operator.once(KernelGrids)
+        program, vectors = grids.program(len(source))
+        work = source.new_empty(program.size)
+        self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
+        self._first, self._others = program.cut(0, 1), program.cut(1, len(program.rows))
+        self.direction, self.residual, self._product, self._solution = (
+            work[vector.place :][: source.numel()].view_as(source) for vector in vectors
         )
 
     def product(self) -> Tensor:
         """A times the direction."""
-        self._program.launch(self._first)
+        launch(self._bound, self._first)
         return self._product
 
     def cycle(self) -> Tensor:
         """Roughly A^-1 times the residual."""
-        self._program.launch(self._others)
-        return self._u
+        launch(self._bound, self._others)
+        return self._solution

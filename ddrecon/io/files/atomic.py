@@ -54,7 +54,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
-    """As `replace_file`, but safe from a loss of power once it has ended.
+    """`replace_file` that is safe from a loss of power once it has ended.
 
     What `path` was until then is kept as `kept_as`; `path` is there at any time.
     """

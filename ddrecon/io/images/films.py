@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import numpy as np
 
 FILMS = {".mp4": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska"}
-"""What ffmpeg takes a suffix for: by itself it would go by content, and follow playlists."""
+"""ffmpeg's format of each suffix: by itself it would go by content, and follow playlists."""
 OTHER_CURVES = re.compile("arib-std-b67|smpte2084|smpte428|linear|log100|log316")
-"""As ffmpeg calls them: HLG, PQ, that of cinemas, none and logarithms."""
+"""Curves that are refused, by ffmpeg's names: HLG, PQ, cinema, none and logarithms."""
 ALPHA = re.compile(
     r"alpha_mode *: 1|Video: [^\n]*, (yuva|rgba|bgra|argb|abgr|gbrap|ya\d)", re.IGNORECASE
 )

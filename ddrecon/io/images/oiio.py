@@ -34,12 +34,12 @@ BEGINNINGS = {
 """How files of a kind begin: OpenImageIO alone would go on to try all that it knows."""
 FLOATS = ("half", "float", "double")
 GRAY = ("Y", "gray", "grey", "luminance")
-"""What a single channel is called that is a picture: others are depth, a matte, or anything."""
+"""Names of a single channel that is a picture: others are depth, a matte, or anything."""
 BLACK_IS_ZERO, RGB = 1, 2
 HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
 """Its lines, then the size, then how the first row of pixels begins."""
 STACK_MARK = "bounds="
-"""What the description of a volume says that we wrote as TIFF, if it has but one page."""
+"""The mark in the description of a volume that we wrote as TIFF, if it has a single page."""
 
 
 def read_exr(path: Path) -> np.ndarray:

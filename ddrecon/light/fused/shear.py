@@ -154,7 +154,7 @@ class _Masses(torch.autograd.Function):
         _, _, _, *needs = ctx.needs_input_grad
         for one in [*range(3)] * needs[0] + [3] * needs[1]:
             d_both = torch.zeros_like(both)
-            d_both[:, one] = 1
+            d_both[:, one].fill_(1)
             d_entered = _change(ctx.shears, field, both, None, d_both)
             both_bar[:, one] = (d_entered * entered_bar).flatten(1).sum(1, dtype=torch.float64)
         return None, None, field_bar, *both_bar.split([3, 1], 1)

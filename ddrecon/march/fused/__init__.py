@@ -6,5 +6,5 @@ Rays go in packets, a ray a lane of a processor's vectors: `cells.h` has values 
 they change with the rays, `runs.h` those of lanes close to each other, and their adjoint,
 `optics.h` the formulas, `rays.h` what a node emits, the integral and its tangent, and `back.h` the
 adjoint.
-`integrate` makes of all that one function of an `Emission`.
+`integrate` makes of all that one function of an `OutgoingLight`.
 """

@@ -13,7 +13,7 @@ template <class F> struct Bars {
     const F *out, *masses;
     const double* mass;
     double* numbers;
-    F *rays, *angles, *coefficients, *table, *fronts;
+    F *rays, *angles, *table, *fronts;
     F* const* fields;
     int packets;
 };
@@ -23,18 +23,17 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     typedef typename Rays::P P;
     typedef typename Rays::V V;
     typedef typename Rays::W W;
-    typedef typename Rays::M M;
     typedef typename Rays::E E;
     typedef typename Rays::Node Node;
-    typedef typename Rays::Rungs Rungs;
-    typedef typename Rays::Point Point;
+    typedef typename Rays::Table Table;
     using Rays::begin, Rays::last, Rays::given, Rays::foot, Rays::across, Rays::row_of;
-    using Rays::DEPTH, Rays::HAS_VIEW, Rays::NUMBER, Rays::VIEW, Rays::lines;
-    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
+    using Rays::COSINE, Rays::DEPTH, Rays::NUMBER, Rays::PLACE, Rays::lines;
+    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_RAYS, Which::VARIES_TABLES;
 
     const Bars<F>& bars;
     const V none = P::all(F(0));
-    V m_bar[L::EXTINCTION], number_bar[2 * L::C + 1], coefficient_bar[L::BEAMS * L::RAY_TERMS + 1];
+    V m_bar[L::EXTINCTION], number_bar[2 * L::C + 1],
+        curve_bar[VARIES_TABLES * L::HOLDS * L::BEAMS * L::HELD + 1];
     V foot_bar[L::BEAMS + 1], across_bar[L::BEAMS + 1];
     V ray_bar[8] = {none, none, none, none, none, none, none, none};
 
@@ -55,7 +54,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             is_asked = is_asked || !this->is_nothing(m_bar[k]);
         }
         for (V& each : number_bar) each = none;
-        for (V& each : coefficient_bar) each = none;
+        for (V& each : curve_bar) each = none;
         for (int b = 0; b < L::BEAMS; ++b) foot_bar[b] = across_bar[b] = none;
         // Pixels that nothing is asked of, masked ones for instance, need no walk.
         if (is_asked) walk(bar, m);
@@ -96,7 +95,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                     if (VARIES_ANGLES && i >= L::C && L::is_point(beam)) {
                         Dual<V, 4> x[] = {foot[beam], across[beam], a->t, b->t};
                         for (int k = 0; k < 4; ++k) x[k].by[k] = P::all(F(1));
-                        const auto slopes = Point::subtended(x[0], x[1], x[2], x[3]);
+                        const auto slopes = Point<F>::subtended(x[0], x[1], x[2], x[3]);
                         foot_bar[beam] += by * slopes.by[0];
                         across_bar[beam] += by * slopes.by[1];
                         begin_bar += by * slopes.by[2];
@@ -144,25 +143,33 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             m_bar[k] += u_bar[c] * this->number(c);
             number_bar[c] += u_bar[c] * P::narrow(m[k]);
         }
-        for (int b = 0; b < L::BEAMS; ++b)
+        for (int b = 0; b < L::BEAMS; ++b) {
+            V place_bar = none, cosine_bar = none;
             for (int c = 0; c < L::C; ++c) {
                 const int k = L::extinction(c), s = L::scattering(c);
                 const int i = L::C + b * L::C + c, j = L::mass(b, c);
-                const V way = P::narrow(m[k]) + node.v[j], scattering = node.v[s];
+                const V way = P::narrow(m[k]) + node.v[j];
+                const V p_bar = w_bar[i] * node.v[s];
                 V way_bar = u_bar[i] * this->number(c);
                 number_bar[c] += u_bar[i] * way;
                 v_bar[s] += w_bar[i] * node.p[i].value;
                 // What scatters nothing has no phase function to vary.
-                if (!node.is_empty)
-                    finish_phase(node, b, c, way, w_bar[i] * scattering, v_bar, way_bar, t_bar);
+                if (!node.is_empty) {
+                    finish_phase(node.p[i], node, c, way, p_bar, v_bar, way_bar);
+                    if constexpr (VARIES_ANGLES) place_bar += p_bar * node.p[i].by[PLACE];
+                    if constexpr (VARIES_ANGLES && L::IS_SCALED)
+                        cosine_bar += p_bar * node.p[i].by[COSINE];
+                    if constexpr (VARIES_TABLES)
+                        if (L::has_curve(b)) finish_curve(node, b, c, way, p_bar);
+                }
                 m_bar[k] += way_bar;
                 v_bar[j] += way_bar;
             }
+            if (VARIES_ANGLES) turn(node, b, place_bar, cosine_bar, t_bar);
+        }
     }
-    // What p of beam b in color c had of mass on the `way`, of the number there, and of angles.
-    void finish_phase(
-        const Node& node, int b, int c, V way, V p_bar, V* v_bar, V& way_bar, V& t_bar) {
-        const E& p = node.p[L::C + b * L::C + c];
+    // What p in color c had of mass on the `way`, and of the number there.
+    void finish_phase(const E& p, const Node& node, int c, V way, V p_bar, V* v_bar, V& way_bar) {
         if constexpr (L::HAS_PEAK) {
             const V depth_bar = p_bar * p.by[DEPTH];
             way_bar += depth_bar * this->peak_of(node, c);
@@ -171,35 +178,30 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             else
                 number_bar[L::C + c] += depth_bar * way;
         }
-        if constexpr (L::HAS_NUMBERS) v_bar[L::number(c)] += p_bar * p.by[NUMBER];
-        if constexpr (HAS_VIEW) {
-            const V one = p_bar * p.by[VIEW], other = p_bar * p.by[VIEW + 1];
-            if (L::is_point(b)) {
-                foot_bar[b] += one;
-                across_bar[b] += other;
-                t_bar += one;
-            } else if (L::HAS_RUNGS || L::IS_STEEP) {
-                coefficient_bar[b * L::RAY_TERMS + 2] += one;
-                coefficient_bar[b * L::RAY_TERMS] += other;
-            }
-        }
-        if (!VARIES_CURVES || !this->has_curve(b)) return;
-        const M counts = (p.value > none) & this->is_peaked(node, c);
-        V powers[L::TERMS], power = L::HAS_PEAK ? P::pick(counts, p_bar, none) : p_bar;
-        const V place = value_of(this->place_of(node, c, way));
-        for (int k = 0; k < L::TERMS; ++k) {
-            powers[k] = power;
-            power *= place;
-        }
-        F* const table_bar = bars.table ? bars.table + L::table(c) : nullptr;
-        if constexpr (L::HAS_RUNGS) {
-            const auto rung = Rungs::rung(this->number_of(node, L::phase(c)));
-            if (table_bar) Rungs::spread(table_bar, rung, node.angle[b], powers);
-        } else if (!L::is_point(b)) {
-            for (int k = 0; k < L::TERMS; ++k) coefficient_bar[L::curve(b, c) + k] += powers[k];
-        } else if (table_bar) {
-            Point::spread(node.angle[b], table_bar, powers);
-        }
+        if constexpr (L::HAS_NUMBERS) v_bar[L::FIRST_NUMBER + L::number(c)] += p_bar * p.by[NUMBER];
+    }
+    // What p of beam b in color c had of the coefficients in its table.
+    void finish_curve(const Node& node, int b, int c, V way, V p_bar) {
+        const int table = L::table(c);
+        const bool is_held = L::HOLDS && !L::is_point(b);
+        V number = none, cosine, bars_at_node[L::CURVE] = {};
+        if (L::HAS_NUMBERS)
+            number = number_place<F, L::IS_SCALED>(node.v[L::FIRST_NUMBER + L::number(c)]);
+        if (L::HAS_PEAK) p_bar = P::pick(node.p[L::C + b * L::C + c].value > none, p_bar, none);
+        V* const bar = is_held ? curve_bar + b * L::HELD + table * L::CURVE : bars_at_node;
+        const V depth = L::HAS_PEAK ? value_of(this->peak_of(node, c)) * way : none;
+        Polynomials<F, L::TERMS, L::POWERS>::spread(p_bar, depth, number, bar);
+        if (is_held) return;
+        const auto place = this->see(b, foot[b], across[b], node.t, cosine);
+        Table::spread(place, bars.table + table * Table::SIZE, bar);
+    }
+    // What bars of beam b's place in tables, and of the cosine there, are for its angles.
+    void turn(const Node& node, int b, V place_bar, V cosine_bar, V& t_bar) {
+        Dual<V, 3> x[] = {foot[b], across[b], node.t}, cosine;
+        for (int k = 0; k < 3; ++k) x[k].by[k] = P::all(F(1));
+        const Dual<V, 3> place = this->see(b, x[0], x[1], x[2], cosine).part;
+        V* const of[] = {&foot_bar[b], &across_bar[b], &t_bar};
+        for (int k = 0; k < 3; ++k) *of[k] += place_bar * place.by[k] + cosine_bar * cosine.by[k];
     }
 
     void spread(int n, const Node& node, const V* v_bar, V t_bar) {
@@ -210,48 +212,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             number_bar[2 * L::C] -= bend_bar[k] * off * node.bend[k] * node.bend[k];
         }
         if constexpr (IS_SLICED)
-            spread_to_cells(node, node.runs, this->slice(n), v_bar, bend_bar);
+            spread_in_slice<F, L>(
+                bars.fields, this->slice(n), node.y, node.x, lines, v_bar, bend_bar);
         else
             spread_between(node, v_bar, bend_bar);
         if constexpr (VARIES_RAYS) move(n, node, v_bar, bend_bar, t_bar);
-    }
-    template <class Spot> void spread_to_cells(
-        const Spot& spot, const Runs<F>& runs, long long offset, const V* v_bar,
-        const V* bend_bar) const {
-#if IS_GPU
-        for (int c = 0; c < L::CHANNELS; ++c)
-            if (bars.fields[c])
-                spread_place(
-                    bars.fields[c] + offset, spot.y, spot.x, lines, v_bar[c],
-                    L::is_cubic(c) ? bend_bar[c - L::FIRST_MASS] : F(0));
-#else
-        bool is_asked[L::CHANNELS], has_cubic = false;
-        M is_zero = none == none;
-        for (int c = 0; c < L::CHANNELS; ++c) {
-            const M is = v_bar[c] == none;
-            is_asked[c] = bars.fields[c] && !P::every(is);
-            if (is_asked[c]) is_zero = is_zero & is;
-            has_cubic = has_cubic || (is_asked[c] && L::is_cubic(c));
-        }
-        // Lanes outside of the box count for nothing.
-        const unsigned counting = ~P::bits_of(__builtin_convertvector(is_zero, typename P::I));
-        for (int r = 0; r < runs.count; ++r) {
-            Run run = runs.run[r];
-            run.lanes &= counting;
-            if (!run.lanes) continue;
-            run.lane = __builtin_ctz(run.lanes);
-            const Shares<F> shares(run, spot.y, spot.x, lines, has_cubic);
-#pragma clang loop unroll(disable)
-            for (int c = 0; c < L::CHANNELS; ++c) {
-                if (!is_asked[c]) continue;
-                F* const field = bars.fields[c] + offset;
-                if (L::is_cubic(c))
-                    shares.template add<true>(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
-                else
-                    shares.template add<false>(field, v_bar[c]);
-            }
-        }
-#endif
     }
     void spread_between(const Node& node, const V* v_bar, const V* bend_bar) const {
         const Layers<F, V> layers(node.z);
@@ -263,11 +228,8 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 value_bar[L::FIRST_MASS + k] += layers.across[i] * bend_bar[k];
                 linear_bar[k] = layers.linear[i] * bend_bar[k];
             }
-            Spot<F, false, V> spot = node;
-            spot.y = node.y.behind(node.z.cells[i] * lines.rows);
-            Runs<F> runs;
-            runs.find(spot.y, spot.x, lines);
-            spread_to_cells(spot, runs, 0, value_bar, linear_bar);
+            const auto row = node.y.behind(node.z.cells[i] * lines.rows);
+            spread_in_slice<F, L>(bars.fields, 0, row, node.x, lines, value_bar, linear_bar);
         }
     }
 
@@ -314,8 +276,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             put(bars.angles, L::BEAMS + b, across_bar[b]);
         }
         for (int k = 0; k < L::EXTINCTION && bars.fronts; ++k) put(bars.fronts, k, m_bar[k]);
-        for (int k = 0; k < L::BEAMS * L::RAY_TERMS && bars.coefficients; ++k)
-            put(bars.coefficients, k, coefficient_bar[k]);
+        for (int b = 0; b < L::BEAMS && VARIES_TABLES && L::HOLDS; ++b)
+            for (int h = 0; h < L::TABLES && L::has_curve(b) && !L::is_point(b); ++h)
+                Table::spread(
+                    Table::place(foot[b]), bars.table + h * Table::SIZE,
+                    curve_bar + b * L::HELD + h * L::CURVE);
     }
 };
 

@@ -72,7 +72,7 @@ class Cells:
 
 def cells_of(sampler: Sampler) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
-    planes, way, support = sampler.planes, sampler.way, sampler.emission.support
+    planes, way, support = sampler.planes, sampler.way, sampler.outgoing.support
     fields = list(sampler.fields.values())
     if way.axis is None:
         return Cells(planes), fields

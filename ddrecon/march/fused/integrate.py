@@ -1,4 +1,4 @@
-"""The view-ray integral of an `Emission` by fused kernels: what `march.integral` does in chunks.
+"""The view-ray integral of outgoing light by fused kernels: what `march.integral` does in chunks.
 
 It is one differentiable function of tensors.
 """
@@ -17,8 +17,7 @@ from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
-from ddrecon.march.emission import Emission
-from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
+from ddrecon.march.fused.bundle import factors_of, numbers_of, pack_rays, see_beams, table_of
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
     Case,
@@ -27,6 +26,7 @@ from ddrecon.march.fused.kernels import (
     integral_kernel,
     tangent_kernel,
 )
+from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.samplers import Sampler
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -34,7 +34,7 @@ NEIGHBORS, TURNS = 128, 8
 """Packets that one thread does after each other, at least, as they meet the same cells; and how
 often each thread has its turn, at most.
 """
-NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
+NAMES = "rays", "angles", "numbers", "table", "fronts"
 """What a walk is given besides fields and what stays, in the order of its arguments."""
 
 
@@ -42,38 +42,37 @@ def march_rays(
     sampler: Sampler, rays: Rays, crossing: Crossing, front: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
-    emission, ends = sampler.emission, (crossing.hit, crossing.near, crossing.far)
-    packed = pack_rays(emission.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
-    layout, (cells, fields) = Layout.of(emission), cells_of(sampler)
-    along = see_beams(emission, layout, packed)
+    outgoing, ends = sampler.outgoing, (crossing.hit, crossing.near, crossing.far)
+    packed = pack_rays(outgoing.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
+    layout, (cells, fields) = Layout.of(outgoing), cells_of(sampler)
+    angles = see_beams(outgoing, packed)
     out, masses, _ = Integrate.apply(
         layout,
         cells,
         packed.bundle,
-        along.angles,
-        along.polynomials,
-        numbers_of(emission),
-        table_of(emission, layout),
+        angles,
+        numbers_of(outgoing),
+        table_of(outgoing, layout),
         packed.bundle.new_empty(layout.extinction, 0) if front is None else front,
         *fields,
     )
     # The walk's masses begin with what is in front.
     own = masses if front is None else masses - front
-    return _compose(emission, out, along.factors), own
+    return _compose(outgoing, out, factors_of(outgoing, layout, angles)), own
 
 
-def _compose(emission: Emission, out: Tensor, factors: tuple[Tensor | None, ...]) -> Tensor:
+def _compose(outgoing: OutgoingLight, out: Tensor, factors: Sequence[Tensor | None]) -> Tensor:
     """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
     light that of what remains; beams' irradiances, and p where it is one of the `factors`
     [1 or C, R] (E2.2).
     """
-    diffuse, *arriving = out.split(emission.colors)
-    scattered = diffuse * emission.diffuse_scale.view(-1, 1)
-    for beam, light, factor in zip(emission.beams, arriving, factors, strict=True):
+    diffuse, *arriving = out.split(outgoing.colors)
+    scattered = diffuse * outgoing.diffuse_scale.view(-1, 1)
+    for beam, light, factor in zip(outgoing.beams, arriving, factors, strict=True):
         weighted = light if factor is None else light * factor
-        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + weighted * strength.view(-1, 1)
     return scattered
 
@@ -115,7 +114,7 @@ class Integrate(torch.autograd.Function):
         rooms = _empty(ctx.layout, tensors[0])
         for name, bar, room in zip(("out_bar", "masses_bar"), bars_of_made, rooms, strict=False):
             ends[name] = room.zero_() if bar is None else bar
-        rays, _, _, numbers, table, fronts, *fields = tensors
+        rays, _, numbers, table, fronts, *fields = tensors
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
         sums = [table if needs[NAMES.index("table")] else None]
         sums += [
@@ -134,7 +133,7 @@ class Integrate(torch.autograd.Function):
         numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
         bars = {
             f"{name}_bar": one.new_empty(one.shape) if is_so else None
-            for name, one, is_so in zip(NAMES[:3], tensors, needs, strict=False)
+            for name, one, is_so in zip(NAMES[:2], tensors, needs, strict=False)
         }
         bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
         kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs[: len(NAMES)]))
@@ -145,10 +144,10 @@ class Integrate(torch.autograd.Function):
                 if total is not None and part is not None:
                     total += part
         table_bar, *field_bars = shares[0]
-        rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()
+        rays_bar, angles_bar, fronts_bar = bars.values()
         numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
         others = numbers_bar, table_bar, fronts_bar, *field_bars
-        return None, None, rays_bar, angles_bar, coefficients_bar, *others
+        return None, None, rays_bar, angles_bar, *others
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
@@ -161,9 +160,8 @@ class Integrate(torch.autograd.Function):
 
 def _case(layout: Layout, cells: Cells, varied: Sequence[bool]) -> Case:
     """What kernels are compiled for where those of `NAMES` are `varied`."""
-    rays, angles, coefficients, _, table, *_ = varied
-    turns = any(layout.beams) and (rays or angles)
-    return Case(cells.is_sliced, rays, turns, coefficients or table)
+    rays, angles, _, table, *_ = varied
+    return Case(cells.is_sliced, rays, layout.has_curves and (rays or angles), table)
 
 
 def _change(

@@ -11,15 +11,14 @@ import torch
 
 from ddrecon.kernels.text import TextKernel, names_of
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.emission import Emission
-from ddrecon.medium.phase_cells import count_tables, is_steep
-from ddrecon.numerics.chebyshev import COEFFICIENTS
+from ddrecon.march.outgoing import OutgoingLight
+from ddrecon.medium.phase_cells import count_powers, is_scaled
 
 _GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
+F *planes, *rays, *angles, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
 """
-_CHANGES = "F *d_rays, *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts"
+_CHANGES = "F *d_rays, *d_angles, *d_numbers, *d_table, *d_fronts"
 
 
 class Layout(NamedTuple):
@@ -27,14 +26,14 @@ class Layout(NamedTuple):
 
     `colors` C leave the volume. A node holds the `extinction`'s field (K = 1 or C channels),
     `diffuse` light (1 or C), K masses for each beam, `scattering` (0: it is the extinction's field
-    again; else 1 or C), what is `emitted` (0: nothing is; else 1 or C), and `peak`: -1 without a
-    forward peak, 0 where it is one number a color, else 1 or C channels. `phases`: 1, or C where
-    colors have phase functions of their own.
+    again; else 1 or C), what is `emitted` (0: nothing is; else 1 or C), `peak` (-1 without a
+    forward peak, 0 where it is one number a color, else 1 or C), where the phase function differs
+    from cell to cell the `numbers` that do (0, 1 or C), and what `remaining` scatters of diffuse
+    light (0, 1 or C).
 
-    Where the phase function differs from cell to cell, `form` is how it depends on the number that
-    does (`bundle.py`): a node holds these `numbers` (1 or C), of which there are so many `tables`
-    (1 or C), and 1 or C channels of what `remaining` scatters of diffuse light. Else `SAME`, 0 and
-    1. `beams`: whether each is a point light. `bits` of a number: 32 or 64.
+    `tables` of p: 1, or C where colors have phase functions of their own. Each has so many `powers`
+    of the number, and `is_scaled` by Henyey and Greenstein's function of that (E8.9). `beams`:
+    whether each is a point light. `bits` of a number: 32 or 64.
     """
 
     colors: int
@@ -43,44 +42,39 @@ class Layout(NamedTuple):
     scattering: int
     emitted: int
     peak: int
-    phases: int
-    form: str
     numbers: int
-    tables: int
     remaining: int
+    tables: int
+    powers: int
+    is_scaled: bool
     beams: tuple[bool, ...]
     bits: int
 
     @staticmethod
-    def of(emission: Emission) -> Layout:
-        """How the fields of `emission` stand in a node."""
-        phase, form = emission.seen.phase, "SAME"
-        if phase.cells is not None:
-            form = "LINEAR" if emission.peak is None else "EVEN"
-            form = "STEEP" if is_steep(phase.kind) else form
-        counts = {name: len(field) for name, field in emission.fields.items()}
+    def of(outgoing: OutgoingLight) -> Layout:
+        """How the fields of `outgoing` stand in a node."""
+        seen, has_peak = outgoing.seen, outgoing.peak is not None
+        counts = {name: len(field) for name, field in outgoing.fields.items()}
         return Layout(
-            emission.colors,
+            outgoing.colors,
             counts["extinction"],
             counts["diffuse"],
             counts.get("scattering", 0),
             counts.get("emitted", 0),
-            -1 if emission.peak is None else counts.get("peak", 0),
-            emission.seen.colors,
-            form,
+            counts.get("peak", 0) if has_peak else -1,
             counts.get("number", 0),
-            count_tables(phase),
             counts.get("remaining", 0),
-            tuple(isinstance(beam, PointBeam) for beam in emission.beams),
-            torch.finfo(emission.diffuse.dtype).bits,
+            len(seen.table(has_peak)) if outgoing.beams else 1,
+            count_powers(seen.phase, has_peak),
+            seen.phase.cells is not None and is_scaled(seen.phase.kind),
+            tuple(isinstance(beam, PointBeam) for beam in outgoing.beams),
+            torch.finfo(outgoing.diffuse.dtype).bits,
         )
 
     @property
-    def ray_terms(self) -> int:
-        """Numbers of each beam that a ray is given: coefficients of p, or where to find them."""
-        if self.form == "SAME":
-            return self.phases * COEFFICIENTS
-        return 2 * self.tables if self.form == "LINEAR" else 3
+    def has_curves(self) -> bool:
+        """Whether p of any beam changes along a ray."""
+        return bool(self.beams) and (self.peak >= 0 or self.numbers > 0 or any(self.beams))
 
     @property
     def channels(self) -> int:
@@ -98,14 +92,13 @@ class Layout(NamedTuple):
 class Case(NamedTuple):
     """What else kernels are compiled for: whether nodes lie in slices, and what is varied.
 
-    Rays; the angles at which they see point lights, which turn with them; and the coefficients or
-    tables of phase functions.
+    Rays; the angles at which they see beams, which turn with them; and tables of phase functions.
     """
 
     is_sliced: bool
     varies_rays: bool = False
     varies_angles: bool = False
-    varies_curves: bool = False
+    varies_tables: bool = False
 
 
 @functools.cache
@@ -139,14 +132,14 @@ def adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     """
     given = f"""
     F *out_bar, *masses_bar; double *masses, *numbers_bar;
-    F *rays_bar, *angles_bar, *coefficients_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
+    F *rays_bar, *angles_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
     int packets
     """
     text = f"""
     const Bars<F> of_bars = {{{names_of(given)}}};
     Back<F, {_written(layout, case)}>(item, of_all, of_bars).run();
     """
-    made = "numbers_bar rays_bar angles_bar coefficients_bar table_bar fronts_bar bars"
+    made = "numbers_bar rays_bar angles_bar table_bar fronts_bar bars"
     return _kernel("transpose", layout, 1, text, given, made, "back")
 
 
@@ -162,5 +155,5 @@ def _kernel(
 
 def _written(layout: Layout, case: Case) -> str:
     """The types `Layout` and `Case` of C++, which find where each channel stands."""
-    of_layout = ", ".join(map(str, (*layout[:-2], *map(int, layout.beams))))
+    of_layout = ", ".join(str(int(count)) for count in (*layout[:-2], *layout.beams))
     return f"Layout<{of_layout}>, Case<{', '.join(str(int(is_so)) for is_so in case)}>"

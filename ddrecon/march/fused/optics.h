@@ -58,9 +58,11 @@ template <class F> struct Numbers : Packets<F> {
     }
 };
 
-// Angles of tables are so many steps from 0 to pi, and rungs so many, from 0 on; see `Rungs`.
-constexpr int ANGLE_STEPS = 1024, EVEN_RUNGS = 16, STEEP_RUNGS = 54, COEFFICIENTS = 12;
-constexpr double PI = 3.14159265358979323846, STEEP_STEP = 0.05, SCALE = 8.0;
+// Angles of tables are so many steps from 0 to pi; S has so many coefficients over the depth.
+constexpr int ANGLE_STEPS = 1024, COEFFICIENTS = 12;
+constexpr double PI = 3.14159265358979323846, SCALE = 8.0;
+// The largest g of tables, and its artanh.
+constexpr double STEEPEST = 0.99, STEEPEST_RISE = 2.6466524123622457;
 
 template <class F> struct Decay {
     typedef Numbers<F> P;
@@ -86,17 +88,51 @@ template <class F> struct Decay {
     }
 };
 
-// E8.7 along a ray, by its polynomial in 1 - 2 s / (depth + s).
-template <class F, int TERMS> struct Polynomial {
+// p by its coefficients c [POWERS, TERMS]: of powers of 1 - 2 s / (depth + s) (E8.8), and of
+// Chebyshev's series in the place of a number of the cell (E8.9).
+template <class F, int TERMS, int POWERS> struct Polynomials {
     template <class N> static INLINE N place(const N& depth) {
         return F(1) - F(2.0 * SCALE) / (depth + F(SCALE));
     }
-    template <class N, class A, class X> static INLINE N at(const A* c, const X& place) {
+    // `row(m)` are the TERMS of the series' term m.
+    template <class N, class Row> static INLINE N at(Row row, const N& depth, const N& number) {
+        const N x = TERMS > 1 ? place(depth) : depth;
+        if constexpr (POWERS == 1) return along(row(0), x);
+        N value = F(0) * number, before = value;
+        for (int m = POWERS - 1; m > 0; --m) {
+            const N next = along(row(m), x) + F(2) * (number * value) - before;
+            before = value;
+            value = next;
+        }
+        return along(row(0), x) + number * value - before;
+    }
+    template <class N, class A> static INLINE N along(const A* c, const N& x) {
         N value(c[TERMS - 1]);
-        for (int k = TERMS - 2; k >= 0; --k) value = c[k] + value * place;
+        for (int k = TERMS - 2; k >= 0; --k) value = c[k] + value * x;
         return value;
     }
+    // What a bar of p is for the coefficients.
+    template <class V> static INLINE void spread(V bar, V depth, V number, V* c_bar) {
+        const V x = TERMS > 1 ? place(depth) : depth;
+        V before = bar * number;
+        for (int m = 0; m < POWERS; ++m) {
+            V power = bar;
+            for (int k = 0; k < TERMS; ++k, power *= x) c_bar[m * TERMS + k] += power;
+            const V next = m ? F(2) * (number * bar) - before : before;
+            before = bar;
+            bar = next;
+        }
+    }
 };
+
+// The place of a number on polynomials in it, from -1 to 1: of a weight, or of g by its artanh.
+template <class F, bool IS_G, class N> INLINE N number_place(const N& number) {
+    typedef Numbers<F> P;
+    if constexpr (!IS_G) return F(2) * number - F(1);
+    const N low(P::all(F(0))), high(P::all(F(STEEPEST)));
+    const N g = P::least(P::most(number, low), high);
+    return F(1 / STEEPEST_RISE) * P::log((F(1) + g) / (F(1) - g)) - F(1);
+}
 
 // A place between two of even places, where cubics have their values and slopes (Hermite).
 template <class F, class N> struct Cubic {
@@ -118,47 +154,16 @@ template <class F, class N> struct Cubic {
         w[2] = (F(1) + rest + rest) * u * u;
         w[3] = -(step * rest) * u * u;
     }
-    // And how that changes.
-    INLINE void weigh_slopes(F step, N* w) const {
-        const N u = part, rest = F(1) - u;
-        w[0] = F(-6) * u * rest;
-        w[1] = step * rest * (rest - u - u);
-        w[2] = F(6) * u * rest;
-        w[3] = step * u * (u - rest - rest);
-    }
 };
 
 // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance.
-template <class F, int TERMS> struct Point {
+template <class F> struct Point {
     typedef Numbers<F> P;
-    typedef typename P::V V;
-    static constexpr F STEP = F(PI / ANGLE_STEPS);
-    // Between which angles of the table of p it is at t, and the cosine of its angle.
-    template <class N> static INLINE Cubic<F, N> angle(N foot, N across, N t, N& cosine) {
+    // Where it is in tables by angle at a distance t, and the cosine of that angle.
+    template <class N> static INLINE Cubic<F, N> see(N foot, N across, N t, N& cosine) {
         const N apart = P::root(across), away = -(foot + t);
         cosine = away / P::root(across + away * away);
         return Cubic<F, N>(P::atan2(apart, away) * F(ANGLE_STEPS / PI), ANGLE_STEPS);
-    }
-    // The coefficients of p over the depth of the peak; `table` is that of the color.
-    template <class N> static INLINE void curve(const Cubic<F, N>& angle, const F* table, N* out) {
-        N weights[4];
-        angle.weigh(STEP, weights);
-        const typename P::I at = 2 * TERMS * angle.first;
-        for (int k = 0; k < TERMS; ++k) {
-            out[k] = weights[0] * P::gather(table + k, at);
-            for (int j = 1; j < 4; ++j) out[k] += weights[j] * P::gather(table + j * TERMS + k, at);
-        }
-    }
-    // What bars of these are for the table.
-    static INLINE void spread(const Cubic<F, V>& angle, F* table_bar, const V* bar) {
-        V weights[4];
-        angle.weigh(STEP, weights);
-        for (int l = 0; l < LANES; ++l)
-            for (int j = 0; j < 4; ++j)
-                for (int k = 0; k < TERMS; ++k)
-                    P::add_one(
-                        table_bar + (2 * P::lane_of(angle.first, l) + j) * TERMS + k,
-                        P::lane(weights[j], l) * P::lane(bar[k], l));
     }
     // The integral of 1 / r^2: the angle that the way subtends over the distance.
     template <class N> static INLINE N subtended(N foot, N across, N t0, N t1) {
@@ -167,102 +172,37 @@ template <class F, int TERMS> struct Point {
     }
 };
 
-// p where it differs from cell to cell. Tables have values and slopes at even places of two kinds:
-// rungs, of the number that differs, and angles. Between four of them E8.7's coefficients are cubic
-// in both. A vector read from a row ends within the next one: behind the last row there is one
-// more.
-template <class F, int TERMS, bool IS_STEEP> struct Rungs {
+// A table of COUNT functions by the angle: values and slopes at even angles.
+template <class F, int COUNT> struct Table {
     typedef Numbers<F> P;
     typedef typename P::V V;
-    typedef Cubic<F, V> Place;
-    static constexpr int LAST = IS_STEEP ? STEEP_RUNGS : EVEN_RUNGS;
-    static constexpr int ROWS = 2 * (ANGLE_STEPS + 1);
     static constexpr F STEP = F(PI / ANGLE_STEPS);
-    // At which rung a number is.
-    template <class N> static INLINE Cubic<F, N> rung(const N& number) {
-        if constexpr (!IS_STEEP) return Cubic<F, N>(number * F(LAST), LAST);
-        // artanh g
-        const N g = P::most(number, N(P::all(F(0))));
-        return Cubic<F, N>(F(0.5 / STEEP_STEP) * P::log((F(1) + g) / (F(1) - g)), LAST);
+    static constexpr int SIZE = 2 * (ANGLE_STEPS + 1) * COUNT;
+    // Where an angle is, counted in steps.
+    template <class N> static INLINE Cubic<F, N> place(const N& angle) {
+        return Cubic<F, N>(angle, ANGLE_STEPS);
     }
-    // The coefficients there, with derivatives of what is a dual number.
-    template <class N, class A> static INLINE void curve(
-        const F* table, const Cubic<F, N>& rung, const Cubic<F, A>& angle, N* out) {
-        constexpr bool HAS_SLOPES = !is_plain<N>(), TURNS = !is_plain<A>();
-        V known[TERMS], by_rung[HAS_SLOPES ? TERMS : 1], by_angle[TURNS ? TERMS : 1];
-        read<HAS_SLOPES, TURNS>(table, rung.value(), angle.value(), known, by_rung, by_angle);
-        for (int k = 0; k < TERMS; ++k) {
-            if constexpr (TURNS)
-                out[k] = rung.part.chain(known[k], by_rung[k], angle.part, by_angle[k]);
-            else if constexpr (HAS_SLOPES)
-                out[k] = rung.part.chain(known[k], by_rung[k]);
-            else
-                out[k] = known[k];
+    // The first `count` of those from `table` on.
+    template <class N>
+    static INLINE void read(const Cubic<F, N>& angle, const F* table, int count, N* out) {
+        N weights[4];
+        angle.weigh(STEP, weights);
+        const typename P::I at = 2 * COUNT * angle.first;
+        for (int k = 0; k < count; ++k) {
+            out[k] = weights[0] * P::gather(table + k, at);
+            for (int j = 1; j < 4; ++j) out[k] += weights[j] * P::gather(table + j * COUNT + k, at);
         }
     }
-    template <class N> static constexpr INLINE bool is_plain() { return sizeof(N) == sizeof(V); }
-    // A lane's terms stand beside each other: it reads them as a vector of its own.
-    template <bool HAS_SLOPES, bool TURNS> static INLINE void read(
-        const F* table, const Place& rung, const Place& angle, V* out, V* by_rung, V* by_angle) {
-        V weights[4][4];
-        rung.weigh(F(1), weights[0]);
-        angle.weigh(STEP, weights[1]);
-        if (HAS_SLOPES) rung.weigh_slopes(F(1), weights[2]);
-        if (TURNS) angle.weigh_slopes(STEP, weights[3]);
-#if IS_GPU
-        for (int k = 0; k < TERMS; ++k) {
-            const auto found =
-                add<HAS_SLOPES, TURNS>(table + row(rung, angle, 0) * TERMS + k, weights, 0);
-            out[k] = found.value;
-            if (HAS_SLOPES) by_rung[k] = found.by[0];
-            if (TURNS) by_angle[k] = found.by[1];
-        }
-#else
-        static_assert(TERMS <= LANES && LANES <= 2 * TERMS, "terms of a row, by lanes");
-        Dual<V, 2> lines[LANES];
+    // What bars of these are for the table.
+    static INLINE void spread(const Cubic<F, V>& angle, F* table_bar, const V* bar) {
+        V weights[4];
+        angle.weigh(STEP, weights);
         for (int l = 0; l < LANES; ++l)
-            lines[l] = add<HAS_SLOPES, TURNS>(table + row(rung, angle, l) * TERMS, weights, l);
-        // Each lane's terms to each term's lanes.
-        for (int k = 0; k < TERMS; ++k)
-            for (int l = 0; l < LANES; ++l) {
-                out[k][l] = P::own(lines[l].value, k);
-                if (HAS_SLOPES) by_rung[k][l] = P::own(lines[l].by[0], k);
-                if (TURNS) by_angle[k][l] = P::own(lines[l].by[1], k);
-            }
-#endif
-    }
-    // Terms of lane l, one or LANES from `table` on.
-    template <bool HAS_SLOPES, bool TURNS>
-    static INLINE Dual<V, 2> add(const F* table, const V (*weights)[4], int l) {
-        Dual<V, 2> sum(V{});
-        for (int j = 0; j < 4; ++j) {
-            V here{}, turning{};
-            for (int i = 0; i < 4; ++i) {
-                const V terms = P::read(table + (j * ROWS + i) * TERMS);
-                here += P::own(weights[1][i], l) * terms;
-                if (TURNS) turning += P::own(weights[3][i], l) * terms;
-            }
-            sum.value += P::own(weights[0][j], l) * here;
-            if (HAS_SLOPES) sum.by[0] += P::own(weights[2][j], l) * here;
-            if (TURNS) sum.by[1] += P::own(weights[0][j], l) * turning;
-        }
-        return sum;
-    }
-    // What bars of the coefficients are for the table.
-    static INLINE void spread(F* table_bar, const Place& rung, const Place& angle, const V* bar) {
-        V rungs[4], angles[4];
-        rung.weigh(F(1), rungs);
-        angle.weigh(STEP, angles);
-        for (int j = 0; j < 4; ++j)
-            for (int i = 0; i < 4; ++i)
-                for (int l = 0; l < LANES; ++l) {
-                    F* const at = table_bar + (row(rung, angle, l) + j * ROWS + i) * TERMS;
-                    const F weight = P::lane(rungs[j], l) * P::lane(angles[i], l);
-                    for (int k = 0; k < TERMS; ++k) P::add_one(at + k, weight * P::lane(bar[k], l));
-                }
-    }
-    static INLINE int row(const Place& rung, const Place& angle, int l) {
-        return 2 * ROWS * P::lane_of(rung.first, l) + 2 * P::lane_of(angle.first, l);
+            for (int j = 0; j < 4; ++j)
+                for (int k = 0; k < COUNT; ++k)
+                    P::add_one(
+                        table_bar + (2 * P::lane_of(angle.first, l) + j) * COUNT + k,
+                        P::lane(weights[j], l) * P::lane(bar[k], l));
     }
 };
 

@@ -5,22 +5,17 @@
 
 namespace ddrecon {
 
-// How p depends on the number that differs from cell to cell (`bundle.py`).
-enum Form { SAME, LINEAR, EVEN, STEEP };
-
 // Channels that colors share, of a kind with one, are those of each. Without a peak it has -1
 // channels; as a number for each color, 0.
 template <
     int COLORS, int EXTINCTIONS, int DIFFUSES, int SCATTERINGS, int EMITTEDS, int PEAKS,
-    int PHASE_COUNT, Form FORM, int NUMBERS, int TABLES, int REMAINING, bool... POINTS>
+    int NUMBER_COUNT, int REMAINING, int TABLE_COUNT, int POWER_COUNT, bool SCALES, bool... POINTS>
 struct Layout {
     static constexpr int C = COLORS, EXTINCTION = EXTINCTIONS, SCATTERING = SCATTERINGS;
-    static constexpr int EMITTED = EMITTEDS;
-    static constexpr int BEAMS = sizeof...(POINTS), PHASES = PHASE_COUNT;
+    static constexpr int EMITTED = EMITTEDS, BEAMS = sizeof...(POINTS), TABLES = TABLE_COUNT;
     static constexpr bool HAS_PEAK = PEAKS >= 0, IS_PEAK_FIELD = PEAKS > 0;
-    static constexpr bool HAS_NUMBERS = FORM != SAME, IS_LINEAR = FORM == LINEAR;
-    static constexpr bool IS_STEEP = FORM == STEEP;
-    static constexpr bool HAS_RUNGS = (FORM == EVEN || IS_STEEP) && HAS_PEAK;
+    static constexpr int NUMBERS = NUMBER_COUNT;
+    static constexpr bool HAS_NUMBERS = NUMBERS > 0, IS_SCALED = SCALES;
     // All outputs: of diffuse light, then of each beam.
     static constexpr int MASSES = BEAMS * EXTINCTION, OUT = (1 + BEAMS) * C;
     static constexpr int FIRST_MASS = EXTINCTION + DIFFUSES, AFTER_MASSES = FIRST_MASS + MASSES;
@@ -29,57 +24,53 @@ struct Layout {
     static constexpr int FIRST_NUMBER = FIRST_PEAK + (IS_PEAK_FIELD ? PEAKS : 0);
     static constexpr int FIRST_REMAINING = FIRST_NUMBER + NUMBERS;
     static constexpr int CHANNELS = FIRST_REMAINING + REMAINING;
-    // Coefficients of p over the depth of the peak, or where there is none over the number.
-    static constexpr int TERMS = HAS_PEAK ? COEFFICIENTS : 1 + IS_LINEAR;
-    // Numbers of each beam that a ray is given: such coefficients, or where to find them.
-    static constexpr int RAY_TERMS =
-        HAS_NUMBERS ? (IS_LINEAR ? 2 * TABLES : 3) : PHASES * COEFFICIENTS;
-    static constexpr bool HAS_TABLES = HAS_NUMBERS ? TABLES > 1 : PHASES > 1;
-    static constexpr int RUNG_COUNT =
-        HAS_RUNGS ? 2 * (1 + (IS_STEEP ? STEEP_RUNGS : EVEN_RUNGS)) : 1;
+    // Coefficients of p over the depth of the peak, and over the number of the cell.
+    static constexpr int TERMS = HAS_PEAK ? COEFFICIENTS : 1, POWERS = POWER_COUNT;
+    static constexpr int CURVE = TERMS * POWERS, CURVES = TABLES * CURVE;
+    // Whether a thread holds those of an angle all together: on a GPU many are read one by one.
+    static constexpr bool HOLDS = !IS_GPU || POWERS == 1;
+    static constexpr int HELD = HOLDS ? CURVES : TABLES * TERMS;
 
+    static constexpr INLINE int at(int first, int channels, int c) {
+        return first + (channels > 1 ? c : 0);
+    }
     // Of color c: its extinction, also among masses; diffuse light, what scatters that, and beams.
-    static constexpr INLINE int extinction(int c) { return EXTINCTION > 1 ? c : 0; }
-    static constexpr INLINE int diffuse(int c) { return EXTINCTION + (DIFFUSES > 1 ? c : 0); }
+    static constexpr INLINE int extinction(int c) { return at(0, EXTINCTION, c); }
+    static constexpr INLINE int diffuse(int c) { return at(EXTINCTION, DIFFUSES, c); }
     static constexpr INLINE int diffusing(int c) {
-        return REMAINING ? FIRST_REMAINING + (REMAINING > 1 ? c : 0) : scattering(c);
+        return REMAINING ? at(FIRST_REMAINING, REMAINING, c) : scattering(c);
     }
     static constexpr INLINE int scattering(int c) {
-        return SCATTERING ? AFTER_MASSES + (SCATTERING > 1 ? c : 0) : extinction(c);
+        return SCATTERING ? at(AFTER_MASSES, SCATTERING, c) : extinction(c);
     }
-    static constexpr INLINE int emitted(int c) { return FIRST_EMITTED + (EMITTED > 1 ? c : 0); }
+    static constexpr INLINE int emitted(int c) { return at(FIRST_EMITTED, EMITTED, c); }
     static constexpr INLINE int mass(int b, int c) {
         return FIRST_MASS + b * EXTINCTION + extinction(c);
     }
-    static constexpr INLINE int peak(int c) { return FIRST_PEAK + (PEAKS > 1 ? c : 0); }
-    static constexpr INLINE int number(int c) { return FIRST_NUMBER + (NUMBERS > 1 ? c : 0); }
-    // Its phase function, the table of that, and what rays are given of it.
-    static constexpr INLINE int phase(int c) { return PHASES > 1 ? c : 0; }
-    static constexpr INLINE int table(int c) {
-        return HAS_TABLES ? c * 2 * (ANGLE_STEPS + 1) * RUNG_COUNT * TERMS : 0;
-    }
-    static constexpr INLINE int curve(int b, int c) {
-        return b * RAY_TERMS + (HAS_TABLES ? c * (HAS_NUMBERS ? 2 : COEFFICIENTS) : 0);
-    }
+    static constexpr INLINE int peak(int c) { return at(FIRST_PEAK, PEAKS, c); }
+    // Which number of the phase function is its own, and which table.
+    static constexpr INLINE int number(int c) { return at(0, NUMBERS, c); }
+    static constexpr INLINE int table(int c) { return at(0, TABLES, c); }
     static constexpr INLINE bool is_cubic(int c) { return c >= FIRST_MASS && c < AFTER_MASSES; }
     // Whether beam b is a point light: known to be none where there are none.
     static constexpr INLINE bool is_point(int b) {
         constexpr bool points[] = {POINTS..., false};
         return (POINTS || ... || false) && points[b];
     }
+    // Whether p of beam b changes along a ray.
+    static constexpr INLINE bool has_curve(int b) { return HAS_PEAK || HAS_NUMBERS || is_point(b); }
 };
 
 // What a kernel is given. Nodes lie in `slices` [N] of `fields`, channels of cells, at `planes` [N]
 // across them [u]; or, where there are none, anywhere: at such parts of the way from near to far.
 // `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
-// [2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
-// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E8.7, or what `bundle.py`
-// has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
-// [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the
-// mass before the rays, if any. `walked` [packets, words]: bits of the segments to be walked, if
-// not all are. Item i is packet i, or `dealt` [packets] says which.
+// [2 beams, R]: of each beam the angle in steps of a table, of a point light the foot; then of each
+// the cosine, of a point light the square distance. `numbers`: scale and peak by color, bound of
+// third-order corrections. `table` [tables * (steps + 1) * 2, CURVE]: coefficients of p by angle.
+// `fronts` [K, R]: the mass before the rays, if any. `walked` [packets, words]: bits of the
+// segments to be walked, if not all are. Item i is packet i, or `dealt` [packets] says which.
 template <class F> struct Given {
-    const F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts;
+    const F *planes, *rays, *angles, *numbers, *table, *fronts;
     const int *slices, *walked, *dealt;
     int ray_count, node_count, depth, rows, columns, words;
     int plane_stride, row_stride, column_stride;
@@ -89,14 +80,14 @@ template <class F> struct Given {
 };
 // The changes of some of that, those left out being 0; the fields' come behind the fields.
 template <class F> struct Changes {
-    const F *rays, *angles, *coefficients, *numbers, *table, *fronts;
+    const F *rays, *angles, *numbers, *table, *fronts;
 };
 
 // Whether nodes lie in slices; and whether derivatives are asked for by rays, by the angles at
-// which they see point lights, which turn with them, and by p's coefficients or tables.
-template <bool SLICED, bool RAYS, bool ANGLES, bool CURVES> struct Case {
+// which they see beams, which turn with them, and by the tables.
+template <bool SLICED, bool RAYS, bool ANGLES, bool TABLES> struct Case {
     static constexpr bool IS_SLICED = SLICED, VARIES_RAYS = RAYS;
-    static constexpr bool VARIES_ANGLES = ANGLES, VARIES_CURVES = CURVES;
+    static constexpr bool VARIES_ANGLES = ANGLES, VARIES_TABLES = TABLES;
 };
 
 // A walk finds values; or values and changes, where numbers N are dual; or what an adjoint needs:
@@ -107,56 +98,43 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     typedef Numbers<F> P;
     typedef typename P::V V;
     typedef typename P::W W;
-    typedef typename P::M M;
-    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
-    typedef ddrecon::Polynomial<F, L::TERMS> Polynomial;
-    typedef ddrecon::Point<F, L::TERMS> Point;
-    typedef ddrecon::Rungs<F, L::TERMS, L::IS_STEEP> Rungs;
+    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_RAYS, Which::VARIES_TABLES;
+    typedef ddrecon::Table<F, L::CURVE> Table;
 
-    // In an adjoint p has derivatives by the depth of the peak, by the number of the cell, and by
-    // two numbers of the angle: foot and square distance of a point light, part and cosine else.
-    static constexpr bool IS_TANGENT = MODE == TANGENT;
-    static constexpr bool HAS_VIEW =
-        MODE == ADJOINT && (VARIES_ANGLES || (VARIES_CURVES && L::HAS_NUMBERS && !L::IS_LINEAR));
-    static constexpr int DEPTH = 0, NUMBER = L::HAS_PEAK, VIEW = NUMBER + L::HAS_NUMBERS;
-    static constexpr int DIRECTIONS = VIEW + 2 * HAS_VIEW;
+    // In an adjoint p has derivatives by the depth of the peak, by the number of the cell, by the
+    // place in tables, and where p is scaled by the cosine.
+    static constexpr bool IS_TANGENT = MODE == TANGENT, IS_ADJOINT = MODE == ADJOINT;
+    static constexpr int DEPTH = 0, NUMBER = L::HAS_PEAK, PLACE = NUMBER + L::HAS_NUMBERS;
+    static constexpr int COSINE = PLACE + VARIES_ANGLES;
+    static constexpr int DIRECTIONS = COSINE + (VARIES_ANGLES && L::IS_SCALED);
     typedef Dual<V> D;
-    typedef Dual<V, DIRECTIONS ? DIRECTIONS : 1> Slopes;
+    // Of values; of p; of distances and angles along rays; of coefficients of p.
     typedef typename If<IS_TANGENT, D, V>::type N;
-    typedef typename If<MODE == ADJOINT, Slopes, N>::type E;
-    // Of distances along rays; of feet of point lights; of lengths, by either; of coefficients.
-    typedef typename If<IS_TANGENT && VARIES_RAYS, D, V>::type Distance;
-    typedef typename If<IS_TANGENT && VARIES_ANGLES, D, V>::type Foot;
-    typedef typename If<IS_TANGENT && (VARIES_RAYS || VARIES_ANGLES), D, V>::type Length;
-    typedef typename If<IS_TANGENT && VARIES_CURVES, D, V>::type Coefficient;
-    // Of angles in tables, and of what is read there.
-    typedef typename If<
-        HAS_VIEW, E, typename If<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type
-        Angle;
-    typedef typename If<L::HAS_RUNGS, E, Angle>::type Curve;
+    typedef typename If<IS_ADJOINT, Dual<V, DIRECTIONS ? DIRECTIONS : 1>, N>::type E;
+    typedef typename If<VARIES_RAYS || VARIES_ANGLES, N, V>::type Way;
+    typedef typename If<VARIES_RAYS || VARIES_ANGLES || (IS_TANGENT && VARIES_TABLES), E, V>::type
+        Curve;
     typedef typename If<IS_TANGENT, Dual<W>, W>::type Mass;
     typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
 
     // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
-    // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p; the beams'
-    // angles.
+    // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p.
     struct Node : Spot<F, IS_SLICED, V> {
-        Runs<F> runs;
         bool is_empty, is_lit;
-        Distance s, t;
+        Way s, t;
         N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
         V limit[L::MASSES + 1], decay[L::OUT];
         E p[L::OUT];
-        Cubic<F, V> angle[L::BEAMS + 1];
     };
 
     const Given<F>& given;
     const Changes<F> changes;
     int item, last, begin, first_node = 0, last_node;
     // Origin, direction, near and far.
-    Distance ray[8];
-    Foot foot[L::BEAMS + 1], across[L::BEAMS + 1];
-    Coefficient coefficients[L::BEAMS * L::RAY_TERMS + 1];
+    Way ray[8];
+    // Both `angles` of each beam, and p's coefficients of those that are no point lights.
+    Way foot[L::BEAMS + 1], across[L::BEAMS + 1];
+    Curve curves[L::BEAMS * L::HELD + 1];
     // Along y the packet's rays are closer together than along x; it `is_turned` where y are
     // columns.
     bool is_turned = false;
@@ -170,15 +148,13 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
           begin(item * LANES),
           last_node(given.node_count - 1),
           lines{given.rows, given.columns, given.row_stride, given.column_stride} {
-        for (int k = 0; k < 8; ++k) ray[k] = load<Distance>(given.rays, changes.rays, k, 8);
+        for (int k = 0; k < 8; ++k) ray[k] = load<Way>(given.rays, changes.rays, k, 8);
         for (int b = 0; b < L::BEAMS; ++b) {
-            foot[b] = load<Foot>(given.angles, changes.angles, row_of(b));
-            across[b] = load<Foot>(given.angles, changes.angles, row_of(L::BEAMS + b));
+            foot[b] = load<Way>(given.angles, changes.angles, row_of(b));
+            across[b] = load<Way>(given.angles, changes.angles, row_of(L::BEAMS + b));
+            if (L::has_curve(b) && !L::is_point(b))
+                read_tables(Table::place(foot[b]), curves + b * L::HELD);
         }
-        if (L::HAS_PEAK || L::HAS_NUMBERS)
-            for (int k = 0; k < L::BEAMS * L::RAY_TERMS; ++k)
-                coefficients[k] =
-                    load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
         // Nodes before the box and behind it are clamped to its faces: between them nothing is
         // added.
         const V near = value_of(ray[6]), far = value_of(ray[7]);
@@ -190,7 +166,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         if (LANES > 1 && IS_SLICED) turn();
     }
     void turn() {
-        const Distance s = distance(ray, (first_node + last_node) / 2);
+        const Way s = distance(ray, (first_node + last_node) / 2);
         const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
         const int end = begin + LANES <= last ? LANES - 1 : last - begin;
         const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
@@ -198,7 +174,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
         for (int k = 1; k <= 4; k += 3) {
-            const Distance y = ray[k];
+            const Way y = ray[k];
             ray[k] = ray[k + 1];
             ray[k + 1] = y;
         }
@@ -267,7 +243,6 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         node.y = at(1, lines.rows);
         node.x = at(2, lines.columns);
         if (!IS_SLICED) node.z = at(0, given.depth);
-        if (IS_SLICED) node.runs.find(node.y, node.x, lines);
         sample(node, n, 0, L::EXTINCTION);
         if (L::SCATTERING || L::EMITTED) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;
@@ -286,23 +261,6 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
         const F* const* fields = given.fields + PART * L::CHANNELS;
         const long long offset = slice(n);
-#if !IS_GPU
-        if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
-            if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
-                for (int r = 0; r < node.runs.count; ++r) {
-                    const Window<F> w(node.runs.run[r], node.y, node.x, lines);
-                    for (int c = from; c < to; ++c) {
-                        V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = w.value(fields[c] + offset, L::is_cubic(c), bend);
-                        known = P::pick(w.is_in, v, known);
-                        if (!L::is_cubic(c)) continue;
-                        V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
-                        known_bend = P::pick(w.is_in, bend, known_bend);
-                    }
-                }
-                return;
-            }
-#endif
         for (int c = from; c < to; ++c) {
             V bend = P::all(F(0));
             P::template part<PART>(node.v[c]) =
@@ -312,8 +270,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
     // bend of that each is handed to `take`.
-    template <class Take>
-    void take_slopes(int n, const Distance& s, int from, int to, Take take) const {
+    template <class Take> void take_slopes(int n, const Way& s, int from, int to, Take take) const {
         auto at = [&](int axis, int size, int direction) {
             return Place<F, Slope>::moving(value_of(place(ray, s, axis)), size, direction);
         };
@@ -345,73 +302,36 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     N peak_of(const Node& node, int c) const {
         return L::IS_PEAK_FIELD ? node.v[L::peak(c)] : number(L::C + c);
     }
-    N number_of(const Node& node, int h) const { return node.v[L::number(h)]; }
-    // Whether p of a beam is by coefficients at all, and in which lanes it is.
-    bool has_curve(int b) const {
-        return L::HAS_PEAK || L::IS_LINEAR || (L::is_point(b) && !L::IS_STEEP);
+    // A number by which p has derivatives in an adjoint.
+    template <int DIRECTION, class X, class A> static X seed(const A& a) {
+        X x(a);
+        if constexpr (IS_ADJOINT && IS_DUAL<X> && DIRECTION < DIRECTIONS)
+            x.by[DIRECTION] = P::all(F(1));
+        return x;
     }
-    M is_peaked(const Node& node, int c) const {
-        const V none = P::all(F(0));
-        return (L::IS_STEEP ? value_of(number_of(node, L::phase(c))) : F(1) + none) > none;
-    }
-    // In an adjoint, a number by which p has derivatives.
-    template <int DIRECTION, class X> static E seed(const X& x) {
-        E own(x);
-        if constexpr (MODE == ADJOINT) own.by[DIRECTION] = P::all(F(1));
-        return own;
-    }
-    // Where on its curve p is behind mass on both ways: by the depth of the peak, or by the number.
-    auto place_of(const Node& node, int c, const N& way) const {
-        if constexpr (L::HAS_PEAK)
-            return Polynomial::place(seed<DEPTH>(peak_of(node, c) * way));
-        else if constexpr (L::IS_LINEAR)
-            return seed<NUMBER>(number_of(node, c));
-        else
-            return P::all(F(0));
-    }
-    // Where beam b is in tables by angle at a node, and the cosine of that.
-    Cubic<F, Angle> see(const Node& node, int b, Angle& cosine) const {
-        Cubic<F, Angle> angle;
-        const Coefficient* given = coefficients + b * L::RAY_TERMS;
-        if constexpr (HAS_VIEW) {
-            if (L::is_point(b))
-                return Point::angle(
-                    seed<VIEW>(foot[b]), seed<VIEW + 1>(across[b]), E(node.t), cosine);
-            cosine = seed<VIEW + 1>(given[0]);
-            angle.part = seed<VIEW>(given[2]);
-        } else {
-            if (L::is_point(b))
-                return Point::angle(Angle(foot[b]), Angle(across[b]), Angle(node.t), cosine);
-            cosine = given[0], angle.part = given[2];
+    // The first `count` coefficients of p from `first` on in table h, cubic in the angle.
+    void read_table(
+        const Cubic<F, Way>& place, int h, int first, int count, Curve* coefficients) const {
+        const Cubic<F, Curve> angle(place.first, seed<PLACE, Curve>(place.part));
+        const int at = h * Table::SIZE + first;
+        Table::read(angle, given.table + at, count, coefficients);
+        if constexpr (IS_TANGENT && VARIES_TABLES) {
+            V change[L::HELD / L::TABLES];
+            if (changes.table) Table::read(place.value(), changes.table + at, count, change);
+            for (int k = 0; k < count && changes.table; ++k) coefficients[k].by[0] += change[k];
         }
-        angle.first = P::whole(value_of(given[1]));
-        return angle;
     }
-    // The coefficients of p of beam b in all tables, and p without a peak.
-    void read_tables(Node& node, int b, Curve* curves, E* plain) const {
-        Angle cosine;
-        const Cubic<F, Angle> angle = see(node, b, cosine);
-        node.angle[b] = angle.value();
-        for (int h = 0; h < L::PHASES; ++h) {
-            const F* const table = given.table + L::table(h);
-            Curve* const curve = curves + h * L::TERMS;
-            V change[L::TERMS];
-            const bool changes_itself = IS_TANGENT && VARIES_CURVES && changes.table;
-            if constexpr (L::HAS_RUNGS) {
-                const auto rung = Rungs::rung(seed<NUMBER>(number_of(node, h)));
-                Rungs::curve(table, rung, angle, curve);
-                if (changes_itself)
-                    Rungs::curve(changes.table + L::table(h), rung.value(), node.angle[b], change);
-            } else if (!L::IS_STEEP) {
-                Point::curve(angle, table, curve);
-                if (changes_itself)
-                    Point::curve(node.angle[b], changes.table + L::table(h), change);
-            }
-            if constexpr (IS_TANGENT && VARIES_CURVES)
-                for (int k = 0; k < L::TERMS && changes_itself; ++k) curve[k].by[0] += change[k];
-            if constexpr (L::IS_STEEP)
-                plain[h] = henyey_greenstein<F>(seed<NUMBER>(number_of(node, h)), E(cosine));
-        }
+    // All coefficients of p, from all tables, if they are HELD.
+    void read_tables(const Cubic<F, Way>& place, Curve* held) const {
+        for (int h = 0; h < L::TABLES && L::HOLDS; ++h)
+            read_table(place, h, 0, L::CURVE, held + h * L::CURVE);
+    }
+    // Where the light of beam b is in tables at a distance, and the cosine of its angle there.
+    template <class X>
+    static Cubic<F, X> see(int b, const X& foot, const X& across, const X& distance, X& cosine) {
+        if (L::is_point(b)) return Point<F>::see(foot, across, distance, cosine);
+        cosine = across;
+        return Table::place(foot);
     }
     // All else at node n: all outputs' emission, depth and p behind the mass `m`.
     void emit(int n, Node& node, const Mass* m) const {
@@ -430,27 +350,37 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             if constexpr (L::EMITTED > 0) node.w[c] += node.v[L::emitted(c)];
             node.u[c] = number(c) * P::narrow(m[L::extinction(c)]);
         }
+        E numbers[L::NUMBERS + 1], places[L::NUMBERS + 1];
+        for (int k = 0; k < L::NUMBERS; ++k) {
+            numbers[k] = seed<NUMBER, E>(node.v[L::FIRST_NUMBER + k]);
+            places[k] = number_place<F, L::IS_SCALED>(numbers[k]);
+        }
         for (int b = 0; b < L::BEAMS; ++b) {
-            const bool has_tables = L::is_point(b) || L::HAS_RUNGS;
-            Curve curves[L::PHASES * L::TERMS];
-            E plain[L::PHASES];
-            if (has_tables || L::IS_STEEP) read_tables(node, b, curves, plain);
+            Curve at_node[L::HELD];
+            const bool is_held = L::HOLDS && !L::is_point(b);
+            const Curve* const held = is_held ? curves + b * L::HELD : at_node;
+            Way cosine;
+            const Cubic<F, Way> place = see(b, foot[b], across[b], node.t, cosine);
+            if (L::is_point(b)) read_tables(place, at_node);
             for (int c = 0; c < L::C; ++c) {
-                const int i = L::C + b * L::C + c, h = L::phase(c);
+                const int i = L::C + b * L::C + c, k = L::number(c);
                 const N scattering = node.v[L::scattering(c)];
                 const N way = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
                 E p(P::all(F(1)));
-                if (has_curve(b)) {
-                    const auto place = place_of(node, c, way);
-                    p = has_tables
-                            ? Polynomial::template at<E>(curves + h * L::TERMS, place)
-                            : Polynomial::template at<E>(coefficients + L::curve(b, c), place);
+                if (L::has_curve(b)) {
+                    auto row = [&](int m) -> const Curve* {
+                        if (L::HOLDS) return held + L::table(c) * L::CURVE + m * L::TERMS;
+                        read_table(place, L::table(c), m * L::TERMS, L::TERMS, at_node);
+                        return at_node;
+                    };
+                    const E depth = seed<DEPTH, E>(peak_of(node, c) * way);
+                    p = Polynomials<F, L::TERMS, L::POWERS>::template at<E>(row, depth, places[k]);
                 }
                 if (L::HAS_PEAK) p = P::most(p, E(P::all(F(0))));
-                if (L::IS_STEEP)
-                    p = L::HAS_PEAK ? P::pick(is_peaked(node, c), p, plain[h]) : plain[h];
+                if constexpr (L::IS_SCALED)
+                    p = p * henyey_greenstein<F>(numbers[k], seed<COSINE, E>(cosine));
                 node.p[i] = p;
-                if constexpr (MODE == ADJOINT)
+                if constexpr (IS_ADJOINT)
                     node.w[i] = scattering * p.value;
                 else
                     node.w[i] = scattering * p;
@@ -463,10 +393,10 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
     }
     // What output i is integrated by: length, or for a point light the integral of 1 / r^2.
-    Length measure(const Node& a, const Node& b, int i) const {
+    Way measure(const Node& a, const Node& b, int i) const {
         const int beam = i / L::C - 1;
         if (i < L::C || !L::is_point(beam)) return b.t - a.t;
-        return Point::subtended(Length(foot[beam]), Length(across[beam]), Length(a.t), Length(b.t));
+        return Point<F>::subtended(foot[beam], across[beam], a.t, b.t);
     }
 };
 

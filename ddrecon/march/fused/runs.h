@@ -1,19 +1,45 @@
 #pragma once
 #include "ddrecon/march/fused/cells.h"
 #include "ddrecon/march/fused/optics.h"
-// Packets of places that are close to each other: their values, in vectors of cells. Some lanes, a
-// run, lie between the same two rows and within LANES columns. Columns of a row are read in one
-// piece, and lanes pick theirs by a permutation: 1.4 times as fast as lane by lane.
+// Cotangents of values at packets of places go back to the cells around. Neighboring rays meet the
+// same cells: some lanes, a run, lie between the same two rows and within LANES columns. Cells of
+// these columns add up all shares of the run in vectors, and are written once:
+//
+//                  lane l, with weights L of its columns i, j
+//         row m    .  .  .  .  .  .  .
+//         row i    .  .  #  #  .  .  .      # += (1 - a) bar L
+//         row j    .  .  #  #  .  .  .      # += a bar L
+//         row p    .  .  .  .  .  .  .
+//               first column
 
 namespace ddrecon {
 
-// Of more runs each lane finds its values itself.
-constexpr int MOST_RUNS = 5;
-
 #if IS_GPU
-template <class F> struct Runs {
-    template <class N> INLINE void find(const Place<F, N>&, const Place<F, N>&, const Lines&) {}
-};
+template <class F> INLINE void spread_place(
+    F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
+    const F ya = y.a, xa = x.a;
+    // Linear weights, and those of a (1 - a) / 2 second differences.
+    const F y_linear[4] = {0, 1 - ya, ya, 0}, x_linear[4] = {0, 1 - xa, xa, 0};
+    const F y_bend[4] = {1 - ya, 3 * ya - 2, 1 - 3 * ya, ya};
+    const F x_bend[4] = {1 - xa, 3 * xa - 2, 1 - 3 * xa, xa};
+    for (int j = 0; j < 4; ++j)
+        for (int i = 0; i < 4; ++i) {
+            const F weight =
+                bar * y_linear[j] * x_linear[i] + bend_bar * (y.excess * y_bend[j] * x_linear[i] +
+                                                              x.excess * y_linear[j] * x_bend[i]);
+            if (weight != F(0))
+                Packets<F>::add(field, y.cells[j] * lines.row + x.cells[i] * lines.column, weight);
+        }
+}
+template <class F, class L> INLINE void spread_in_slice(
+    F* const* fields, long long offset, const Place<F, F>& y, const Place<F, F>& x,
+    const Lines& lines, const F* v_bar, const F* bend_bar) {
+    for (int c = 0; c < L::CHANNELS; ++c)
+        if (fields[c])
+            spread_place(
+                fields[c] + offset, y, x, lines, v_bar[c],
+                L::is_cubic(c) ? bend_bar[c - L::FIRST_MASS] : F(0));
+}
 #else
 // `lanes` (bits) that are a run, the first of which is `lane`; they need columns `low` to `high`,
 // all within LANES columns from `first` on.
@@ -50,84 +76,6 @@ template <class F> struct Runs {
     }
 };
 
-// Permutations of lanes, where processors have them.
-template <class F> struct Permute;
-#if defined(__AVX512F__)
-template <class F> constexpr bool HAS_PERMUTATION = sizeof(F) == 4 && LANES == 16;
-template <> struct Permute<float> {
-    typedef Packets<float>::V V;
-    typedef Packets<float>::I I;
-    static INLINE V pick(V row, I at) { return __builtin_ia32_permvarsf512(row, at); }
-};
-#else
-template <class F> constexpr bool HAS_PERMUTATION = false;
-#endif
-
-// What a run sees of fields: its rows, and lanes' columns within its own.
-template <class F> struct Window {
-    typedef Packets<F> P;
-    typedef typename P::V V;
-    typename P::M is_in;
-    Place<F, V> y, x;
-    long long rows[4];
-    int first, stride;
-    Window(const Run& run, const Place<F, V>& y, const Place<F, V>& x, const Lines& lines)
-        : is_in(__builtin_convertvector(P::lanes_of(run.lanes), typename P::M)),
-          y(y),
-          x(x.behind(typename P::I{} - run.first)),
-          first(run.first),
-          stride(lines.column) {
-        for (int r = 0; r < 4; ++r)
-            rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
-    }
-    // As `Spot::value`.
-    INLINE V value(const F* f, bool is_cubic, V& bend) const {
-        V row[4];
-        UNROLLED
-        for (int r = 0; r < 4; ++r) {
-            if (!is_cubic && (r == 0 || r == 3)) continue;
-            if (stride == 1)
-                row[r] = P::read(f + rows[r] + first);
-            else
-                for (int l = 0; l < LANES; ++l)
-                    row[r][l] = f[rows[r] + (long long)(first + l) * stride];
-        }
-        auto cell = [&](int r, int c) HERE { return Permute<F>::pick(row[r], x.cells[c]); };
-        return is_cubic ? curved(y, x, cell, bend) : linear(y, x, cell);
-    }
-};
-
-#endif
-
-// Cotangents of values at packets of places in a slice go back to the cells. Neighboring rays meet
-// the same cells. Of a run, cells of its columns add up all shares in vectors, and are written
-// once:
-//
-//                  lane l, with weights L of its columns i, j
-//         row m    .  .  .  .  .  .  .
-//         row i    .  .  #  #  .  .  .      # += (1 - a) bar L
-//         row j    .  .  #  #  .  .  .      # += a bar L
-//         row p    .  .  .  .  .  .  .
-//               first column
-
-#if IS_GPU
-template <class F> INLINE void spread_place(
-    F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
-    const F ya = y.a, xa = x.a;
-    // Linear weights, and those of a (1 - a) / 2 second differences.
-    const F y_linear[4] = {0, 1 - ya, ya, 0}, x_linear[4] = {0, 1 - xa, xa, 0};
-    const F y_bend[4] = {1 - ya, 3 * ya - 2, 1 - 3 * ya, ya};
-    const F x_bend[4] = {1 - xa, 3 * xa - 2, 1 - 3 * xa, xa};
-    for (int j = 0; j < 4; ++j)
-        for (int i = 0; i < 4; ++i) {
-            const F weight =
-                bar * y_linear[j] * x_linear[i] + bend_bar * (y.excess * y_bend[j] * x_linear[i] +
-                                                              x.excess * y_linear[j] * x_bend[i]);
-            if (weight != F(0))
-                Packets<F>::add(field, y.cells[j] * lines.row + x.cells[i] * lines.column, weight);
-        }
-}
-#else
 // What the lanes of a run count for LANES columns of cells, from its first on.
 template <class F> struct Shares {
     typedef Numbers<F> P;
@@ -187,6 +135,42 @@ template <class F> struct Shares {
         }
     }
 };
+
+// Bars `v_bar` [CHANNELS] of values at places in a slice of `fields`, and `bend_bar` [MASSES] of
+// what masses there are off by, added to those fields that are not null.
+template <class F, class L, class V> void spread_in_slice(
+    F* const* fields, long long offset, const Place<F, V>& y, const Place<F, V>& x,
+    const Lines& lines, const V* v_bar, const V* bend_bar) {
+    typedef Packets<F> P;
+    bool is_asked[L::CHANNELS], has_cubic = false;
+    typename P::M is_zero = V{} == V{};
+    for (int c = 0; c < L::CHANNELS; ++c) {
+        const typename P::M is = v_bar[c] == V{};
+        is_asked[c] = fields[c] && !P::every(is);
+        if (is_asked[c]) is_zero = is_zero & is;
+        has_cubic = has_cubic || (is_asked[c] && L::is_cubic(c));
+    }
+    // Lanes outside of the box count for nothing.
+    const unsigned counting = ~P::bits_of(__builtin_convertvector(is_zero, typename P::I));
+    Runs<F> runs;
+    runs.find(y, x, lines);
+    for (int r = 0; r < runs.count; ++r) {
+        Run run = runs.run[r];
+        run.lanes &= counting;
+        if (!run.lanes) continue;
+        run.lane = __builtin_ctz(run.lanes);
+        const Shares<F> shares(run, y, x, lines, has_cubic);
+#pragma clang loop unroll(disable)
+        for (int c = 0; c < L::CHANNELS; ++c) {
+            if (!is_asked[c]) continue;
+            F* const field = fields[c] + offset;
+            if (L::is_cubic(c))
+                shares.template add<true>(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
+            else
+                shares.template add<false>(field, v_bar[c]);
+        }
+    }
+}
 #endif
 
 } // namespace ddrecon

@@ -1,7 +1,6 @@
-"""A sweep as fused kernels (NVIDIA Warp): directions that cross the same slices go side by side.
+"""A sweep as fused kernels (NVIDIA Warp), one text for processors and GPUs.
 
-For processors alone: on a GPU torch's operations sweep. `step.h` is the one formula of a step, in
-numbers or dual ones. `rows.h` follows light along rows of cells, and `returning.h` is the adjoint.
-What these are given stands in `given.h`. `directions` says which directions go together, `rows`
-launches the kernels, and `sweep` makes of it one function of tensors.
+`step.h` is the formula of a step, in numbers or dual ones. `ordinates.h` follows light along
+ordinates of a quadrature set, forward and back. `ordinates.py` has the tables that it is given,
+`launches.py` launches it, and `sweep.py` makes of it one differentiable function of tensors.
 """

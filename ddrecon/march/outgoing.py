@@ -34,19 +34,22 @@ class Inflow:
 
 
 @dataclass(frozen=True)
-class Emission:
-    """What a volume sends towards one camera.
+class OutgoingLight:
+    """The light that a volume sends towards one camera.
 
-    Emission a unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2.2, E2.3.
+    A unit of length adds kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2.2, E2.3.
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
-    does to p (E8.7). `remaining`, where given, scatters diffuse light in place of kappa_s: where
+    does to p (E8.7). `remaining`, if not None, scatters diffuse light in place of kappa_s: where
     the phase function differs from cell to cell, that is interpolated as the extinction is. Where
-    `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for. `emitted`
-    [C, z, y, x], if given, is what the medium emits by itself a unit length (E2.11). Where the
-    volume repeats, fields are those of an unrolled `period`; `from_eye`, if given, is what is seen
-    from another place, as other periods are. `inflow`, if given, is what comes in through faces.
-    `extended` are `fields` up to the faces, where they are known.
+    `support` [z, y, x], if not None, is 0, nothing scatters, and no derivative is asked for.
+    `emitted` [C, z, y, x], if not None, is what the medium emits by itself a unit length (E2.11).
+
+    `lit` is the light of beams with a profile, which is no part of `beams`: one for each beam,
+    without diffuse light and without what is emitted. Where the volume repeats, fields are those of
+    an unrolled `period`; `from_eye`, if not None, is what is seen from another place, as other
+    periods are. `inflow`, if not None, is what comes in through faces. `extended` are `fields` up
+    to the faces, where they are known.
     """
 
     grid: Grid
@@ -59,8 +62,9 @@ class Emission:
     remaining: Coefficient | None = None
     support: Tensor | None = None
     emitted: Tensor | None = None
+    lit: tuple[OutgoingLight, ...] = ()
     period: Unrolled | None = None
-    from_eye: Callable[[Tensor], Emission] | None = None
+    from_eye: Callable[[Tensor], OutgoingLight] | None = None
     inflow: Inflow | None = None
     extended: Mapping[str, Tensor] | None = None
 
@@ -88,26 +92,11 @@ class Emission:
             1 if self.emitted is None else len(self.emitted),
         )
 
-    def parts(self) -> list[Emission]:
-        """Emissions without profiles, which sum to this: of all beams that have none, and of each
-        that has one, as of a directional light where that scatters by so much more.
-        """
-        plain, parts = list[Beam | PointBeam](), list[Emission]()
-        for beam in self.beams:
-            if isinstance(beam, PointBeam) or beam.profile is None:
-                plain.append(beam)
-                continue
-            # Of all that is sent, this beam's light alone.
-            lit = replace(self.scattering, field=self.scattering.field * beam.profile)
-            beams, dark = (replace(beam, profile=None),), torch.zeros_like(self.diffuse[:1])
-            own = self.grid, self.extinction, lit, beams, dark, self.seen, self.peak
-            parts.append(Emission(*own, support=self.support, period=self.period))
-        return [replace(self, beams=tuple(plain), extended=None), *parts] if parts else [self]
-
     @functools.cached_property
     def fields(self) -> dict[str, Tensor]:
         """What rays sample, `[channels, z, y, x]`, as it stands in channels of one interpolation.
 
+        Its order is that of channels in kernels: of `Layout` in `fused/kernels.py` and `rays.h`.
         Masses are numbered by beam. `scattering` is left out where it is the extinction's field,
         `peak` where it is the same everywhere. Where the phase function differs from cell to cell,
         `number` is that of its numbers which does, and `remaining` is what scatters diffuse light.
@@ -137,3 +126,30 @@ class Emission:
         first = len(self.extinction.field) + len(self.fields["diffuse"])
         last = first + sum(len(beam.mass) for beam in self.beams)
         return ThirdOrder(first, last, self.extinction.mass_bound, border=1)
+
+
+def light_up(outgoing: OutgoingLight, beams: Sequence[Beam | PointBeam]) -> OutgoingLight:
+    """`outgoing` light without beams, and that of `beams`.
+
+    A beam with a profile is a directional light where the medium scatters by so much more.
+    """
+    plain, lit = list[Beam | PointBeam](), list[OutgoingLight]()
+    scattering, dark = outgoing.scattering, torch.zeros_like(outgoing.diffuse[:1])
+    for beam in beams:
+        if isinstance(beam, PointBeam) or beam.profile is None:
+            plain.append(beam)
+            continue
+        within = replace(scattering, field=scattering.field * beam.profile)
+        alone = OutgoingLight(
+            outgoing.grid,
+            outgoing.extinction,
+            within,
+            (replace(beam, profile=None),),
+            dark,
+            outgoing.seen,
+            outgoing.peak,
+            support=outgoing.support,
+            period=outgoing.period,
+        )
+        lit.append(alone)
+    return replace(outgoing, beams=tuple(plain), lit=tuple(lit))

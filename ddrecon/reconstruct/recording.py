@@ -1,0 +1,196 @@
+"""An iteration's derivative as programs that are recorded once a resolution and then replayed.
+
+There is one program of the light, one of each view, and one of the way back through the light. They
+are fixed programs of the parameters' values and of the last solutions, which are copied to where
+the programs look for them. A solve makes one iteration more than it took last; whether that was
+enough is read after the replay.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon import engine
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.kernels.graphs import record_graph
+from ddrecon.numerics.reads import without_reads
+from ddrecon.ranks import rank_count
+from ddrecon.reconstruct.gradients import (
+    Differentiated,
+    differentiate,
+    differentiate_view,
+    follow_back,
+    follow_light,
+)
+from ddrecon.reconstruct.objective import Comparison
+from ddrecon.scene import Scene, View
+from ddrecon.variables.kinds import is_of_volume
+from ddrecon.variables.values import with_values
+
+LOG = logging.getLogger(engine.LOG)
+SPARE = 1
+"""Iterations of a solve beyond those it took last: tolerances fall as images come closer."""
+LossOf = Callable[[View, Tensor], Tensor]
+Record = Callable[[Callable[[], Any]], tuple[Any, Callable[[], object]]]
+"""Returns the result of a computation and a function that computes it again, in place."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A `result` whose tensors are overwritten where they are by each `replay`."""
+
+    result: Any
+    replay: Callable[[], object]
+
+
+class Recording:
+    """The programs of iterations of `scene` with `values`, as `record` makes them.
+
+    `sums` are the derivatives by values and by the light's leaves, over the views of an iteration.
+    """
+
+    def __init__(
+        self, scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory, record: Record
+    ):
+        self.scene, self._record = scene, record
+        self.values = {name: value.detach().clone() for name, value in values.items()}
+        for name, value in values.items():
+            self.values[name].requires_grad_(value.requires_grad)
+        self.guesses = {key: solution.clone() for key, solution in memory.last.items()}
+        counts = {key: count + SPARE for key, count in memory.iterations.items()}
+        self.memory = SolveMemory(memory.is_warm, iterations=counts)
+        self.sums: list[Tensor] = []
+        self.light = self._recorded(self._follow_light)
+        self.views: dict[tuple[str, float], Program] = {}
+        self.back: Program | None = None
+
+    def replay(
+        self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
+    ) -> Differentiated | None:
+        """The derivative by `values`; None where a solve needs more iterations than it makes."""
+        # By `data`, whose changes nobody counts: the way back was recorded with other numbers.
+        for name, value in self.values.items():
+            value.data.copy_(values[name].detach())
+        for key, guess in self.guesses.items():
+            guess.copy_(memory.last[key])
+        programs = []
+        for view in compared.views:
+            key = view.name, compared.share(view)
+            if key not in self.views:
+                # Views are recorded in light that there can be.
+                self.light.replay()
+                look = partial(self._view, view.name, compared.loss_of)
+                self.views[key] = self._recorded(look)
+            programs.append(self.views[key])
+        if self.back is None:
+            self.back = self._recorded(self._follow_back)
+        # The light's program sets the sums to zero, to which views add.
+        self.light.replay()
+        images, loss = list[Tensor](), self.sums[0].new_zeros(())
+        for view, program in zip(compared.views, programs, strict=True):
+            program.replay()
+            image, view_loss = (tensor.clone() for tensor in program.result)
+            images.append(image)
+            loss = loss + view_loss
+            compared.note(view, image, view_loss)
+        self.back.replay()
+        if not self._is_solved(memory):
+            return None
+        gradients = {name: bar.clone() for name, bar in self.back.result.items()}
+        memory.last |= {key: solution.clone() for key, solution in self.memory.last.items()}
+        return Differentiated(images, loss, gradients)
+
+    def _recorded(self, computation: Callable[[], Any]) -> Program:
+        with without_reads():
+            return Program(*self._record(computation))
+
+    def _is_solved(self, memory: SolveMemory) -> bool:
+        """Whether solves are as exact as `memory` asks; one read. Their records are kept there."""
+        records = [*self.light_records, *self.back_records]
+        residuals = torch.stack([torch.as_tensor(record.residual) for record in records]).tolist()
+        tolerance = self.scene.diffusion.tolerance
+        for record, residual in zip(records, residuals, strict=True):
+            floor = memory.tolerance_floor.get(record.kind, 0.0)
+            if record.kind != "rounds" and not residual <= max(tolerance, floor):
+                return False
+        memory.records.extend(records)
+        return True
+
+    def _follow_light(self) -> Any:
+        self.memory.records, self.memory.last = [], dict(self.guesses)
+        self.cut = follow_light(self.scene, self.values, self.memory)
+        self.light_records = self.memory.records
+        self.inputs = [*self.values.values(), *self.cut.leaves]
+        self.sums = [torch.zeros_like(tensor) for tensor in self.inputs]
+
+    def _view(self, name: str, loss_of: LossOf) -> tuple[Tensor, Tensor]:
+        # What is made of values is made anew, so that each view has a graph of its own.
+        outside = {n: value for n, value in self.values.items() if not is_of_volume(n)}
+        world = with_values(self.scene, outside)
+        image, loss, bars = differentiate_view(
+            self.cut.light_field, world, name, loss_of, self.inputs
+        )
+        for total, bar in zip(self.sums, bars, strict=True):
+            if bar is not None:
+                total.add_(bar)
+        return image, loss
+
+    def _follow_back(self) -> dict[str, Tensor]:
+        self.memory.records = []
+        # Each run begins where the last iteration ended, also the second while it is recorded.
+        self.memory.last |= {key: one for key, one in self.guesses.items() if key[0] == "adjoint"}
+        count, values = len(self.values), list(self.values.values())
+        through = follow_back(self.cut.tensors, self.sums[count:], values, is_last=False)
+        self.back_records = self.memory.records
+        return {
+            name: direct.clone() if bar is None else direct + bar
+            for name, direct, bar in zip(self.values, self.sums, through, strict=False)
+        }
+
+
+class Replays:
+    """Derivatives of iterations at one resolution, replayed from the second on where they can be.
+
+    What cannot be recorded is computed plainly, and a line says why.
+    """
+
+    def __init__(self, scene: Scene, record: Record | None = None):
+        self.scene, self.record = scene, record
+        self.recording: Recording | None = None
+        settings = scene.diffusion
+        is_fixed = (settings.model, settings.scheme) in _FIXED and rank_count() == 1
+        if is_fixed and scene.volume.density.is_cuda:
+            self.record = record_graph
+
+    def differentiate(
+        self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
+    ) -> Differentiated:
+        """As of `gradients.differentiate`, where `compared` compares the images of its views."""
+        # A plain iteration tells how many iterations solves take, but not of an empty volume.
+        counts = memory.iterations.values()
+        if self.record is not None and counts and all(counts):
+            try:
+                self.recording = self.recording or Recording(
+                    self.scene, values, memory, self.record
+                )
+                objective = self.recording.replay(values, compared, memory)
+            except RuntimeError as error:
+                LOG.warning("iterations run without CUDA graphs: %s", str(error).split("\n")[0])
+                self.record = objective = None
+            if objective is not None:
+                return objective
+            self.recording = None
+        names = [view.name for view in compared.views]
+        compared.forget()
+        return differentiate(self.scene, names, values, compared, memory)
+
+
+_FIXED = {("p1", "conservative"), ("none", "conservative")}
+"""Models and schemes whose solves can make a fixed number of iterations."""

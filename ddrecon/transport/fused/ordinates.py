@@ -1,0 +1,197 @@
+"""Tables of discrete ordinates for kernels (`ordinates.h`): how each crosses the grid, in teams."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.transport.characteristics import Course, Direction
+from ddrecon.transport.sweep import sweep_rule
+
+POINTS = 4
+"""Cells upwind that light comes from at most."""
+MOST = 24
+"""Ordinates in a team at most: more read moments less often, fewer leave more of a cache."""
+
+FILL_GPU, FILL_CACHE = 2**18, 2**14
+"""Cells of slices at least that a launch by cells does: on a GPU about as many threads as it holds,
+on a processor few, since arrays of a chunk have all its slices.
+"""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Ordinates swept side by side: from `first` on, `count` of them, in teams from `team` on."""
+
+    first: int
+    count: int
+    team: int
+    teams: int
+
+    @property
+    def ordinates(self) -> slice:
+        """Their places in tables."""
+        return slice(self.first, self.first + self.count)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Ordinates in the order of kernels: `numbers` in the quadrature set, and what kernels get.
+
+    `chunks` are swept one after another. `arrays`: `teams` [T, 4] and `ordinates` [N, 13] have the
+    structs `Team` and `Ordinate` of `ordinates.h`, `paths` [N, 8] the struct `Path`; `values` and
+    `weighted` [N, K] are harmonics, and harmonics times quadrature weights;
+    `moved` [N, 3] is a part of `paths`; `ones` [N, 1].
+    """
+
+    numbers: list[int]
+    chunks: list[Chunk]
+    arrays: dict[str, Tensor]
+    most: int
+
+
+@dataclass(frozen=True)
+class Ordinate:
+    """How the ordinate `number` of a quadrature set crosses the grid.
+
+    `axis`: that across which its slices lie; `step` [u]: its path through a cell; `moved`: cells
+    that it passes along z, y and x meanwhile, with signs. Light comes from `points`, so many cells
+    away, against its senses, with `weights`. Across x the first lies in the same row.
+    """
+
+    number: int
+    axis: int
+    step: float
+    moved: tuple[float, ...]
+    points: list[tuple[int, ...]]
+    weights: list[float]
+
+    @staticmethod
+    def of(grid: Grid, number: int, direction: Direction) -> Ordinate:
+        """The ordinate of a `direction` through `grid` (E2.9)."""
+        course = Course.of(grid, direction)
+        axis, moved = course.order[0] - 1, course.moved
+        points, weights = list[tuple[int, ...]](), list[float]()
+        for point in product(*((1,) if other == axis else (0, 1) for other in range(3))):
+            weight = math.prod(
+                abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True)
+            )
+            # Scalar recurrences in rows want their own point, whatever its weight.
+            if weight > 0 or (axis == 2 and not points):
+                points.append(point)
+                weights.append(weight)
+        # Equal paths share decay terms: mirror images have equal ones but for rounding.
+        step = float(f"{course.step:.14g}")
+        return Ordinate(number, axis, step, tuple(moved), points, weights)
+
+    @property
+    def senses(self) -> list[int]:
+        """Along z, y and x, 1 or -1; 1 as well where it does not move."""
+        return [-1 if moved < 0 else 1 for moved in self.moved]
+
+    @property
+    def turn(self) -> int:
+        """In which order of rows, up in y or down, cells upwind are done first; 0: in either."""
+        return 0 if self.axis == 0 else (self.moved[1] > 0) - (self.moved[1] < 0)
+
+    def integers(self, width: int) -> list[int]:
+        """The struct `Ordinate` for rows of so many cells."""
+        _, up, along = self.senses
+        shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
+        lacking = [0] * (POINTS - len(self.points))
+        is_single = len(self.points) == 1 and self.axis < 2
+        backs = [back for back, _, _ in self.points]
+        count = 1 if is_single else POINTS
+        return [self.axis, *self.senses, count, *backs, *lacking, *shifts, *lacking]
+
+    def numbers(self) -> list[float]:
+        """The struct `Path`."""
+        lacking = [0.0] * (POINTS - len(self.weights))
+        return [self.step, *self.moved, *self.weights, *lacking]
+
+
+def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[list[list[list[Ordinate]]]]:
+    """Chunks of teams for kernels by rows: of each team those that go up in y, and down.
+
+    Teams come in pairs, along z and against it, of which a chunk has so many `pieces`.
+    """
+    ways = [[o for o in ordinates if (o.moved > (0, 0, 0)) == is_up] for is_up in (True, False)]
+    count = math.ceil(len(ways[0]) / MOST / pieces) * pieces
+    teams = list[list[list[Ordinate]]]()
+    for n in range(count):
+        for way in ways:
+            turns = {turn: [o for o in way[n::count] if o.turn == turn] for turn in (1, -1, 0)}
+            # Those that can do either turn with the others, so that rows are read once.
+            turns[1 if len(turns[1]) >= len(turns[-1]) else -1] += turns[0]
+            teams.append([sorted(turns[turn], key=lambda o: o.step) for turn in (1, -1)])
+    return [teams[k : k + 2 * pieces] for k in range(0, len(teams), 2 * pieces)]
+
+
+def ordinate_tables(
+    grid: Grid, directions: int, like: Tensor, moments: int, pieces: int | None = None
+) -> Tables:
+    """Tables of a quadrature set of `directions` through `grid`, for so many `moments`.
+
+    They are for kernels by rows, whose teams are `pieces` of the directions, or by cells (None);
+    of the type and on the device of `like` [..., C, z, y, x].
+    """
+    most = 0
+    if pieces is None:
+        _, second, largest = sorted(grid.shape)
+        items = FILL_GPU if like.is_cuda else FILL_CACHE
+        most = math.ceil(items / (like.shape[-4] * second * largest))
+    return _make_tables(grid, directions, moments, pieces, most, like.dtype, like.device)
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _make_tables(
+    grid: Grid,
+    directions: int,
+    moments: int,
+    pieces: int | None,
+    most: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tables:
+    """The same; chunks by cells have so many ordinates at `most`."""
+    points, weights, harmonics = sweep_rule(directions, moments)
+    ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
+    if pieces is not None:
+        chunks_of_teams = _team_rows(ordinates, pieces)
+    else:
+        single = [[[o], []] for o in ordinates]
+        chunks_of_teams = [single[k : k + most] for k in range(0, len(single), most)]
+    order, teams, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
+    for chunk in chunks_of_teams:
+        first, team = len(order), len(teams)
+        for number, (ups, downs) in enumerate(chunk):
+            sense = ups[0].senses[0] if pieces is None else 1 - 2 * (number % 2)
+            begin, middle = len(order), len(order) + len(ups)
+            order += ups + downs
+            teams.append([begin, middle, len(order), sense])
+        chunks.append(Chunk(first, len(order) - first, team, len(teams) - team))
+    numbers = [o.number for o in order]
+    values = harmonics[numbers]
+    of_numbers = {
+        "paths": torch.tensor([o.numbers() for o in order], dtype=torch.float64),
+        "moved": torch.tensor([o.moved for o in order], dtype=torch.float64),
+        "values": values,
+        "weighted": values * values.new_tensor(weights)[numbers, None],
+        "ones": values.new_ones(len(order), 1),
+        "one": values.new_ones(len(order), 1),
+    }
+    integers = {"teams": teams, "ordinates": [o.integers(grid.shape[2]) for o in order]}
+    arrays = {
+        name: torch.tensor(rows, dtype=torch.int32, device=device)
+        for name, rows in integers.items()
+    } | {name: numbers.to(device, dtype) for name, numbers in of_numbers.items()}
+    team_size = max(end - begin for begin, _, end, _ in teams)
+    return Tables(numbers, chunks, arrays, team_size)

@@ -1,0 +1,99 @@
+"""A recorded iteration is the plain one, whatever the values are by then."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+from tape import record
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
+from ddrecon.losses import Target
+from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.objective import Comparison
+from ddrecon.reconstruct.recording import Recording, Replays
+from ddrecon.scene import Scene, View
+from ddrecon.variables.values import value_of
+
+NAMES = "density", "albedo", "lights.0.irradiance"
+
+
+@pytest.fixture(params=["torch", "warp"])
+def scene(request: pytest.FixtureRequest) -> Scene:
+    use_engine(request.param)
+    base = make_scene(
+        random_values(5, 4, 6), ambient=(0.2, 0.3, 0.4), transport_rounds=1, tolerance=1e-12
+    )
+    eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5), "three": (-1.8, 0.4, -1.5)}
+    image = random_values(3, 4, 5, seed=2)
+    views = [View(name, make_camera(eye), image) for name, eye in eyes.items()]
+    return replace(base, views=views, render=replace(base.render, tolerance=0))
+
+
+def leaves_of(scene: Scene, factor: float = 1.0) -> dict[str, Tensor]:
+    return {name: (factor * value_of(scene, name)).detach().requires_grad_() for name in NAMES}
+
+
+def compare(scene: Scene, *names: str) -> Comparison:
+    targets = {view.name: Target.of(view.image, None) for view in scene.views}
+    return Comparison([scene.view(name) for name in names], targets)
+
+
+def differentiate_plainly(
+    scene: Scene, values: Mapping[str, Tensor], *names: str
+) -> Differentiated:
+    return differentiate(scene, names, values, compare(scene, *names), SolveMemory())
+
+
+def assert_same(objective: Differentiated, plain: Differentiated) -> None:
+    torch.testing.assert_close(objective.loss, plain.loss, rtol=1e-10, atol=0)
+    torch.testing.assert_close(objective.images, plain.images, rtol=1e-10, atol=1e-12)
+    for name, bar in objective.gradients.items():
+        close = 1e-9 * float(plain.gradients[name].abs().max())
+        torch.testing.assert_close(bar, plain.gradients[name], rtol=0, atol=close, msg=name)
+
+
+def test_replays_are_plain_iterations(scene: Scene) -> None:
+    """Of other values and views than those that were recorded, and after other views."""
+    memory = SolveMemory()
+    differentiate(scene, ["one"], leaves_of(scene), compare(scene, "one"), memory)
+    # Volumes here differ by more than those of two iterations in a row.
+    memory.iterations = {key: 2 * count for key, count in memory.iterations.items()}
+    recording = Recording(scene, leaves_of(scene), memory, record)
+    for factor, names in ((1.0, ["one", "two"]), (0.9, ["two", "one"]), (1.1, ["three"])):
+        values, compared = leaves_of(scene, factor), compare(scene, *names)
+        objective = recording.replay(values, compared, memory)
+        assert objective is not None
+        assert_same(objective, differentiate_plainly(scene, values, *names))
+        assert list(compared.pictures) == names
+
+
+def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
+    memory = SolveMemory()
+    differentiate(scene, ["one"], leaves_of(scene), compare(scene, "one"), memory)
+    memory.iterations = dict.fromkeys(memory.iterations, 0)
+    recording = Recording(scene, leaves_of(scene), memory, record)
+    assert recording.replay(leaves_of(scene, 0.5), compare(scene, "one"), memory) is None
+    replays = Replays(scene, record)
+    values, compared = leaves_of(scene, 0.5), compare(scene, "one")
+    objective = replays.differentiate(values, compared, memory)
+    assert_same(objective, differentiate_plainly(scene, values, "one"))
+    assert len(compared.metrics["psnr"]) == 1
+
+
+def test_what_cannot_be_recorded_runs_plainly(
+    scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A camera that is sought looks at other rays in each iteration."""
+    memory, values = SolveMemory(), leaves_of(scene)
+    name = "views.one.camera"
+    values[name] = value_of(scene, name).clone().requires_grad_()
+    replays = Replays(scene, record)
+    for _ in range(2):
+        objective = replays.differentiate(values, compare(scene, "one"), memory)
+    assert replays.record is None
+    assert "without CUDA graphs" in caplog.text
+    assert_same(objective, differentiate_plainly(scene, values, "one"))
