@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.engine import engine_of_parts
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import (
@@ -47,14 +46,6 @@ def needed_terms(scene: Scene) -> list[str]:
         *_diffuse_terms(medium, scene, is_diffuse),
         f"view rays: {samples} a cell of at most {depth:.2g} optical depths",
     ]
-
-
-def engine_of_scene(scene: Scene) -> dict[str, str]:
-    """The engine that runs each part of rendering `scene`."""
-    settings = scene.diffusion
-    return engine_of_parts(
-        printed=settings.scheme == "printed", flux_limited=settings.model == "flux_limited"
-    )
 
 
 def _color_term(scene: Scene) -> str:
