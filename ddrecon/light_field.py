@@ -52,10 +52,8 @@ from ddrecon.transport.sweep import DIRECTIONS
 
 @dataclass(frozen=True)
 class FaceLight:
-    """What transport rounds know of light at faces (E2.17).
-
-    `outside` [C, 1, 1, 1] is the radiance that enters through them; `source` [1 or 4, C, z, y, x]
-    are the moments Q0 and Q1 of what cells receive of beams.
+    """What transport rounds know of light at faces (E2.17): `outside` [C, 1, 1, 1], the radiance
+    that enters there, and `source` [1 or 4, C, z, y, x], moments Q0 and Q1 of light from beams.
     """
 
     outside: Tensor
