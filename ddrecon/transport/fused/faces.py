@@ -38,10 +38,9 @@ def sweep_faces(
     for number, chunk in enumerate(tables.chunks):
         numbers = tables.numbers[chunk.ordinates]
         courses = [Course.of(medium.grid, points[n]) for n in numbers]
-        given = None if ends is None else [ends[n] for n in numbers]
-        part, left = recompute(
-            _sweep_chunk, medium, source, gradient, inflow, directions, number, courses, given
-        )
+        entering = None if ends is None else [ends[n] for n in numbers]
+        light, place = (source, gradient, inflow), (directions, number)
+        part, left = recompute(_sweep_chunk, medium, light, place, courses, entering)
         moments = moments + part
         gone |= zip(numbers, left, strict=True)
     return moments, [gone[n] for n in range(directions)]
@@ -49,15 +48,16 @@ def sweep_faces(
 
 def _sweep_chunk(
     medium: Medium,
-    source: Tensor,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    directions: int,
-    number: int,
+    emitted: tuple[Tensor, Tensor, Tensor | None],
+    place: tuple[int, int],
     courses: list[Course],
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
-    """The moments of the ordinates of a chunk, and what leaves along each."""
+    """The moments of the ordinates of a chunk, and what leaves along each.
+
+    `emitted`: source, gradient and inflow; `place`: how many directions there are, and the chunk.
+    """
+    source, gradient, _ = emitted
     nothing = [_nothing(course, source) for course in courses]
     ends = nothing if ends is None else ends
 
@@ -68,10 +68,9 @@ def _sweep_chunk(
             for first, end in zip(across, nothing if is_dark else ends, strict=True)
         ]
         rings = [_place(medium.grid, *one) for one in zip(courses, entering, strict=True)]
-        light = source, gradient, inflow
-        if is_dark:
-            light = torch.zeros_like(source), torch.zeros_like(gradient), None
-        moments, ring = sweep_chunk(medium, *light, directions, number, torch.stack(rings))
+        dark = torch.zeros_like(source), torch.zeros_like(gradient), None
+        light = dark if is_dark else emitted
+        moments, ring = sweep_chunk(medium, *light, *place, torch.stack(rings))
         return moments, [
             _leave(medium.grid, *one) for one in zip(courses, ring, entering, strict=True)
         ]

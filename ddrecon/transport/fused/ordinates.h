@@ -111,7 +111,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
     static constexpr int KINDS = 1 + IS_DUAL<N>;
     // What an ordinate gives in a cell: the mean of I, or cotangents of what scatters, of its rise,
     // of the depth and of scattering, the last two for coefficients of 1.
-    enum { MEAN, OWN = 0, RISE, MASS, SCATTERED, OUTPUTS };
+    enum { MEAN, SOURCE = 0, RISE, MASS, SCATTERED, OUTPUTS };
     enum { PHI, PSI, ETA, ETA_SLOPE, PASSED, DECAYS };
     // A row of cells, or one cell: the place of its first cell along z, counted from where the team
     // begins, y and x, among cells, and among numbers in rings: in its plane and in that upwind, or
@@ -154,7 +154,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
     INLINE long long scratch_size() const {
         return (DECAYS + 2 + 2LL * of.count + (2 + OUTPUTS) * of.most) * of.pitch;
     }
-    INLINE F* own_row(int kind, int j) const {
+    INLINE F* ordinate_row(int kind, int j) const {
         return BY_CELLS ? scratch + DECAYS + 2 + kind
                         : source_rows + (2 * of.count + kind * of.most + j - team.begin) * of.pitch;
     }
@@ -183,7 +183,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
     INLINE F* output(int which, int j, const Row& row) const {
         if (BY_CELLS)
             return of.outputs + ((long long)which * of.launched + place(j)) * cells + row.at;
-        return own_row(2 + which, j);
+        return ordinate_row(2 + which, j);
     }
     INLINE auto field(const F* values, const F* changes, int channels, const Row& row) const {
         return readable<N>(values, changes) + ((channels > 1 ? color * cells : 0) + row.at);
@@ -202,15 +202,15 @@ template <class N, class F, Kind KIND> struct Ordinates {
     // Where light comes from, `side` -1, or goes to, 1, of a ring of planes.
     template <int POINTS>
     INLINE Upwind<POINTS> neighbors(const F* ring, const long long* planes, int side, int j) const {
-        Upwind<POINTS> found;
+        Upwind<POINTS> points;
         const Ordinate& ordinate = this->ordinate(j);
         UNROLLED
         for (int k = 0; k < POINTS; ++k) {
             const F* const at = ring + planes[ordinate.back[k]] + side * ordinate.shifts[k];
-            found.weights[k] = path(j).weights[k];
-            found.from[k] = readable<N>(at, at + plane_size);
+            points.weights[k] = path(j).weights[k];
+            points.from[k] = readable<N>(at, at + plane_size);
         }
-        return found;
+        return points;
     }
 
     // Copies a number in a ring to beyond the opposite faces along which the grid is periodic, but
@@ -247,7 +247,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
                 INDEPENDENT
                 for (int c = 0; c < of.width; ++c) copies[k * of.pitch + c] = from[k * all + c];
             }
-        F* const sums = own_row(kind, begin);
+        F* const sums = ordinate_row(kind, begin);
         for (long long c = 0; c < (end - begin) * pitch(); ++c) sums[c] = F(0);
         const Product<F> product = {sums,
                                     pitch(),
@@ -380,12 +380,12 @@ template <class N, class F, Kind KIND> struct Ordinates {
         const F* const at = of.entering + place(j) * of.planes * KINDS * plane_size + row.light[0];
         return readable<N>(at, at + plane_size);
     }
-    // What is found of a row: I where it leaves cells and its mean, or one of them. ALONG: I where
+    // The result for a row: I where it leaves cells and its mean, or one of them. ALONG: I where
     // it leaves cells, but for what comes from cells of the same row, and which part of that does.
     enum Result { BOTH, AFTER, WITHIN, ALONG };
     template <Result RESULT, int POINTS> APART void follow_row(const Row& row, int j) const {
         const Path<F> path = this->path(j);
-        const auto own = readable<N>(own_row(0, j), own_row(1, j));
+        const auto source = readable<N>(ordinate_row(0, j), ordinate_row(1, j));
         const auto e = field(of.extinction, of.d_extinction, of.extinctions, row);
         const auto sc = field(of.scattering, of.d_scattering, of.scatterings, row);
         const auto rises = field(of.gradient, of.d_gradient, of.colors + 1, row);
@@ -407,7 +407,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
             const N depth = scale * e[c], scatters = strength * sc[c];
             const N rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
-            const Emitted<N> emitted = {scatters * own[c], scatters * rise};
+            const Emitted<N> emitted = {scatters * source[c], scatters * rise};
             const Passage<N> by = pass_through(decay_at(decays, pitch, c), depth);
             if constexpr (RESULT != WITHIN) {
                 const N after = light_after(arriving, emitted, inflow, by);
@@ -424,11 +424,11 @@ template <class N, class F, Kind KIND> struct Ordinates {
     }
     // What comes along a row itself is carried on from cell to cell.
     template <class M> INLINE void carry_on(F* to, F* d_to, int way) const {
-        const auto given = readable<M>(to, d_to), by = readable<M>(carried, carried + pitch());
+        const auto local = readable<M>(to, d_to), by = readable<M>(carried, carried + pitch());
         M x = F(0);
         for (int t = 0; t < width; ++t) {
             const int c = way > 0 ? t : width - 1 - t;
-            x = given[c] + by[c] * x;
+            x = local[c] + by[c] * x;
             to[c] = value_of(x);
             if constexpr (IS_DUAL<M>) d_to[c] = change_of(x);
         }
@@ -455,7 +455,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
             },
             [&](const Row& row, int begin, int end) HERE {
                 const int apart = sizeof(Path<F>) / sizeof(F);
-                collect(OWN, of.values, of.count, of.count, of.moments, row, begin, end);
+                collect(SOURCE, of.values, of.count, of.count, of.moments, row, begin, end);
                 collect(RISE, of.paths + 1, apart, 3, of.gradient_bar, row, begin, end);
                 collect(MASS, of.ones, 1, 1, of.e_bar, row, begin, end);
                 collect(SCATTERED, of.ones, 1, 1, of.sc_bar, row, begin, end);
@@ -469,7 +469,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
     APART void return_along(const Row& row, int j) const {
         F* const returning = ring(of.returning, of.back_planes, j);
         auto downwind = neighbors<4>(returning, row.returning, 1, j);
-        const F along = downwind.weights[0], *const bar = own_row(1, j),
+        const F along = downwind.weights[0], *const bar = ordinate_row(1, j),
                 *const decays = this->decays;
         downwind.weights[0] = F(0);
         F* const to = returning + row.returning[0];
@@ -487,7 +487,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
     template <bool IS_RETURNING, int POINTS> APART F return_row(const Row& row, int j) const {
         REORDERED
         const Path<F> path = this->path(j);
-        const F *const own = own_row(0, j), *const bar = own_row(1, j);
+        const F *const source = ordinate_row(0, j), *const bar = ordinate_row(1, j);
         const F* const e = field(of.extinction, nullptr, of.extinctions, row);
         const F* const sc = field(of.scattering, nullptr, of.scatterings, row);
         const F* const rises = field(of.gradient, nullptr, of.colors + 1, row);
@@ -495,7 +495,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
         const auto upwind = neighbors<POINTS>(ring(of.light, of.planes, j), row.light, -1, j);
         const auto downwind = neighbors<POINTS>(returning, row.returning, 1, j);
         F* const to = returning + row.returning[0];
-        F *const own_bar = output(OWN, j, row), *const rise_bar = output(RISE, j, row);
+        F *const source_bar = output(SOURCE, j, row), *const rise_bar = output(RISE, j, row);
         F *const mass_bar = output(MASS, j, row), *const scattered = output(SCATTERED, j, row);
         const F step = path.step, scale = this->scale * step, strength = this->strength * step;
         const F inflow = this->inflow;
@@ -509,10 +509,10 @@ template <class N, class F, Kind KIND> struct Ordinates {
             F arriving = upwind(c), after_bar = downwind(c);
             // Where light leaves the box its cotangent was written before.
             if constexpr (HAS_FACES) arriving += entering(row, j)[c], after_bar += to[c];
-            const F depth = scale * e[c], scatters = strength * sc[c], o = own[c];
+            const F depth = scale * e[c], scatters = strength * sc[c], q = source[c];
             const F rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
-            const Emitted<F> emitted = {scatters * o, scatters * rise};
+            const Emitted<F> emitted = {scatters * q, scatters * rise};
             const Decay<F> decay = decay_at(decays, pitch, c);
             const Passage<Dual<F>> by = pass_through(decay, Dual<F>(depth, F(1)));
             const F depth_bar = after_bar * light_after(arriving, emitted, inflow, by).by[0] +
@@ -521,10 +521,10 @@ template <class N, class F, Kind KIND> struct Ordinates {
             const F slope_bar = after_bar * by.rising.value - within_bar * by.eta.value;
             if constexpr (IS_RETURNING)
                 to[c] = after_bar * by.passed.value + within_bar * by.phi.value;
-            own_bar[c] = whole_bar * scatters;
+            source_bar[c] = whole_bar * scatters;
             rise_bar[c] = slope_bar * scatters;
             mass_bar[c] = depth_bar * step;
-            scattered[c] = (whole_bar * o + slope_bar * rise) * step;
+            scattered[c] = (whole_bar * q + slope_bar * rise) * step;
             sum += within_bar * by.phi.value - after_bar * by.lost.value;
         }
         return sum;

@@ -142,5 +142,5 @@ class _Sweep(torch.autograd.Function):
             moments, light = sweep.follow(entering=entering)
             return moments if light is None else (moments, light[:, :, :, 1].contiguous())
 
-        found = run_plainly(change, *ctx.saved_tensors, *changes[2:])
-        return found if isinstance(found, tuple) else (found, None)
+        d_results = run_plainly(change, *ctx.saved_tensors, *changes[2:])
+        return d_results if isinstance(d_results, tuple) else (d_results, None)
