@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,7 +110,7 @@ class Sweep:
                 if saved is not None:
                     saved[number, chunk.ordinates, colors] = light[:, :, (stage.start - 1) % planes]
                 self._launch(bound, chunk, colors, stage)
-            self._sum_outputs(chunk, outputs, {"weighted": moments})
+            self._sum_outputs(chunk, outputs, ["weighted"], [moments])
         return _total(moments), light if self.has_faces else saved
 
     def go_back(
@@ -152,8 +152,7 @@ class Sweep:
                     light[:, :, (stage.start - 1) % planes] = saved[number, chunk.ordinates, colors]
                     self._launch(follow, chunk, colors, stage)
                 self._launch(go_back, chunk, colors, stage)
-            names = "values", "moved", "ones", "one"
-            self._sum_outputs(chunk, outputs, dict(zip(names, sums, strict=True)))
+            self._sum_outputs(chunk, outputs, ["values", "moved", "ones", "ones"], sums)
             inflow[colors] += entered.view(chunk.teams, -1, self.lanes).sum((0, 2))
         totals = [_total(one) for one in (mass, scattered, gradient, source)]
         return inflow.to(self.like), totals[0][0], totals[1][0], *totals[2:]
@@ -201,12 +200,14 @@ class Sweep:
             return None
         return self.like.new_empty(count, chunk.count, *self.like.shape[1:])
 
-    def _sum_outputs(self, chunk: Chunk, outputs: Tensor | None, sums: dict[str, Tensor]) -> None:
-        """Adds outputs of ordinates, times tables of these names, to `sums`."""
+    def _sum_outputs(
+        self, chunk: Chunk, outputs: Tensor | None, tables: Sequence[str], sums: Sequence[Tensor]
+    ) -> None:
+        """Adds outputs of ordinates, times `tables` of these names, to `sums`."""
         if outputs is None:
             return
-        for output, (name, (total,)) in zip(outputs, sums.items(), strict=True):
-            matrix = self.tables.arrays[name][chunk.ordinates]
+        for output, table, (total,) in zip(outputs, tables, sums, strict=True):
+            matrix = self.tables.arrays[table][chunk.ordinates]
             total.view(len(total), -1).addmm_(matrix.T, output.view(chunk.count, -1))
 
     def _bind(

@@ -186,7 +186,6 @@ def _make_tables(
         "values": values,
         "weighted": values * values.new_tensor(weights)[numbers, None],
         "ones": values.new_ones(len(order), 1),
-        "one": values.new_ones(len(order), 1),
     }
     integers = {"teams": teams, "ordinates": [o.integers(grid.shape[2]) for o in order]}
     arrays = {
