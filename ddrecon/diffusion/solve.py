@@ -17,8 +17,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.hierarchy import Hierarchy, Passes
 from ddrecon.diffusion.operator import Operator
-from ddrecon.engine import has_kernels
 from ddrecon.errors import SolveError
+from ddrecon.numerics.autodiff import is_fused
 
 MAX_ITERATIONS = 2_000
 
@@ -60,7 +60,7 @@ def solve_by_multigrid(
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled beside what is done before it."""
-    if has_kernels("diffusion", gpu=like.is_cuda):
+    if is_fused():
         from ddrecon.diffusion.fused import passes  # imports Warp
 
         passes.name_kernels(like)
@@ -91,7 +91,7 @@ def prepare(operator: Operator) -> Hierarchy:
 
 def _cycle_of(operator: Operator, source: Tensor) -> Any:
     """What multiplies and preconditions, on the engine at hand."""
-    if not has_kernels("diffusion", gpu=source.is_cuda):
+    if not is_fused():
         return TensorCycle(operator, source)
     from ddrecon.diffusion.fused.passes import KernelCycle  # imports Warp
 
