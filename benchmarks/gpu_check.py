@@ -269,7 +269,7 @@ def graphs(check: Check) -> Iterator[str]:
             torch.manual_seed(0)
             run = check.runs()[name]()
             if is_plain:
-                run.replays.record = None
+                run.replays.new_recorder = None
             taken = [check.time_of(run.step, 1) for _ in range(6)]
             ends.append(run.parameters[0].value.detach())
             seconds.append(median(taken[1:]))

@@ -16,8 +16,6 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-OF_ROWS = "follow_rows", "return_rows"
-"""Kernels of a processor alone."""
 MOST = {"transpose": (192, 1280)}
 """Registers of a thread and bytes of its stack; of other kernels 128 and 1024, so that two blocks
 of 256 threads have room beside each other.
@@ -37,7 +35,7 @@ def test_kernels_of_iterations_fit_into_registers(
         factor = max(scene.volume.grid.shape) // 8
         Reconstruction(scene_at_level(scene, factor)).step()
     monkeypatch.setattr(warp.config, "optimization_level", None)  # as users have them
-    for index, kernel in enumerate(one for one in kernels if one.key not in OF_ROWS):
+    for index, kernel in enumerate(kernels):
         architecture = ARCHITECTURES[index % len(ARCHITECTURES)]
         registers, stack = find_resources(kernel, architecture, tmp_path)
         most_registers, most_stack = MOST.get(kernel.key, (128, 1024))
