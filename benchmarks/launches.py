@@ -9,9 +9,7 @@ resolution.
 A call is an operation of torch, views of tensors not counted; on a GPU each costs at least 5
 microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
 depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
-numbers, for which it waits as well. All are counted alike on a machine without a GPU, but for the
-diffusion's solves, which on a GPU are torch's operations with either engine, and for the sweeps of
-rounds.
+numbers, for which it waits as well. All are counted alike on a machine without a GPU.
 """
 
 from __future__ import annotations
