@@ -25,7 +25,7 @@ from ddrecon.numerics.chebyshev import COEFFICIENTS, extrema
 from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
 
 WEIGHT_POWERS = 4
-"""Coefficients over a weight: S of two forward lobes is within 2 % of E8.7."""
+"""Coefficients over a weight: S of two forward lobes is within about 2 % of E8.7."""
 STEEPEST = 0.99
 """The largest g of tables. Over artanh g up to there, S has as many coefficients as over depth."""
 
