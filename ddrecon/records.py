@@ -76,12 +76,8 @@ def _find_faults(
     kind = next((kind for kind in alternatives(hint) if _is_of(value, kind)), None)
     if kind is None:
         words = " or ".join(_describe(kind) for kind in alternatives(hint) if kind is not NoneType)
-        found = (
-            repr(value)
-            if isinstance(value, Real | str | tuple | NoneType)
-            else type(value).__name__
-        )
-        yield name, f"expected {words}, found {found}"
+        is_short = isinstance(value, Real | str | tuple | NoneType)
+        yield name, f"expected {words}, found {repr(value) if is_short else type(value).__name__}"
     elif "choices" in limits and value is not None and value not in limits["choices"]:
         yield name, f"expected one of {', '.join(map(str, limits['choices']))}, found {value!r}"
     elif is_dataclass(value):

@@ -359,6 +359,7 @@ SUN = DirectionalLight(tensor(0.0, -1.0, 0.0), 3.0)  # type: ignore[arg-type]
 PARTS: list[tuple[str, str, Any, str]] = [
     ("", "lights", [SUN], "lights.0.irradiance: expected a tensor, found 3.0"),
     ("", "lights", [None], "lights.0: expected DirectionalLight or AmbientLight or "),
+    ("", "views", [None], "views.0: expected View, found None"),
     ("", "ground", Ground(tensor(0.5), Plane(math.nan, 1)), "ground.plane.height: must be finite"),
     ("", "ground", Ground(tensor(0.5), Plane(-9.0, 7)), "ground.plane.axis: must be at most 2, "),
     ("", "diffusion", {}, "diffusion: expected DiffusionSettings, found dict"),

@@ -19,7 +19,7 @@ from ddrecon.light.moments import add, moments_of_flux, weigh
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
 from ddrecon.light.profile import profile_in
-from ddrecon.light.refracted import Confined, enter_faces, refract_sky
+from ddrecon.light.refracted import Confined, enter_faces, refract_skies
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
@@ -109,10 +109,8 @@ def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree:
         source = receive_beams(cells, lights, degree)
         return Received(source, source[0])
     pairs = [follow_pair(cells, light) for light in lights]
-    return reduce(
-        Received.plus,
-        (Received(pair.source(cells), pair.along + pair.against, pair.turned) for pair in pairs),
-    )
+    lit = (Received(pair.source(cells), pair.along + pair.against, pair.turned) for pair in pairs)
+    return reduce(Received.plus, lit)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
@@ -145,14 +143,12 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     if not skies:
         return None
     if medium.index != 1:
-        return reduce(
-            torch.add,
-            (
-                profile * attenuate(medium, region.travel, moment_weights(region, degree))
-                for sky in skies
-                for region, profile in refract_sky(medium.grid, medium.index, sky)
-            ),
+        regions = refract_skies(medium.grid, medium.index, skies)
+        lit = (
+            profile * attenuate(medium, region.travel, moment_weights(region, degree))
+            for region, profile in regions
         )
+        return reduce(torch.add, lit)
     weights = torch.cat([moment_weights(sky, degree) for sky in skies])
     return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
@@ -184,12 +180,12 @@ def scatter_sky(
         return period.extend(visible) * medium.seen.phase.value(torch.atleast_3d(z + y + x))
 
     total = period.extend(torch.zeros_like(medium.extinction.value))
+    if medium.index != 1:
+        for region, profile in refract_skies(medium.grid, medium.index, _lit_skies(skies)):
+            light = recompute(scatter, region.travel[0], region.irradiance[0])
+            total = total + profile * light
+        return total / (4 * math.pi)
     for sky in _lit_skies(skies):
-        if medium.index != 1:
-            for region, profile in refract_sky(medium.grid, medium.index, sky):
-                light = recompute(scatter, region.travel[0], region.irradiance[0])
-                total = total + profile * light
-            continue
         for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
             total = total + recompute(scatter, travel, irradiance)
     return total / (4 * math.pi)

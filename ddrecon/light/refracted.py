@@ -5,7 +5,7 @@ Through each face that it shines on goes a beam of its own, in the part of the b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -92,10 +92,11 @@ def _behind(grid: Grid, centers: list[Tensor], axis: int, slope: Tensor, face: f
     return total / POINTS
 
 
-def refract_sky(grid: Grid, index: float, sky: Sky) -> Iterator[tuple[Sky, Tensor]]:
-    """The light of each region of `sky` behind each face it falls on, and its profile there."""
-    for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
-        light = DirectionalLight(array_order(travel), irradiance)
-        for one in enter_faces(grid, index, light):
-            way, power = array_order(one.light.direction)[None], one.light.irradiance[None]
-            yield Sky(way, power, way[..., None] * power[:, None]), one.profile
+def refract_skies(grid: Grid, index: float, skies: Sequence[Sky]) -> Iterator[tuple[Sky, Tensor]]:
+    """The light of each region of `skies` behind each face it falls on, and its profile there."""
+    for sky in skies:
+        for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
+            light = DirectionalLight(array_order(travel), irradiance)
+            for beam in enter_faces(grid, index, light):
+                way, power = array_order(beam.light.direction)[None], beam.light.irradiance[None]
+                yield Sky(way, power, way[..., None] * power[:, None]), beam.profile

@@ -282,7 +282,7 @@ def _find_coefficients(
     def coefficient(sigma: Tensor) -> Coefficient:
         if sigma.shape[1:].numel() == 1:
             return Coefficient(sigma, field)
-        return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * field)
+        return Coefficient(_ones(len(sigma), sigma.dtype, sigma.device), sigma * field)
 
     is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
     scale = _remember_scaled if is_small else _scale_sections
@@ -293,6 +293,13 @@ def _find_coefficients(
         # One field for both, as cells share what remains of their scattering.
         remaining = Coefficient((1 - fraction) * scattering.scale, scattering.field)
     return coefficient(scaled), scattering, remaining, coefficient(sigma_a), peak
+
+
+@functools.cache
+def _ones(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A scale [C, 1, 1, 1] of 1, one tensor for all: what is known of it need not be read again."""
+    with torch.inference_mode(False):
+        return torch.ones(count, 1, 1, 1, dtype=dtype, device=device)
 
 
 def _scale_sections(

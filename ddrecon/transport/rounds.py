@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import torch
@@ -60,13 +60,13 @@ def run_rounds(
     if medium.emission is not None:
         emitted = sweep_emission(medium, directions, glow)
     mirror = face_mirror(medium, directions, None if emitted is None else glow)
+    every_round = _Rounds(problem, higher, emitted, solve, directions, mirror)
     began, is_open, light = perf_counter(), tolerance > 0, cut(phi)
     factors = [None] * rounds if is_open else _blending(medium, rounds)
     for round_index, factor in enumerate(factors, 1):
         is_last, before = round_index == rounds, light[0][0]
         cosine = _flux_factor(medium, is_last and not is_open)
-        given = round_index, cosine, factor, mirror
-        light = _round(problem, higher, light, emitted, solve, directions, *given)
+        light = _round(every_round, light, round_index, cosine, factor)
         residual = _residual(light[0][0], before) if is_open or is_last else 1.0
         if is_last or residual < tolerance:
             break
@@ -102,38 +102,45 @@ def sweep_emission(medium: Medium, directions: int, mirror: Mirror | None = None
     return sweep_change(emitting, dark, even, None, directions, mirror)
 
 
+@dataclass(frozen=True)
+class _Rounds:
+    """What is the same in all rounds on `problem`.
+
+    `higher` is as of `run_rounds`, and `emitted` as of `sweep_emission`.
+    """
+
+    problem: DiffusionProblem
+    higher: Tensor
+    emitted: Cut | None
+    solve: SolverWithMemory
+    directions: int
+    mirror: Mirror | None
+
+
 def _round(
-    problem: DiffusionProblem,
-    higher: Tensor,
-    light: Cut,
-    emitted: Cut | None,
-    solve: SolverWithMemory,
-    directions: int,
-    round_index: int,
-    cosine: Tensor,
-    factor: Tensor | None,
-    mirror: Mirror | None,
+    rounds: _Rounds, light: Cut, round_index: int, cosine: Tensor, factor: Tensor | None
 ) -> Cut:
     """What one round makes of `light` (E2.10); with a `factor`, `factor` as far from light (E7.1).
 
-    `higher`: as of `run_rounds`; `emitted`: light as of `sweep_emission`; `cosine`: as of
-    `_flux_factor`.
+    `cosine`: as of `_flux_factor`.
     """
+    problem, directions = rounds.problem, rounds.directions
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E2.9 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    low, high = sweep_change(medium, light, (problem.source, higher), inflow, directions, mirror)
-    if emitted is not None:
-        low, high = add(low, emitted[0]), high + emitted[1]
+    scatters = problem.source, rounds.higher
+    low, high = sweep_change(medium, light, scatters, inflow, directions, rounds.mirror)
+    if rounds.emitted is not None:
+        low, high = add(low, rounds.emitted[0]), high + rounds.emitted[1]
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     mean, first = mean_and_first(light[0])
     off = None
     if round_index > 1:
         off = _imbalance(operator, right, mean), problem.flux(mean, begun=first, sign=-1)
     gain, source, turned = _gain(medium, low, off, directions, cosine)
-    solve_round = replace(solve, round_index=round_index, start=mean.detach())
+    solve_round = replace(rounds.solve, round_index=round_index, start=mean.detach())
     u = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
     gained, gained_first = mean_and_first(gain)

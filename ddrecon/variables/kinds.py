@@ -140,16 +140,15 @@ def _side(scene: Scene) -> float:
 class Kind:
     """One kind of variable.
 
-    `rate` is the default learning rate; values are kept within [`low`, `high`]. `is_color`: they
-    may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
-    the names of a vector's entries, which change one at a time. `is_direction`: only the way a
-    vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, taken of what `losses.compress` makes of one that `is_compressed`, and `alone` times
-    that where no other field is sought: then it only suppresses noise. `difference_steps` are those
-    of finite differences. `release` is the part of a run after which the variable begins to move
-    where other fields are optimized: a lamp would learn wrong things while they are empty, and
-    emission, where lights shine, stand for what is lit. Its rate rises over a warm-up by the power
-    `rise`.
+    `rate`: the default learning rate; values are kept within [`low`, `high`]. `is_color`: values
+    may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components`:
+    names of a vector's entries, which change one at a time. `is_direction`: only where a vector
+    points matters, and a step keeps its length. `tv`: the default weight of total variation, of
+    `is_compressed` kinds that of the logarithm (E11.3); it is `alone` times as much where no other
+    field is sought, since it then only suppresses noise. `difference_steps`: those of finite
+    differences. `release`: the share of a run after which the variable begins to move where other
+    fields are optimized: a lamp would learn wrong things while they are empty, and emission, where
+    lights shine, stand for what is lit. Its rate rises over a warm-up by the power `rise`.
     """
 
     rate: Rate

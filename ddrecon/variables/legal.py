@@ -39,8 +39,10 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     """
     require_scene(scene)
     views = scene.views if view is None else [scene.view(view)]
-    faults = faults_of(scene, keys=KEYS), *(faults_of(item, f"views.{item.name}") for item in views)
-    for key, what in chain(*faults):
+    faults = faults_of(scene)
+    if view is not None:
+        faults = chain(faults_of(scene, keys=KEYS), faults_of(views[0], f"views.{view}"))
+    for key, what in faults:
         raise UsageError(f"{key}: {what}")
     cells, density = scene.volume.grid.shape, scene.volume.density
     if density.is_meta:
@@ -67,7 +69,7 @@ def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
         numbers["ground.albedo"] = scene.ground.albedo
     for view in views:
         camera, owner = view.camera, f"views.{view.name}."
-        numbers |= {owner + part: getattr(view, part) for part in RESPONSE}
+        numbers |= {owner + key: getattr(view, key) for key in RESPONSE}
         numbers |= {owner + "camera": camera.pose, owner + "distortion": camera.distortion}
         numbers[owner + "principal_point"] = camera.principal_point
     return {name: value for name, value in numbers.items() if isinstance(value, Tensor)}

@@ -213,7 +213,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         }
         if constexpr (IS_SLICED)
             spread_in_slice<F, L>(
-                bars.fields, this->slice(n), node.y, node.x, lines, v_bar, bend_bar);
+                bars.fields, this->slice(n), node.runs, node.y, node.x, lines, v_bar, bend_bar);
         else
             spread_between(node, v_bar, bend_bar);
         if constexpr (VARIES_RAYS) move(n, node, v_bar, bend_bar, t_bar);
@@ -229,7 +229,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 linear_bar[k] = layers.linear[i] * bend_bar[k];
             }
             const auto row = node.y.behind(node.z.cells[i] * lines.rows);
-            spread_in_slice<F, L>(bars.fields, 0, row, node.x, lines, value_bar, linear_bar);
+            Runs<F> runs;
+            runs.find(row, node.x, lines);
+            spread_in_slice<F, L>(bars.fields, 0, runs, row, node.x, lines, value_bar, linear_bar);
         }
     }
 

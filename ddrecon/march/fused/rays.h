@@ -120,6 +120,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
     // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p.
     struct Node : Spot<F, IS_SLICED, V> {
+        Runs<F> runs;
         bool is_empty, is_lit;
         Way s, t;
         N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
@@ -243,6 +244,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         node.y = at(1, lines.rows);
         node.x = at(2, lines.columns);
         if (!IS_SLICED) node.z = at(0, given.depth);
+        if (IS_SLICED) node.runs.find(node.y, node.x, lines);
         sample(node, n, 0, L::EXTINCTION);
         if (L::SCATTERING || L::EMITTED) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;
@@ -261,6 +263,23 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
         const F* const* fields = given.fields + PART * L::CHANNELS;
         const long long offset = slice(n);
+#if !IS_GPU
+        if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
+            if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
+                for (int r = 0; r < node.runs.count; ++r) {
+                    const Window<F> w(node.runs.run[r], node.y, node.x, lines);
+                    for (int c = from; c < to; ++c) {
+                        V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
+                        const V v = w.value(fields[c] + offset, L::is_cubic(c), bend);
+                        known = P::pick(w.is_in, v, known);
+                        if (!L::is_cubic(c)) continue;
+                        V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
+                        known_bend = P::pick(w.is_in, bend, known_bend);
+                    }
+                }
+                return;
+            }
+#endif
         for (int c = from; c < to; ++c) {
             V bend = P::all(F(0));
             P::template part<PART>(node.v[c]) =

@@ -8,9 +8,9 @@
 // By rows, for a processor: an item is a team of ordinates of one color, which go through the
 // planes across z in the same order. In a plane they go through the rows twice: up in y with those
 // ordinates that do, and down with the others. Whatever the slices of an ordinate are, across z or
-// y, cells upwind were done before. (Ordinates with slices across x sweep a grid of which y and x
-// are transposed.) Loops over the cells of a row are vector code, and sums over ordinates are
-// formed row by row.
+// y, cells upwind were done before; across x, what comes from cells of the same row is carried on
+// from cell to cell. Other loops over the cells of a row are vector code, and sums over ordinates
+// are formed row by row.
 //
 // By cells, for a GPU: an item is a cell of a slice, for one ordinate and color. A launch does one
 // slice of every ordinate; what ordinates give is summed later. With faces, also on a processor:
@@ -43,7 +43,8 @@ template <class F> struct Path {
 // What kernels are given. Arrays are [..., colors, cells]; tangents have d_ before their names.
 // `values` and `weighted` [ordinates, count]: harmonics, and these times quadrature weights;
 // `scales` [3, colors]: factors of the fields extinction and scattering [1 or colors, cells], and
-// what light enters the box. `light` is I where it leaves cells, less that inflow, and `returning`
+// what light enters the box; `densest` [1 or colors, depth, height]: the most of extinction in a
+// row. `light` is I where it leaves cells, less that inflow, and `returning`
 // are cotangents of I where it enters them: for each ordinate and color a ring of `planes` or
 // `back_planes` planes, numbered from where the team begins, with a rim of zeros. `outputs` are
 // what ordinates give in each cell, to be summed. A launch has ordinates from `first` on, teams
@@ -62,72 +63,45 @@ template <class F> struct Sweep {
     int pitch, most, first, launched, team, color, together, lanes, begin, end;
 };
 
-// Rows of numbers that lie `apart` cells from each other.
-template <class F> struct Rows {
-    F* first;
-    long long apart;
-};
-// A matrix of a product of rows: its numbers, and how far those for the next row lie.
-template <class F> struct Matrix {
-    const F* numbers;
-    int next_out, next_in;
-};
-// OUTS rows are, or are added to by, sums of INS rows times numbers of a matrix.
-template <bool IS_ADDING, int OUTS, int INS, class F> INLINE void multiply_block(
-    const Rows<F>& out, const Rows<const F>& in, const Matrix<F>& matrix, int width) {
-    F by[OUTS][INS];
-    UNROLLED
-    for (int a = 0; a < OUTS; ++a) UNROLLED
-    for (int b = 0; b < INS; ++b)
-        by[a][b] = matrix.numbers[a * matrix.next_out + b * matrix.next_in];
-    INDEPENDENT
-    for (int c = 0; c < width; ++c) {
-        F x[INS];
+// The product of a matrix `by` with rows `in`, which is added to rows `out`. Rows lie `apart` from
+// each other, and so do the matrix's numbers for the next row of either.
+template <class F> struct Product {
+    F* out;
+    long long out_apart;
+    const F* in;
+    long long in_apart;
+    const F* by;
+    int by_out, by_in;
+
+    // Blocks of rows share reads: OUTS from row a on, INS from row b on.
+    template <int OUTS, int INS> INLINE void add_block(int a, int b, int width) const {
+        F *const sums = out + a * out_apart, factor[OUTS][INS];
+        const F *const rows = in + b * in_apart, *const corner = by + a * by_out + b * by_in;
+        const long long out_apart = this->out_apart, in_apart = this->in_apart;
         UNROLLED
-        for (int b = 0; b < INS; ++b) x[b] = in.first[b * in.apart + c];
-        UNROLLED
-        for (int a = 0; a < OUTS; ++a) {
-            F sum = by[a][0] * x[0];
+        for (int n = 0; n < OUTS * INS; ++n)
+            factor[n / INS][n % INS] = corner[n / INS * by_out + n % INS * by_in];
+        INDEPENDENT
+        for (int c = 0; c < width; ++c) UNROLLED
+        for (int k = 0; k < OUTS; ++k) {
+            F sum = sums[k * out_apart + c];
             UNROLLED
-            for (int b = 1; b < INS; ++b) sum += by[a][b] * x[b];
-            if constexpr (IS_ADDING) sum += out.first[a * out.apart + c];
-            out.first[a * out.apart + c] = sum;
+            for (int n = 0; n < INS; ++n) sum += factor[k][n] * rows[n * in_apart + c];
+            sums[k * out_apart + c] = sum;
         }
     }
-}
-template <int OUTS, class F> INLINE void multiply_outs(
-    Rows<F> out, Rows<const F> in, int ins, Matrix<F> matrix, bool is_adding, int width) {
-    for (int b = 0; b < ins;) {
-        const int step = ins - b < 4 ? 1 : 4;
-        const Rows<const F> rows = {in.first + b * in.apart, in.apart};
-        const Matrix<F> part = {
-            matrix.numbers + b * matrix.next_in, matrix.next_out, matrix.next_in};
-        if (step == 4 && (b || is_adding))
-            multiply_block<true, OUTS, 4>(out, rows, part, width);
-        else if (step == 4)
-            multiply_block<false, OUTS, 4>(out, rows, part, width);
-        else if (b || is_adding)
-            multiply_block<true, OUTS, 1>(out, rows, part, width);
-        else
-            multiply_block<false, OUTS, 1>(out, rows, part, width);
-        b += step;
+    APART void add(int outs, int ins, int width) const {
+        constexpr int SIZE = 4;
+        for (int a = 0, many; a < outs; a += many) {
+            many = outs - a < SIZE ? 1 : SIZE;
+            int b = 0;
+            for (; b + SIZE <= ins; b += SIZE)
+                many > 1 ? add_block<SIZE, SIZE>(a, b, width) : add_block<1, SIZE>(a, b, width);
+            for (; b < ins; ++b)
+                many > 1 ? add_block<SIZE, 1>(a, b, width) : add_block<1, 1>(a, b, width);
+        }
     }
-}
-// Rows that are, or are added to by, the product of a matrix with other rows.
-template <class F> APART void multiply_rows(
-    Rows<F> out, int outs, Rows<const F> in, int ins, Matrix<F> matrix, bool is_adding, int width) {
-    for (int a = 0; a < outs;) {
-        const int step = outs - a < 4 ? 1 : 4;
-        const Rows<F> rows = {out.first + a * out.apart, out.apart};
-        const Matrix<F> part = {
-            matrix.numbers + a * matrix.next_out, matrix.next_out, matrix.next_in};
-        if (step == 4)
-            multiply_outs<4>(rows, in, ins, part, is_adding, width);
-        else
-            multiply_outs<1>(rows, in, ins, part, is_adding, width);
-        a += step;
-    }
-}
+};
 
 enum Kind { BY_ROWS, CELLS, FACES };
 
@@ -273,24 +247,25 @@ template <class N, class F, Kind KIND> struct Ordinates {
                 INDEPENDENT
                 for (int c = 0; c < of.width; ++c) copies[k * of.pitch + c] = from[k * all + c];
             }
-        const Rows<const F> rows = {BY_CELLS ? from : copies, BY_CELLS ? all : of.pitch};
-        multiply_rows<F>(
-            {own_row(kind, begin), pitch()}, end - begin, rows, of.count,
-            {by + begin * of.count, of.count, 1}, false, width);
+        F* const sums = own_row(kind, begin);
+        for (long long c = 0; c < (end - begin) * pitch(); ++c) sums[c] = F(0);
+        const Product<F> product = {sums,
+                                    pitch(),
+                                    BY_CELLS ? from : copies,
+                                    BY_CELLS ? all : of.pitch,
+                                    by + begin * of.count,
+                                    of.count,
+                                    1};
+        product.add(end - begin, of.count, width);
     }
     // Decay terms in a row, by the path through a cell: ordinates with the same one share them.
     template <bool HAS_SLOPES> INLINE void find_decays(const Row& row, F step) const {
-        const F depth = value_of(scale) * step * densest(row);
-        if (!BY_CELLS && depth < F(0.5))
+        const long long first = of.extinctions > 1 ? (long long)color * of.depth * of.height : 0;
+        const F densest = of.densest[first + row.at / of.width];
+        if (value_of(scale) * step * densest < F(0.5))
             find_decays<HAS_SLOPES, true>(row, step);
         else
             find_decays<HAS_SLOPES, false>(row, step);
-    }
-    INLINE F densest(const Row& row) const {
-        return BY_CELLS ? F(0)
-                        : of.densest
-                              [(of.extinctions > 1 ? color * of.depth * of.height : 0) +
-                               row.at / of.width];
     }
     template <bool HAS_SLOPES, bool IS_THIN> APART void find_decays(const Row& row, F step) const {
         const F* const e = of.extinction + (of.extinctions > 1 ? color * cells : 0) + row.at;
@@ -305,6 +280,12 @@ template <class N, class F, Kind KIND> struct Ordinates {
             decays[ETA * pitch + c] = by.eta, decays[PASSED * pitch + c] = by.passed;
             if constexpr (HAS_SLOPES) decays[ETA_SLOPE * pitch + c] = by.eta_slope;
         }
+    }
+
+    static INLINE Decay<F> decay_at(const F* decays, long long pitch, int c) {
+        return {
+            decays[PHI * pitch + c], decays[PSI * pitch + c], decays[ETA * pitch + c],
+            decays[ETA_SLOPE * pitch + c], decays[PASSED * pitch + c]};
     }
 
     // Does `each` row of planes and ordinates, or the cell of this item; or what lies `beyond` the
@@ -350,10 +331,16 @@ template <class N, class F, Kind KIND> struct Ordinates {
     INLINE void collect(
         int which, const F* by, int apart, int count, F* sums, const Row& row, int begin,
         int end) const {
-        multiply_rows<F>(
-            {sums + ((long long)number / 2 * count * of.colors + color) * cells + row.at, all},
-            count, {output(which, begin, row), of.pitch}, end - begin,
-            {by + begin * apart, 1, apart}, true, width);
+        const long long piece = number / 2;
+        const Product<F> product = {
+            sums + (piece * count * of.colors + color) * cells + row.at,
+            all,
+            output(which, begin, row),
+            of.pitch,
+            by + begin * apart,
+            1,
+            apart};
+        product.add(count, end - begin, width);
     }
 
     // Light through the cells: moments of its mean, unless light alone is kept.
@@ -421,10 +408,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
             const N rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
             const Emitted<N> emitted = {scatters * own[c], scatters * rise};
-            const Decay<F> decay = {
-                decays[PHI * pitch + c], decays[PSI * pitch + c], decays[ETA * pitch + c],
-                decays[ETA_SLOPE * pitch + c], decays[PASSED * pitch + c]};
-            const Passage<N> by = pass_through(decay, depth);
+            const Passage<N> by = pass_through(decay_at(decays, pitch, c), depth);
             if constexpr (RESULT != WITHIN) {
                 const N after = light_after(arriving, emitted, inflow, by);
                 to[c] = value_of(after);
@@ -529,9 +513,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
             const F rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
             const Emitted<F> emitted = {scatters * o, scatters * rise};
-            const Decay<F> decay = {
-                decays[PHI * pitch + c], decays[PSI * pitch + c], decays[ETA * pitch + c],
-                decays[ETA_SLOPE * pitch + c], decays[PASSED * pitch + c]};
+            const Decay<F> decay = decay_at(decays, pitch, c);
             const Passage<Dual<F>> by = pass_through(decay, Dual<F>(depth, F(1)));
             const F depth_bar = after_bar * light_after(arriving, emitted, inflow, by).by[0] +
                                 within_bar * light_within(arriving, emitted, inflow, by).by[0];
