@@ -3,10 +3,10 @@
     python benchmarks/gpu_check.py [STAGE]... [--device cuda] [--shrink 1] [--engine warp]
 
 Without names all stages run, in their order: machine, kernels, agree, speed, graphs, top, bits,
-tests, optimize, shortage. Each prints its table and the seconds it took; what fails says so, and the next
-stage goes on. `--device cpu --shrink 4` tries the script where there is no GPU: grids and images
-are four times smaller. Stages that take longest are `agree`, which computes all scenes of `configs`
-on the processor as well, and `speed`.
+tests, optimize, shortage. Each prints its table and the seconds it took; what fails says so, and
+the next stage goes on. `--device cpu --shrink 4` tries the script where there is no GPU: grids and
+images are four times smaller. Stages that take longest are `agree`, which computes all scenes of
+`configs` on the processor as well, and `speed`.
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ def graphs(check: Check) -> Iterator[str]:
             torch.manual_seed(0)
             run = check.runs()[name]()
             if is_plain:
-                run.replays.record = None
+                run.replays.new_recorder = None
             taken = [check.time_of(run.step, 1) for _ in range(6)]
             ends.append(run.parameters[0].value.detach())
             seconds.append(median(taken[1:]))

@@ -2,15 +2,14 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. `TORCH_ALONE` is the one table of what warp has
-not; besides, warp has no tangents by some tensors (`numerics.autodiff.is_fused`).
+same formulas, so their numbers agree to rounding. `numerics.autodiff.is_fused` says where kernels
+run; what has none is torch's with either engine, such as the paper's own scheme.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -21,13 +20,6 @@ from ddrecon.extras import advice
 ENGINES = ("torch", "warp")
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-TORCH_ALONE: dict[str, frozenset[str]] = {
-    "view rays": frozenset(),
-    "light": frozenset(),
-    "diffusion": frozenset({"printed", "flux_limited"}),
-    "transport rounds": frozenset(),
-}
-"""Each part of the renderer, and the traits of a scene with any of which torch runs it."""
 CACHE = "WARP_CACHE_PATH"
 """The environment variable that names the folder where Warp keeps kernels."""
 LOG = "ddrecon.engine"
@@ -58,27 +50,6 @@ def current_engine() -> str:
         name = os.environ.get("DDRECON_ENGINE") or "auto"
         _engine = _resolve(name, f"DDRECON_ENGINE={name}")
     return _engine
-
-
-def has_kernels(part: str, **traits: bool) -> bool:
-    """Whether `part`, a key of `TORCH_ALONE`, runs as kernels of warp with these `traits`."""
-    is_left = any(is_so and trait in TORCH_ALONE[part] for trait, is_so in traits.items())
-    return not is_left and current_engine() == "warp"
-
-
-def engine_of_parts(**traits: bool) -> dict[str, str]:
-    """The engine that runs each part of the renderer for a scene with these `traits`."""
-    return {part: "warp" if has_kernels(part, **traits) else "torch" for part in TORCH_ALONE}
-
-
-def name_engines(engines: Mapping[str, str]) -> str:
-    """The `engines` of parts in words: with warp what it runs and what it leaves to torch."""
-    fused = [part for part, engine in engines.items() if engine == "warp"]
-    others = [part for part, engine in engines.items() if engine == "torch"]
-    if not fused:
-        return "torch"
-    rest = f"; {' and '.join(others)} in torch" if others else ""
-    return f"warp ({', '.join(fused)}){rest}"
 
 
 def engine_versions() -> dict[str, str]:

@@ -52,10 +52,8 @@ from ddrecon.transport.sweep import DIRECTIONS
 
 @dataclass(frozen=True)
 class FaceLight:
-    """What transport rounds know of light at faces (E2.17).
-
-    `outside` [C, 1, 1, 1] is the radiance that enters through them; `source` [1 or 4, C, z, y, x]
-    are the moments Q0 and Q1 of what cells receive of beams.
+    """What transport rounds know of light at faces (E2.17): `outside` [C, 1, 1, 1], the radiance
+    that enters there, and `source` [1 or 4, C, z, y, x], moments Q0 and Q1 of light from beams.
     """
 
     outside: Tensor
@@ -66,8 +64,7 @@ class FaceLight:
 class LightField:
     """All light inside a medium.
 
-    `beams` are those of directional and point lights, not yet scattered (E2.2); cells have
-    `received` from them.
+    `beams` are of directional and point lights (E2.2), not yet scattered; cells `received` some.
 
     `diffuse` [K, C, z, y, x] is phi of all other light but that of `skies` and `turned`: light that
     was scattered or emitted (E2.4, E2.10), and the unscattered light of a ground, of beams that
@@ -165,21 +162,20 @@ def _scatter_light(
 ) -> LightField:
     """Light that scatters any number of times; `cells` are means of `medium`.
 
-    `unscattered` are phi [K, C, z, y, x] of light besides that of `lights`.
+    `unscattered`: phi [K, C, z, y, x] of light besides that of `lights`.
     """
     name_kernels(medium.extinction.field)
     # Q0 and Q1 are of light not yet scattered; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]
-    source = [weigh(light, remaining_moments(cells)) for light in unscattered]
+    scattering = (weigh(light, remaining_moments(cells)) for light in unscattered)
+    source = cut(reduce(add, scattering, received.source))
     # As it is where faces do not refract: what is known of a tensor is not known of its product.
     ambient = ambient_radiance(lights, cells.g)
     outside = ambient if medium.index == 1 else medium.index**2 * ambient
     # L0 and L1: E2.4 to E2.6.
-    scattered = solve_diffuse(
-        cells, cut(reduce(add, source, received.source)), outside, settings, memory
-    )
+    scattered = solve_diffuse(cells, source, outside, settings, memory)
     # Light of `unscattered` scatters by E2.3 as well; beams by E2.2 on each view ray.
     return LightField(
         medium,

@@ -144,7 +144,7 @@ def send_down(
     """
     if not is_diffuse:
         sent = [send(light_field, rays) for rays in bundles]
-        return replace(sent[0], diffuse=torch.cat([each.diffuse for each in sent]))
+        return replace(sent[0], diffuse=torch.cat([light.diffuse for light in sent]))
     period, wide = light_field.unrolled()
     light, degree = scatter_once_more(wide.medium, wide.diffuse), wide.medium.degree
     values = harmonics(-upwards(plane)[0], degree).T.to(light)

@@ -89,11 +89,9 @@ def view_image(
     if derivatives == "all":
         return _collect(light_field, scene, camera, behind)
     diffusing = replace(_without_glow(light_field), beams=(), ground=None)
-    parts = [
-        (_without_diffuse(light_field), scene, camera, behind),
-        (diffusing, _without_background(scene), camera, None),
-    ]
-    varied, fixed = parts if derivatives == "single" else reversed(parts)
+    single = _without_diffuse(light_field), scene, camera, behind
+    often = diffusing, _without_background(scene), camera, None
+    varied, fixed = (single, often) if derivatives == "single" else (often, single)
     with torch.no_grad():
         rest = _collect(*fixed).detach()
     return _collect(*varied) + rest

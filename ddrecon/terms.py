@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.engine import engine_of_parts
 from ddrecon.grid import Grid
 from ddrecon.light.ground import UPWARDS, Ground
 from ddrecon.light.lights import (
@@ -49,22 +48,14 @@ def needed_terms(scene: Scene) -> list[str]:
     ]
 
 
-def engine_of_scene(scene: Scene) -> dict[str, str]:
-    """The engine that runs each part of rendering `scene`."""
-    settings = scene.diffusion
-    return engine_of_parts(
-        printed=settings.scheme == "printed", flux_limited=settings.model == "flux_limited"
-    )
-
-
 def _color_term(scene: Scene) -> str:
     """How many color channels there are, and what has as many."""
     volume, ground = scene.volume, scene.ground
-    views = [v for each in scene.views for v in (each.exposure, each.offset, each.background)]
+    views = [v for view in scene.views for v in (view.exposure, view.offset, view.background)]
     values: dict[str, list[Tensor | None]] = {
         "the medium": [volume.sigma_a, volume.sigma_s],
         "what glows": [volume.emission, volume.black_body],
-        "lights": [v for each in scene.lights for k, v in vars(each).items() if k in BRIGHTNESS],
+        "lights": [v for light in scene.lights for k, v in vars(light).items() if k in BRIGHTNESS],
         "the ground": [] if ground is None else [ground.albedo],
         "views": views,
     }
@@ -146,8 +137,8 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
 
 def _has_beams(scene: Scene) -> bool:
     """Whether a light is directional, or has suns that are."""
-    parts = decompose_lights(scene.lights)
-    return any(isinstance(part, DirectionalLight | BeamLight) for part in parts)
+    sources = decompose_lights(scene.lights)
+    return any(isinstance(source, DirectionalLight | BeamLight) for source in sources)
 
 
 def _light_terms(scene: Scene, is_diffuse: bool) -> list[str]:

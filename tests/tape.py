@@ -59,7 +59,7 @@ class Tape(TorchDispatchMode):
 
 
 def record(computation: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
-    """As `ddrecon.kernels.graphs.record_graph`, on a processor."""
+    """As `ddrecon.kernels.graphs.GraphRecorder`, on a processor."""
     from ddrecon.kernels import launch  # imports Warp
 
     computation()

@@ -9,7 +9,7 @@ import pytest
 
 import ddrecon
 from ddrecon import engine
-from ddrecon.engine import TORCH_ALONE, current_engine, engine_of_parts, engine_versions
+from ddrecon.engine import current_engine, engine_versions
 from ddrecon.errors import MissingExtraError, UsageError
 
 ADVICE = 'needs warp: pip install "ddrecon[fast]"'
@@ -76,14 +76,10 @@ def test_an_environment_that_cannot_be_is_named(
     assert str(caught.value) == f"DDRECON_ENGINE=warp {ADVICE}"
 
 
-def test_the_engine_runs_all_parts_but_those_that_are_in_torch(installed: None) -> None:
+def test_its_version_is_told(installed: None) -> None:
     ddrecon.use_engine("torch")
-    assert engine_of_parts() == dict.fromkeys(TORCH_ALONE, "torch")
     assert engine_versions() == {"engine": "torch"}
     ddrecon.use_engine("warp")
-    all_parts = dict.fromkeys(TORCH_ALONE, "warp")
-    assert engine_of_parts(gpu=False, refracting=False) == all_parts
-    assert engine_of_parts(refracting=True) == all_parts | {"transport rounds": "torch"}
     assert engine_versions() == {"engine": "warp", "warp-lang": "9.8.7"}
 
 

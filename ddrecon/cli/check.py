@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from ddrecon.cameras import pixel_width
-from ddrecon.engine import name_engines
+from ddrecon.engine import current_engine
 from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes
@@ -28,7 +28,7 @@ from ddrecon.scene_file.box import CELL
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
-from ddrecon.terms import engine_of_scene, needed_terms
+from ddrecon.terms import needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 
@@ -113,7 +113,7 @@ def describe(
         "optimizes": {name: start.numel() for name, start in scene.starts.items()},
         "loss": loss,
         "support": support,
-        "engine": engine_of_scene(scene),
+        "engine": current_engine(),
         "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
@@ -146,7 +146,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         *([loss_text(report["loss"])] if report["loss"] else []),
         *([support_text(report["support"])] if report["support"] else []),
         *([f"for experts: {expert}"] if expert else []),
-        f"engine: {name_engines(report['engine'])}",
+        f"engine: {report['engine']}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
 

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ddrecon.diffusion.operator import AXES, Operator, difference
+from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.numerics.reads import may_read
 
 FEW_CELLS = 128
@@ -109,10 +109,10 @@ class Passes:
             resistance = torch.full_like(resistance, math.inf)
         below, above = half / resistance, half.roll(-1, axis) / resistance
         coarsening = Coarsening(axis, cells, below, above)
-        coarse = [sum(_pairs(c, axis)) for c in operator.conductances]
+        coarse = [torch.add(*_pairs(c, axis)) for c in operator.conductances]
         coarse[axis - 1] = 1 / resistance + _stiffness(coarsening, operator)
         z, y, x = coarse
-        loss = sum(_pairs(operator.loss, axis))
+        loss = torch.add(*_pairs(operator.loss, axis))
         return coarsening, Operator((z, y, x), loss, operator.periodic)
 
     def matrix(self, operator: Operator) -> Tensor:
@@ -122,9 +122,9 @@ class Passes:
         matrix = torch.diag_embed(double.diagonal.flatten(1))
         place = torch.arange(math.prod(shape), device=matrix.device).view(1, *shape)
         for axis, c in double.along_axes:
-            here, beyond = place.flatten(), place.roll(-1, axis).flatten()
-            matrix[:, here, beyond] -= c.flatten(1)
-            matrix[:, beyond, here] -= c.flatten(1)
+            cell, beyond = place.flatten(), place.roll(-1, axis).flatten()
+            matrix[:, cell, beyond] -= c.flatten(1)
+            matrix[:, beyond, cell] -= c.flatten(1)
         return matrix
 
     def run(self) -> None:
@@ -164,12 +164,7 @@ def restrict(coarsening: Coarsening, residual: Tensor) -> Tensor:
     axis = coarsening.axis
     first, second = _pairs(residual, axis)
     moved = coarsening.below * second - coarsening.above * first.roll(-1, axis)
-    return first + second + accumulated(moved, axis)
-
-
-def accumulated(moved: Tensor, axis: int) -> Tensor:
-    """What moves up through faces: from the cell below to the one above."""
-    return moved.roll(1, axis) - moved
+    return first + second + accumulate(moved, axis)
 
 
 def prolong(coarsening: Coarsening, u: Tensor) -> Tensor:
@@ -231,7 +226,7 @@ class Hierarchy:
         shape = tuple(operator.loss.shape[1:])
         guess = _usual_axes.get(shape, [])
         while True:
-            levels, ties, grid = [], list[Tensor](), operator
+            levels, ties, grid = list[Level](), list[Tensor](), operator
             while _is_level(grid, is_finest=not levels):
                 inverse, kept, tie = passes.scale(grid)
                 axes = guess[len(levels)] if len(levels) < len(guess) else _long_axes(grid)

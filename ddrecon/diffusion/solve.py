@@ -17,8 +17,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.hierarchy import Hierarchy, Passes
 from ddrecon.diffusion.operator import Operator
-from ddrecon.engine import has_kernels
 from ddrecon.errors import SolveError
+from ddrecon.numerics.autodiff import is_fused
 
 MAX_ITERATIONS = 2_000
 
@@ -52,7 +52,7 @@ def solve_by_multigrid(
         raise SolveError(
             "multigrid did not reach its tolerance",
             solution.iterations,
-            solution.residual,
+            float(solution.residual),
             "raise diffusion.tolerance or use --dtype float64",
         )
     return solution
@@ -60,7 +60,7 @@ def solve_by_multigrid(
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled beside what is done before it."""
-    if has_kernels("diffusion", gpu=like.is_cuda):
+    if is_fused():
         from ddrecon.diffusion.fused import passes  # imports Warp
 
         passes.name_kernels(like)
@@ -71,7 +71,8 @@ class TensorCycle:
 
     def __init__(self, operator: Operator, source: Tensor):
         self._operator, self.hierarchy = operator, operator.once(prepare)
-        self.direction, self.residual = (torch.empty_like(source) for _ in range(2))
+        vectors = (torch.empty_like(source) for _ in range(3))
+        self.direction, self.residual, self.room = vectors
 
     def product(self) -> Tensor:
         """A times the direction."""
@@ -90,7 +91,7 @@ def prepare(operator: Operator) -> Hierarchy:
 
 def _cycle_of(operator: Operator, source: Tensor) -> Any:
     """What multiplies and preconditions, on the engine at hand."""
-    if not has_kernels("diffusion", gpu=source.is_cuda):
+    if not is_fused():
         return TensorCycle(operator, source)
     from ddrecon.diffusion.fused.passes import KernelCycle  # imports Warp
 
@@ -106,25 +107,22 @@ def _iterate(
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     cycle, tiny = _cycle_of(operator, source), torch.finfo(source.dtype).tiny
-    inverse, scratch = cycle.hierarchy.inverse_diagonal, torch.empty_like(source)
-    u, direction, residual = torch.zeros_like(source), cycle.direction, cycle.residual
-
-    def inner(a: Tensor, b: Tensor) -> Tensor:
-        """The inner product of each color, [C, 1, 1, 1]."""
-        return torch.mul(a, b, out=scratch).sum((1, 2, 3), keepdim=True)
+    inverse, u = cycle.hierarchy.inverse_diagonal, torch.zeros_like(source)
+    direction, residual, room = cycle.direction, cycle.residual, cycle.room
 
     def square_norm(a: Tensor) -> Tensor:
-        return torch.mul(a, a, out=scratch).mul_(inverse).sum((1, 2, 3), keepdim=True)
+        return _sum_cells(torch.mul(a, a, out=room).mul_(inverse))
 
     source_square = square_norm(source).clamp(min=tiny)
-    residual.copy_(source)
-    if guess is not None and guess.shape == source.shape:
+    if guess is None or guess.shape != source.shape:
+        residual.copy_(source)
+    else:
         direction.copy_(guess)
-        left = source - cycle.product()
+        torch.sub(source, cycle.product(), out=residual)
         # A guess that is worse than zero is not used.
-        helps = square_norm(left) <= source_square
+        helps = square_norm(residual) <= source_square
         u = torch.where(helps, guess, u)
-        residual.copy_(torch.where(helps, left, source))
+        residual.copy_(torch.where(helps, residual, source))
     direction.zero_()
     power, iteration = torch.ones_like(source_square), 0
     while True:
@@ -138,10 +136,17 @@ def _iterate(
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative > tolerance**2
         preconditioned = cycle.cycle()
-        previous, power = power, inner(residual, preconditioned).clamp_(min=tiny)
+        weighed = torch.mul(residual, preconditioned, out=room)
+        previous, power = power, _sum_cells(weighed).clamp_(min=tiny)
         torch.addcmul(preconditioned, direction, power / previous, out=direction)
         product = cycle.product()
-        step = is_open * power / inner(direction, product).clamp_(min=tiny)
+        curved = torch.mul(direction, product, out=preconditioned)
+        step = is_open * power / _sum_cells(curved).clamp_(min=tiny)
         u.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1
+
+
+def _sum_cells(u: Tensor) -> Tensor:
+    """The sum of each color, [C, 1, 1, 1]."""
+    return u.sum((1, 2, 3), keepdim=True)

@@ -6,33 +6,32 @@ fixed program of tensors that stay where they are. A replay costs a processor on
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
 T = TypeVar("T")
 
 
-def record_graph(computation: Callable[[], T]) -> tuple[T, Callable[[], object]]:
-    """What `computation` returns, not computed yet, and a function that computes it, in place.
+class GraphRecorder:
+    """Records graphs that run in turn and share their memory, which goes with the last of them."""
 
-    Each replay overwrites its tensors. Raises RuntimeError where CUDA refuses to record.
-    """
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    # Constants, workspaces of libraries and modules of kernels are made in a run before.
-    with torch.cuda.stream(stream):
-        computation()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool=_pool(), capture_error_mode="thread_local"):
-        result = computation()
-    return result, graph.replay
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
 
+    def __call__(self, computation: Callable[[], T]) -> tuple[T, Callable[[], object]]:
+        """What `computation` returns, not computed yet, and a function that computes it, in place.
 
-@functools.cache
-def _pool() -> Any:
-    """The memory of all graphs, which run in turn."""
-    return torch.cuda.graph_pool_handle()
+        Each replay overwrites its tensors. Raises RuntimeError where CUDA refuses to record.
+        """
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        # Constants, workspaces of libraries and modules of kernels are made in a run before.
+        with torch.cuda.stream(stream):
+            computation()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+            result = computation()
+        return result, graph.replay

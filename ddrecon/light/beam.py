@@ -56,7 +56,7 @@ class Beam:
 
 def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Beam]:
     """The beams of `lights` in `medium`."""
-    directions, *each = unit_directions(*(light.direction for light in lights))
+    directions, *units = unit_directions(*(light.direction for light in lights))
     extinction = medium.extinction
     crossing = extinction.field, medium.grid, directions, extinction.mass_bound
 
@@ -68,7 +68,7 @@ def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Bea
     masses = find_masses() if is_fused(directions) else recompute(find_masses)
     return [
         Beam(mass, direction, along_colors(light.irradiance))
-        for mass, direction, light in zip(masses, each, lights, strict=True)
+        for mass, direction, light in zip(masses, units, lights, strict=True)
     ]
 
 
@@ -88,8 +88,8 @@ def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int
 @remember
 def unit_directions(*directions: Tensor) -> tuple[Tensor, ...]:
     """Unit `directions` (z, y, x) beside each other, [L, 3], and one by one."""
-    each = [torch.nn.functional.normalize(array_order(one), dim=0) for one in directions]
-    return torch.stack(each), *each
+    units = [torch.nn.functional.normalize(array_order(travel), dim=0) for travel in directions]
+    return torch.stack(units), *units
 
 
 @remember
@@ -140,8 +140,8 @@ def attenuate_few(
             from ddrecon.light.fused.receive import receive
 
             colors = max(weights.shape[2], len(scale))
-            given = entered, steps, weights.expand(-1, -1, colors)
-            return receive(field, scale.flatten().expand(colors), *given)
+            scales = scale.flatten().expand(colors)
+            return receive(field, scales, entered, steps, weights.expand(-1, -1, colors))
         tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
         return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 

@@ -71,8 +71,8 @@ class Ground:
         if self.albedo.ndim == 1:
             return mean
         places = torch.stack([_place(points[:, axis], grid, axis) for axis in self.plane.across])
-        found = sample_slices(self.albedo[None], places.flip(0).T[None])[0]
-        return torch.where((places.abs() <= 1).all(0), found, mean)
+        albedo = sample_slices(self.albedo[None], places.flip(0).T[None])[0]
+        return torch.where((places.abs() <= 1).all(0), albedo, mean)
 
     def albedo_on(self, rows: int, columns: int) -> Tensor:
         """The mean albedo of so many texels [C, rows, columns]; [C, 1, 1] of what has no map."""
@@ -112,10 +112,9 @@ def texel_centers(grid: Grid, plane: Plane, like: Tensor) -> Tensor:
         # so many that none is centered where a face of the box is; of what repeats, one period
         is_periodic = axis in grid.periodic
         count = grid.shape[axis] if is_periodic else 4 * math.ceil(grid.shape[axis] / 4)
-        part = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (4 / count) - 2
-        size = part.abs()
-        place = torch.where(size > 1, part.sign() / (2 - size), part)
-        place = part / 2 if is_periodic else place
+        even = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (4 / count) - 2
+        size = even.abs()
+        place = even / 2 if is_periodic else torch.where(size > 1, even.sign() / (2 - size), even)
         places.append((grid.lower[axis] + grid.upper[axis] + place * grid.extent[axis]) / 2)
     places = [*torch.meshgrid(*places, indexing="ij")]
     places.insert(plane.axis, torch.full_like(places[0], plane.height))
@@ -127,19 +126,19 @@ def look_up_texels(texels: Tensor, grid: Grid, plane: Plane, *points: Tensor) ->
 
     Returns `[C, ...]`.
     """
-    parts = []
+    coordinates = []
     for dim, (axis, place) in enumerate(zip(plane.across, points, strict=True), 1):
-        part = _place(place, grid, axis)
+        at = _place(place, grid, axis)
         if axis in grid.periodic:
             # a texel more on both sides
             count = texels.shape[dim]
             ends = texels.narrow(dim, count - 1, 1), texels.narrow(dim, 0, 1)
             texels = torch.cat([ends[0], texels, ends[1]], dim)
-            parts.append((torch.remainder(part + 1, 2) - 1) * (count / (count + 2)))
+            coordinates.append((torch.remainder(at + 1, 2) - 1) * (count / (count + 2)))
             continue
-        size = part.abs()
-        parts.append(torch.where(size > 1, part.sign() * (2 - 1 / size.clamp(min=1)), part) / 2)
-    rows, columns = torch.broadcast_tensors(*parts)
+        size = at.abs()
+        coordinates.append(torch.where(size > 1, at.sign() * (2 - 1 / size.clamp(min=1)), at) / 2)
+    rows, columns = torch.broadcast_tensors(*coordinates)
     places = torch.stack([columns.flatten(), rows.flatten()], -1)
     return sample_slices(texels[None], places[None])[0].unflatten(1, rows.shape)
 
@@ -158,16 +157,16 @@ def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     and as the cosine to the axis for 1/2. Even light's irradiance is exact.
     """
     number = torch.arange(count, dtype=torch.float64)
-    part, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))
-    cosine = part**power
+    share, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))
+    cosine = share**power
     sine = (1 - cosine**2).sqrt()
     along = {
         axis: cosine,
         (axis + 1) % 3: sine * azimuth.cos(),
         (axis + 2) % 3: sine * azimuth.sin(),
     }
-    directions = torch.stack([along[one] for one in range(3)], -1)
-    return directions, 2 * math.pi / count * power * part ** (power - 1)
+    directions = torch.stack([along[k] for k in range(3)], -1)
+    return directions, 2 * math.pi / count * power * share ** (power - 1)
 
 
 def light_from_below(
@@ -178,15 +177,15 @@ def light_from_below(
     It is given the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much more
     that is. What it returns is less the light that is `ambient` [C] from everywhere.
     """
-    directions, angles = (part.to(ambient) for part in hemisphere(plane.axis, UPWARDS, 1.0))
+    directions, angles = (field.to(ambient) for field in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
     weights = moment_weights(rays, medium.degree)[..., 0]
     # Each direction is a moment of its own.
     passed = attenuate_few(medium, directions, torch.eye(len(directions)).to(ambient)[..., None])
     axis, centers = plane.axis, medium.grid.centers(ambient)
-    ways = directions.T.view(3, -1, 1, 1, 1)
-    drift = (centers[axis] - plane.height) / ways[axis]
-    points = [centers[one] - ways[one] * drift for one in plane.across]
+    travel = directions.T.view(3, -1, 1, 1, 1)
+    drift = (centers[axis] - plane.height) / travel[axis]
+    points = [centers[across] - travel[across] * drift for across in plane.across]
 
     def send(even: Tensor, texels: Tensor) -> Tensor:
         more = look_up_texels(texels, medium.grid, plane, *points).transpose(0, 1)

@@ -88,7 +88,7 @@ def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Sequence[Tensor])
 
     It is per unit of what `scatter_once_more` is.
     """
-    z, y, x = (part * cosine for part, cosine in zip(beam.direction, towards, strict=True))
+    z, y, x = (a * b for a, b in zip(beam.direction, towards, strict=True))
     cosine = torch.atleast_3d(z + y + x)
     if medium.is_cellwise:
         phase = turned_in_cells(medium, beam.turns, angle_of(cosine))

@@ -1,18 +1,9 @@
 """Beams that a backward peak turns back and forth: pairs of beams against each other (E8.11).
 
 The part b of scattering turns light exactly back. So light of a directional light goes on as two
-beams, F along its direction and G against it, with their optical depth t from where it enters:
-
-    dF/dt = -F + beta G,    -dG/dt = -G + beta F,    F = 1 at t = 0,  G = 0 at t = T,
-
-where beta = b kappa_s / kappa_t. With lambda = sqrt(1 - beta^2), r = beta / (1 + lambda) and u the
-depth that is left, T - t:
-
-    F = (exp(-lambda t) - r^2 exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
-    G = r (exp(-lambda t) - exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
-
-Where beta differs from cell to cell, since albedo or b does, a slice is a layer that lets light
-pass and turns light back; layers are added up from the far end, and followed from the near one.
+beams, F along its direction and G against it. Each slice that rays cross is a layer that lets light
+pass and turns light back (E8.13): what layers turn back is added up from the far end, and light is
+followed from the near one.
 """
 
 from __future__ import annotations
@@ -28,7 +19,7 @@ from ddrecon.light.beam import unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import add, beam_moments, weigh
 from ddrecon.light.shear import Shear, cross_grid, sum_masses
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
@@ -83,50 +74,21 @@ class Pair:
 def follow_pair(medium: Medium, light: DirectionalLight) -> Pair:
     """The pair that the beam of `light` becomes in `medium`."""
     extinction = medium.extinction
-    _, direction = unit_directions(light.direction)
-    irradiance = light.irradiance.view(-1, 1, 1, 1)
-    is_uniform = extinction.field is medium.scattering.field and not medium.is_cellwise
-    ways = torch.stack([direction, -direction] if is_uniform else [direction])
-    crossing = extinction.field, medium.grid, ways, extinction.mass_bound
-    (entered, *behind), (step, *_) = recompute(sum_masses, *crossing)
-    turned = backward_fraction(medium)
+    directions, direction = unit_directions(light.direction)
+    crossing = extinction.field, medium.grid, directions, extinction.mass_bound
+    (entered, *_), (step, *_) = recompute(sum_masses, *crossing)
+    period = unroll_along(medium.grid, direction, is_both=True)
 
     def find_shares() -> tuple[Tensor, Tensor, Tensor]:
         tau = extinction.mean_transmittance(entered, step)
-        if is_uniform:
-            return tau, *_pair(medium, entered, behind[0], step, turned)
-        back = turned * medium.scattering.value
-        period = unroll_along(medium.grid, direction, is_both=True)
-        fields = period.extend(extinction.value), period.extend(back)
-        pair = turn_in_cells(*fields, period.wide, direction)
-        forth, against = map(period.crop, pair)
-        return tau, tau * forth, tau * against
+        turned = backward_fraction(medium) * medium.scattering.value
+        fields = period.extend(extinction.value), period.extend(turned)
+        along, against = turn_in_cells(*fields, period.wide, direction)
+        return tau, tau * period.crop(along), tau * period.crop(against)
 
-    received, along, against = (
-        irradiance / (4 * math.pi) * share for share in recompute(find_shares)
-    )
+    irradiance = along_colors(light.irradiance) / (4 * math.pi)
+    received, along, against = (irradiance * share for share in recompute(find_shares))
     return Pair(direction, received, along, against)
-
-
-def _pair(
-    medium: Medium, entered: Tensor, behind: Tensor, step: Tensor, turned: Tensor
-) -> tuple[Tensor, Tensor]:
-    """F and G, averaged over each cell; `entered` and `behind` are the mass on both sides."""
-    extinction = medium.extinction
-    depth = extinction.scale * (extinction.field * step)
-    before, after = extinction.scale * entered, extinction.scale * behind
-    # beta is 0 where there is no medium
-    back, whole = torch.broadcast_tensors(turned * medium.scattering.scale, extinction.scale)
-    beta = torch.where(whole > 0, back / torch.where(whole > 0, whole, 1), 0)
-    rate = (1 - beta * beta).sqrt()
-    reflected = beta / (1 + rate)
-    # means of exp(-lambda t) and of exp(-lambda (T + u)) over the cell
-    share = decay_mean(rate * depth)
-    total = before + depth + after
-    forth = torch.exp(-rate * before) * share
-    back = torch.exp(-rate * (total + after)) * share
-    again = 1 / (1 - reflected**2 * torch.exp(-2 * rate * total))
-    return (forth - reflected**2 * back) * again, reflected * (forth - back) * again
 
 
 def turn_in_cells(

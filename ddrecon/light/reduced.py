@@ -50,7 +50,7 @@ class Received:
 
     def across(self, profile: Tensor) -> Received:
         """This light of directional lights, its irradiance times `profile` [1, z, y, x]."""
-        turned = (replace(one, radiance=profile * one.radiance) for one in self.turned)
+        turned = (replace(beam, radiance=profile * beam.radiance) for beam in self.turned)
         return Received(profile * self.source, profile * self.mean, tuple(turned))
 
 
@@ -61,9 +61,9 @@ def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | Poin
     for light in lights:
         if isinstance(light, PointLight):
             beams.append(follow_point_light(medium, light))
-        for one in _confine(medium, light):
-            (beam,) = follow_beams(medium, [one.light])
-            beams.append(replace(beam, profile=one.profile))
+        for confined in _confine(medium, light):
+            (beam,) = follow_beams(medium, [confined.light])
+            beams.append(replace(beam, profile=confined.profile))
     return tuple(beams)
 
 
@@ -90,17 +90,18 @@ def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Recei
     moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What
     backward peaks turn back belongs to the beams of parallel light (E8.11).
     """
-    parts = list[Received]()
+    lit = list[Received]()
     if parallel := _unconfined(cells, lights):
-        parts.append(_receive_parallel(cells, parallel, degree))
+        lit.append(_receive_parallel(cells, parallel, degree))
     for light in lights:
         if isinstance(light, PointLight):
-            received = receive_point_light(cells, light, degree)
-            parts.append(Received(weigh(received, remaining_moments(cells)), received[0]))
-        for one in _confine(cells, light):
-            parts.append(_receive_parallel(cells, [one.light], degree).across(one.profile))
+            phi = receive_point_light(cells, light, degree)
+            lit.append(Received(weigh(phi, remaining_moments(cells)), phi[0]))
+        for confined in _confine(cells, light):
+            received = _receive_parallel(cells, [confined.light], degree)
+            lit.append(received.across(confined.profile))
     nothing = torch.zeros_like(cells.extinction.value)
-    return reduce(Received.plus, parts) if parts else Received(nothing[None], nothing)
+    return reduce(Received.plus, lit) if lit else Received(nothing[None], nothing)
 
 
 def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Received:
@@ -108,8 +109,10 @@ def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree:
         source = receive_beams(cells, lights, degree)
         return Received(source, source[0])
     pairs = [follow_pair(cells, light) for light in lights]
-    parts = (Received(one.source(cells), one.along + one.against, one.turned) for one in pairs)
-    return reduce(Received.plus, parts)
+    return reduce(
+        Received.plus,
+        (Received(pair.source(cells), pair.along + pair.against, pair.turned) for pair in pairs),
+    )
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
@@ -142,12 +145,14 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     if not skies:
         return None
     if medium.index != 1:
-        parts = (
-            profile * attenuate(medium, one.travel, moment_weights(one, degree))
-            for sky in skies
-            for one, profile in refract_sky(medium.grid, medium.index, sky)
+        return reduce(
+            torch.add,
+            (
+                profile * attenuate(medium, region.travel, moment_weights(region, degree))
+                for sky in skies
+                for region, profile in refract_sky(medium.grid, medium.index, sky)
+            ),
         )
-        return reduce(torch.add, parts)
     weights = torch.cat([moment_weights(sky, degree) for sky in skies])
     return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
 
@@ -181,8 +186,9 @@ def scatter_sky(
     total = period.extend(torch.zeros_like(medium.extinction.value))
     for sky in _lit_skies(skies):
         if medium.index != 1:
-            for one, profile in refract_sky(medium.grid, medium.index, sky):
-                total = total + profile * recompute(scatter, one.travel[0], one.irradiance[0])
+            for region, profile in refract_sky(medium.grid, medium.index, sky):
+                light = recompute(scatter, region.travel[0], region.irradiance[0])
+                total = total + profile * light
             continue
         for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
             total = total + recompute(scatter, travel, irradiance)

@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.engine import has_kernels
 from ddrecon.march.box import Crossing
 from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
 from ddrecon.march.sight import Sight
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
@@ -85,7 +84,7 @@ def _march_alone(
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
     """As `march_rays`, by the engine in use, through all periods of a grid."""
     march_own = march_rays
-    if has_kernels("view rays"):
+    if is_fused():
         from ddrecon.march.fused.integrate import march_rays as march_own
     if sampler.outgoing.period is not None:
         return march_periods(march_own, sampler, rays, crossing)

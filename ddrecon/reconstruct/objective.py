@@ -54,12 +54,12 @@ class Comparison:
         """The same, of which nothing is kept."""
         return self.share(view) * self.targets[view.name].loss_of(image)
 
-    def note(self, view: View, image: Tensor, loss: Tensor) -> None:
-        """Keeps the `image` of `view`, the `loss` that it adds, and its quality."""
+    def note(self, view: View, image: Tensor, loss: Tensor, psnr: Tensor | None = None) -> None:
+        """Keeps the `image` of `view`, the `loss` that it adds, and its quality (`psnr`)."""
         target = self.targets[view.name]
         self.pictures[view.name] = image
         self.metrics["loss"].append(loss)
-        self.metrics["psnr"].append(target.psnr_of(image))
+        self.metrics["psnr"].append(target.psnr_of(image) if psnr is None else psnr)
         if "ssim" in self.metrics:
             self.metrics["ssim"].append(target.ssim_of(image))
 

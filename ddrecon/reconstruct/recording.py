@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ddrecon import engine
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.kernels.graphs import record_graph
+from ddrecon.kernels.graphs import GraphRecorder
 from ddrecon.numerics.reads import without_reads
 from ddrecon.ranks import rank_count
 from ddrecon.reconstruct.gradients import (
@@ -37,7 +37,6 @@ from ddrecon.variables.values import with_values
 LOG = logging.getLogger(engine.LOG)
 SPARE = 1
 """Iterations of a solve beyond those it took last: tolerances fall as images come closer."""
-LossOf = Callable[[View, Tensor], Tensor]
 Record = Callable[[Callable[[], Any]], tuple[Any, Callable[[], object]]]
 """Returns the result of a computation and a function that computes it again, in place."""
 
@@ -86,7 +85,7 @@ class Recording:
             if key not in self.views:
                 # Views are recorded in light that there can be.
                 self.light.replay()
-                look = partial(self._view, view.name, compared.loss_of)
+                look = partial(self._view, view, compared)
                 self.views[key] = self._recorded(look)
             programs.append(self.views[key])
         if self.back is None:
@@ -96,10 +95,10 @@ class Recording:
         images, loss = list[Tensor](), self.sums[0].new_zeros(())
         for view, program in zip(compared.views, programs, strict=True):
             program.replay()
-            image, view_loss = (tensor.clone() for tensor in program.result)
+            image, view_loss, psnr = (tensor.clone() for tensor in program.result)
             images.append(image)
             loss = loss + view_loss
-            compared.note(view, image, view_loss)
+            compared.note(view, image, view_loss, psnr)
         self.back.replay()
         if not self._is_solved(memory):
             return None
@@ -130,17 +129,17 @@ class Recording:
         self.inputs = [*self.values.values(), *self.cut.leaves]
         self.sums = [torch.zeros_like(tensor) for tensor in self.inputs]
 
-    def _view(self, name: str, loss_of: LossOf) -> tuple[Tensor, Tensor]:
+    def _view(self, view: View, compared: Comparison) -> tuple[Tensor, Tensor, Tensor]:
         # What is made of values is made anew, so that each view has a graph of its own.
         outside = {n: value for n, value in self.values.items() if not is_of_volume(n)}
         world = with_values(self.scene, outside)
         image, loss, bars = differentiate_view(
-            self.cut.light_field, world, name, loss_of, self.inputs
+            self.cut.light_field, world, view.name, compared.loss_of, self.inputs
         )
         for total, bar in zip(self.sums, bars, strict=True):
             if bar is not None:
                 total.add_(bar)
-        return image, loss
+        return image, loss, compared.targets[view.name].psnr_of(image)
 
     def _follow_back(self) -> dict[str, Tensor]:
         self.memory.records = []
@@ -161,13 +160,13 @@ class Replays:
     What cannot be recorded is computed plainly, and a line says why.
     """
 
-    def __init__(self, scene: Scene, record: Record | None = None):
-        self.scene, self.record = scene, record
+    def __init__(self, scene: Scene, new_recorder: Callable[[], Record] | None = None):
+        self.scene, self.new_recorder = scene, new_recorder
         self.recording: Recording | None = None
         settings = scene.diffusion
         is_fixed = (settings.model, settings.scheme) in _FIXED and rank_count() == 1
         if is_fixed and scene.volume.density.is_cuda:
-            self.record = record_graph
+            self.new_recorder = GraphRecorder
 
     def differentiate(
         self, values: Mapping[str, Tensor], compared: Comparison, memory: SolveMemory
@@ -175,15 +174,15 @@ class Replays:
         """As of `gradients.differentiate`, where `compared` compares the images of its views."""
         # A plain iteration tells how many iterations solves take, but not of an empty volume.
         counts = memory.iterations.values()
-        if self.record is not None and counts and all(counts):
+        if self.new_recorder is not None and counts and all(counts):
             try:
                 self.recording = self.recording or Recording(
-                    self.scene, values, memory, self.record
+                    self.scene, values, memory, self.new_recorder()
                 )
                 objective = self.recording.replay(values, compared, memory)
             except RuntimeError as error:
                 LOG.warning("iterations run without CUDA graphs: %s", str(error).split("\n")[0])
-                self.record = objective = None
+                self.new_recorder = objective = None
             if objective is not None:
                 return objective
             self.recording = None

@@ -23,7 +23,6 @@ from ddrecon.run.report import FINER, registered_text
 from ddrecon.run.run_folder import CHECKPOINTS, SCENE, Checkpoints, RunFolder, write_scene
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, referenced_files
-from ddrecon.terms import engine_of_scene
 
 OPTIMIZE = "optimize"
 """The title of the progress bar of a run that is no frame of a film."""
@@ -49,8 +48,7 @@ def open_run(
     write_scene(scene_file, path)
     if loaded is None:
         claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])
-    of_run = {"seed": run.seed, "engines": engine_of_scene(scene)}
-    folder = RunFolder(path, scene_file, result_of, environment | of_run)
+    folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
     if loaded is None:
         folder.start(run)
     else:

@@ -14,7 +14,6 @@ from typing import Any
 
 from torch import Tensor
 
-from ddrecon.engine import name_engines
 from ddrecon.io.images.table import png_of, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
@@ -41,7 +40,7 @@ from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.quality import Findings
 from ddrecon.run.registration import shift_between
 from ddrecon.scene import Scene, View
-from ddrecon.terms import engine_of_scene, needed_terms
+from ddrecon.terms import needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import fields_of
 
@@ -72,8 +71,6 @@ def write_run_report(
     `numbers` are those of `list_numbers`.
     """
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
-    engines = name_engines(engine_of_scene(scene))
-    package_versions = {key: value for key, value in environment.items() if key != "engines"}
     settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     sections = [
@@ -82,9 +79,9 @@ def write_run_report(
         section("Loss", side_by_side(*curves(rows)), *_explain_steps(rows)),
         section("Views", *view_section(findings)),
         *([section("Numbers found", table(["", "start", "found"], numbers))] if numbers else []),
-        section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
+        section("Physics", paragraph(needs), items(needed_terms(scene))),
         section("Settings", fold("scene.yaml, all defaults filled in", settings)),
-        section("Versions", versions(package_versions)),
+        section("Versions", versions(environment)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
     goes_on = summary["ended"]["kind"] == GOES_ON["kind"]

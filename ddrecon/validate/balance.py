@@ -118,10 +118,10 @@ def _plain(value: Any, unit: Tensor) -> Any:
 def _cross_each(scene: Scene, box: _Box) -> dict[str, Tensor]:
     """What crosses the `box` of each light of `scene`, of its ground and of its emission."""
     medium = box.media[0]
-    sources = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
-    crossings = {name: box.cross(parts) for name, parts in sources.items()}
+    lights = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
+    crossings = {name: box.cross(sources) for name, sources in lights.items()}
     if box.lit:
-        ambient = ambient_radiance([*chain(*sources.values())], medium.g).flatten()
+        ambient = ambient_radiance([*chain(*lights.values())], medium.g).flatten()
         crossings["ground"] = box.cross_upwards(ambient)
     if medium.emission is not None:
         crossings["emission"] = box.cross_out()
@@ -153,26 +153,26 @@ class _Box:
         sides = enumerate(grid.extent)
         return [(axis not in grid.periodic) * math.prod(grid.extent) / side for axis, side in sides]
 
-    def cross(self, parts: Sequence[Source]) -> Tensor:
-        """What crosses of a light, of those of its `parts` that the ground does not hide."""
-        parts = stay_above(parts, self.lit.ground.plane) if self.lit else parts
+    def cross(self, sources: Sequence[Source]) -> Tensor:
+        """What crosses of the `sources` of a light that the ground does not hide."""
+        sources = stay_above(sources, self.lit.ground.plane) if self.lit else sources
         crossing = self.media[0].g.new_zeros(4, 2, len(FACES), 1, dtype=torch.float64)
-        for part in parts:
-            if isinstance(part, AmbientLight):
-                crossing = crossing + self._cross_evenly(part.radiance, (True, self.lit is None))
-            elif isinstance(part, Sky):
-                for travel, power in zip(part.travel, part.irradiance, strict=True):
+        for source in sources:
+            if isinstance(source, AmbientLight):
+                crossing = crossing + self._cross_evenly(source.radiance, (True, self.lit is None))
+            elif isinstance(source, Sky):
+                for travel, power in zip(source.travel, source.irradiance, strict=True):
                     region = DirectionalLight(array_order(travel), power)
                     crossing = crossing + self._follow(region, turns=0)
             else:
-                crossing = crossing + self._follow(part)
+                crossing = crossing + self._follow(source)
         return crossing
 
     def cross_upwards(self, ambient: Tensor) -> Tensor:
         """What crosses of the ground's light: `ambient` light [C], and what that sends more."""
         crossing = self._cross_evenly(ambient, (False, True))
-        for way, angle in zip(*hemisphere(self.up, UPWARDS, 1.0), strict=True):
-            light = DirectionalLight(array_order(way).to(ambient), angle[None].to(ambient))
+        for direction, angle in zip(*hemisphere(self.up, UPWARDS, 1.0), strict=True):
+            light = DirectionalLight(array_order(direction).to(ambient), angle[None].to(ambient))
             crossing = crossing + self._follow(light, ambient)
         return crossing
 
@@ -183,9 +183,9 @@ class _Box:
         power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
         empty = power / (2 * len(FACES))
         even = torch.ones_like(medium.extinction.value)
-        given = even[None], cell_gradient(even)
-        found = (self.sweep_out(medium.emitting, *given) for medium in self.media)
-        return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *found))
+        source = even[None], cell_gradient(even)
+        leaving = (self.sweep_out(medium.emitting, *source) for medium in self.media)
+        return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *leaving))
 
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
         """What crosses of a `radiance` [C] that is the same everywhere: `sides` are down and up."""
@@ -193,13 +193,12 @@ class _Box:
         halves = torch.full((2, len(FACES)), 0.5)
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
-        parts = (halves * areas)[..., None].to(radiance.device)
-        falling, given = math.pi * parts * radiance, (nothing[None], cell_gradient(nothing))
-        index = self.media[0].index
+        falling = math.pi * (halves * areas)[..., None].to(radiance.device) * radiance
+        index, source = self.media[0].index, (nothing[None], cell_gradient(nothing))
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
         inflow = index**2 * radiance.view(-1, 1, 1, 1)
-        found = (empty + self.sweep_out(medium, *given, inflow) for medium in self.media)
-        crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *found))
+        leaving = (empty + self.sweep_out(medium, *source, inflow) for medium in self.media)
+        crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *leaving))
         return crossing * crossing.new_tensor(sides).view(2, 1, 1)
 
     def _follow(self, light: Beamed, ambient: Tensor | None = None, turns: int = TURNS) -> Tensor:
@@ -223,8 +222,9 @@ class _Box:
                 irradiance = irradiance * ((even - ambient)[:, None] + more)
             out = self.areas[axis] / len(points) * (2 * side - 1)
             power = irradiance * (out * travel[:, axis]).clamp(min=0)
-            media = self.media if bool(power.any()) else ()
-            passing = [power * transmittance(one, rays, RAY_BY_RAY) for one in media] or 2 * [power]
+            passing = [power, power]
+            if bool(power.any()):
+                passing = [power * transmittance(m, rays, RAY_BY_RAY) for m in self.media]
             leaving = torch.stack(torch.broadcast_tensors(power, 0 * power, *passing)).double()
             is_up = travel[:, self.up] > 0
             powers.append(torch.stack([(leaving * ~is_up).sum(2), (leaving * is_up).sum(2)], 1))
@@ -236,19 +236,17 @@ class _Box:
         powers, (medium, _) = list[Tensor](), self.media
         for beam in enter_faces(medium.grid, medium.index, light):
             assert beam.face is not None and beam.at_face is not None
-            cosine, spacing = (
-                array_order(beam.light.direction)[beam.face].abs(),
-                medium.grid.spacing,
-            )
+            cosine = array_order(beam.light.direction)[beam.face].abs()
+            spacing = medium.grid.spacing
             area = math.prod(spacing) / spacing[beam.face] * cosine * beam.at_face.sum()
             entering = (area * beam.light.irradiance).expand(len(FACES), -1) / len(FACES)
             outer = reflectance(cosine, medium.index)
             # Of light that only grazes a face nothing enters.
-            found = [entering, outer / (1 - outer).clamp(min=1e-9) * entering]
-            for one in self.media:
-                passages = follow_inside(one, beam, turns)
-                found.append(reduce(torch.add, (each.released for each in passages)))
-            powers.append(torch.stack(torch.broadcast_tensors(*found)).double())
+            crossing = [entering, outer / (1 - outer).clamp(min=1e-9) * entering]
+            for inside in self.media:
+                passages = follow_inside(inside, beam, turns)
+                crossing.append(reduce(torch.add, (passage.released for passage in passages)))
+            powers.append(torch.stack(torch.broadcast_tensors(*crossing)).double())
         power = reduce(torch.add, powers)
         return torch.stack([power, 0 * power], 1)
 
@@ -282,12 +280,12 @@ class _Box:
                     mirror.left.append(out)
                     out = mirror.released(number)
                 course, gone = Course.of(grid, direction), power.new_zeros(6, out[0].shape[-3])
-                part = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
+                scale = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
                 for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
                     moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
                     if moved and axis not in grid.periodic:
                         lost = layer.sum(across, dtype=torch.float64)
-                        gone[2 * axis + (moved > 0)] = part * abs(moved) * lost
+                        gone[2 * axis + (moved > 0)] = scale * abs(moved) * lost
                 power = power + _split(gone, direction[self.up])
         return power
 
@@ -307,8 +305,8 @@ def _leave_turned(beam: TurnedBeam, grid: Grid, up: int) -> Tensor:
 
 def _split(power: Tensor, rise: float) -> Tensor:
     """`power` of light that rises so much, downwards and upwards; of level light half each."""
-    part = (1 + (rise > 0) - (rise < 0)) / 2
-    return torch.stack([(1 - part) * power, part * power])
+    share = (1 + (rise > 0) - (rise < 0)) / 2
+    return torch.stack([(1 - share) * power, share * power])
 
 
 def lines(report: dict[str, Any]) -> list[str]:

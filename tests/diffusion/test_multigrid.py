@@ -7,6 +7,7 @@ import torch
 from media import dense_matrix, random_values, solve_by_gradients
 from torch import Tensor
 
+from ddrecon.diffusion import hierarchy
 from ddrecon.diffusion.hierarchy import Hierarchy, Passes, prolong, restrict
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.diffusion.solve import solve_by_multigrid
@@ -116,6 +117,13 @@ def test_a_box_whose_ends_are_neighbors_is_solved(shape: tuple[int, ...]):
     solution = solve_by_multigrid(operator, source, None, 1e-13)
     torch.testing.assert_close(solution.value, u, rtol=1e-10, atol=1e-10)
     assert solution.iterations < 20
+
+
+def test_what_was_strong_before_changes_no_result(monkeypatch: pytest.MonkeyPatch):
+    operator, source = patchy_box((9, 10, 11)), random_values(2, 9, 10, 11)
+    expected = cycle_of(operator)(source)
+    monkeypatch.setitem(hierarchy._usual_axes, (9, 10, 11), [[1], [3]])
+    assert torch.equal(cycle_of(operator)(source), expected)
 
 
 def test_few_cells_are_solved_directly():

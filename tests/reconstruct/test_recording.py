@@ -77,7 +77,7 @@ def test_a_solve_that_needs_more_iterations_is_told(scene: Scene) -> None:
     memory.iterations = dict.fromkeys(memory.iterations, 0)
     recording = Recording(scene, leaves_of(scene), memory, record)
     assert recording.replay(leaves_of(scene, 0.5), compare(scene, "one"), memory) is None
-    replays = Replays(scene, record)
+    replays = Replays(scene, lambda: record)
     values, compared = leaves_of(scene, 0.5), compare(scene, "one")
     objective = replays.differentiate(values, compared, memory)
     assert_same(objective, differentiate_plainly(scene, values, "one"))
@@ -91,9 +91,9 @@ def test_what_cannot_be_recorded_runs_plainly(
     memory, values = SolveMemory(), leaves_of(scene)
     name = "views.one.camera"
     values[name] = value_of(scene, name).clone().requires_grad_()
-    replays = Replays(scene, record)
+    replays = Replays(scene, lambda: record)
     for _ in range(2):
         objective = replays.differentiate(values, compare(scene, "one"), memory)
-    assert replays.record is None
+    assert replays.new_recorder is None
     assert "without CUDA graphs" in caplog.text
     assert_same(objective, differentiate_plainly(scene, values, "one"))

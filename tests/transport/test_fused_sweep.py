@@ -12,9 +12,12 @@ from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import cut
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.transport.fused import ordinates
+from ddrecon.transport.rounds import face_mirror
 from ddrecon.transport.sweep import sweep_change
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from as_on_a_gpu import ORDERS, as_on_a_gpu
 
 pytestmark = pytest.mark.slow
 
@@ -44,11 +47,13 @@ class Case:
     depth: float = 3.0
     dtype: torch.dtype = torch.float64
     is_island: bool = False
+    periodic: tuple[int, ...] = ()
+    index: float = 1.0
 
     @property
     def grid(self) -> Grid:
         z, y, x = (n * step for n, step in zip(self.shape, self.spacing, strict=True))
-        return Grid(self.shape, (0.0, 0.0, 0.0), (z, y, x))
+        return Grid(self.shape, (0.0, 0.0, 0.0), (z, y, x), periodic=self.periodic)
 
     def values(self) -> dict[str, Tensor]:
         """All that a sweep depends on, by name."""
@@ -77,7 +82,7 @@ class Case:
     def medium(self, values: dict[str, Tensor]) -> Medium:
         density, sigma_a, sigma_s = (values[name] for name in ("density", "sigma_a", "sigma_s"))
         g = values.get("g", density.new_zeros(()))
-        volume = Volume(self.grid, density, sigma_a, sigma_s, g)
+        volume = Volume(self.grid, density, sigma_a, sigma_s, g, index=self.index)
         return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
 
 
@@ -85,7 +90,13 @@ def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> Tensor:
     use_engine(engine)
     medium = case.medium(values)
     lights = cut(values["light"]), cut(values["source"])
-    return torch.cat(sweep_change(medium, *lights, values.get("inflow"), case.directions))
+    # What faces reflect has left them in the sweep before.
+    mirror = face_mirror(medium, case.directions)
+    sweeps = [
+        torch.cat(sweep_change(medium, *lights, values.get("inflow"), case.directions, mirror))
+        for _ in range(1 if mirror is None else 2)
+    ]
+    return sum(sweeps[1:], sweeps[0])
 
 
 def gradients(
@@ -133,6 +144,11 @@ CASES = {
     "island": Case((7, 8, 70), CUBES, colors=1, is_island=True),
     "island-slanted": Case((7, 8, 70), FLAT, colors=1, is_island=True),
     "island-high": Case((25, 40, 7), colors=1, moments=1, is_island=True),
+    "around-zx": Case(periodic=(0, 2)),
+    "around-y": Case(periodic=(1,), spacing=CUBES),
+    "around-cubes": Case(periodic=(0, 1), spacing=CUBES, colors=1, varies=True),
+    "refracting": Case(index=1.4, known=4),
+    "refracting-line": Case((1, 9, 1), CUBES, index=1.3, moments=1),
 }
 
 
@@ -153,3 +169,34 @@ def test_single_precision(spacing: tuple[float, float, float]):
 def test_some_derivatives_are_asked_for(varied: list[str]):
     one, other = (gradients(Case(), engine, varied) for engine in ("warp", "torch"))
     assert_same(one, other, 1e-12)
+
+
+@pytest.mark.parametrize("case", [Case(directions=44), Case((5, 6, 7), CUBES, colors=1)], ids=str)
+def test_it_does_not_matter_which_ordinates_go_together(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few or all in a chunk, in one thread or in pieces of their own in many."""
+    together = gradients(case, "warp")
+    monkeypatch.setattr(ordinates, "MOST", 3)
+    ordinates._make_tables.cache_clear()
+    assert_same(gradients(case, "warp"), together, 1e-13)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    assert_same(gradients(case, "warp"), together, 1e-13)
+    ordinates._make_tables.cache_clear()
+
+
+@pytest.mark.parametrize("fill", [1, 200, 10**6])
+def test_chunks_by_cells_may_have_any_size(fill: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FILL_GPU", "FILL_CACHE"):
+        monkeypatch.setattr(ordinates, name, fill)
+    case = Case((3, 4, 5), periodic=(0,), directions=18)
+    assert_same(gradients(case, "warp"), gradients(case, "torch"), 1e-12)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("name", ["color", "44", "around-zx", "refracting"])
+def test_cells_of_a_slice_may_be_done_in_any_order(name: str, order: str) -> None:
+    known = gradients(CASES[name], "torch")
+    with as_on_a_gpu(order):
+        found = gradients(CASES[name], "warp")
+    assert_same(found, known, 1e-12)

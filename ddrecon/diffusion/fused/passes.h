@@ -238,7 +238,7 @@ template <class F> INLINE void solve(const Pass<F>& p, F* work, Size item) {
 
 // Pairs of cells along an axis, and the coarse grid that they make.
 template <int AXIS, class F> struct Pairs {
-    static constexpr int ONE = (AXIS + 1) % 3, OTHER = (AXIS + 2) % 3;
+    static constexpr int SIDE = (AXIS + 1) % 3, OTHER = (AXIS + 2) % 3;
     const Pass<F>& p;
     int fine[3];
     Cells cells;
@@ -288,15 +288,15 @@ template <int AXIS, class F> struct Pairs {
             });
         if (cells.color >= p.face_colors) return;
         F* const along = p.results[AXIS] + place;
-        F *const one = p.results[ONE] + place, *const other = p.results[OTHER] + place;
-        const F *const c_one = p.c[ONE], *const c_other = p.c[OTHER];
+        F *const side = p.results[SIDE] + place, *const other = p.results[OTHER] + place;
+        const F *const c_side = p.c[SIDE], *const c_other = p.c[OTHER];
         const F* const below = p.below[AXIS] + cells.color * cells.count;
         const F* const above = p.above[AXIS] + cells.color * cells.count;
         cells.visit_row([&](int i, const Beside& along_x, bool inner) HERE {
             const Cell cell = cells.cell(i);
-            one[i] = sum_of_pair(c_one, cell, inner);
+            side[i] = sum_of_pair(c_side, cell, inner);
             other[i] = sum_of_pair(c_other, cell, inner);
-            along[i] += F(0.5) * (energy<ONE>(c_one, cell, along_x, inner, below, above) +
+            along[i] += F(0.5) * (energy<SIDE>(c_side, cell, along_x, inner, below, above) +
                                   energy<OTHER>(c_other, cell, along_x, inner, below, above));
         });
     }

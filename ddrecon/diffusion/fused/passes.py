@@ -1,13 +1,15 @@
 """Multigrid's passes as kernels (`passes.h`): listed in a table once, launched as often as wanted.
 
-On a GPU each pass is a launch, with a thread for each cell. On a processor an item is a row; passes
-over few cells, and all of them where there is one thread, are done within one launch.
+On a GPU a pass is a launch, with a thread for each cell. On a processor an item is a row or a
+slice; passes over few cells, and all passes where threads are no more than colors, share a launch,
+in which a thread does the cells of a color.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -52,13 +54,12 @@ class Vector(NamedTuple):
 class KernelPasses(Passes):
     """Lists the passes of a preparation, or of a cycle for vectors of so many `colors`.
 
-    `is_by_cell`: whether an item does a cell, as on a GPU, and not a row. `kept`: what the table
-    points to.
+    `is_by_cell`: whether an item does a cell, as on a GPU. `tensors`: what the table points to.
     """
 
     def __init__(self, like: Tensor, colors: int = 1):
         self.like, self.colors, self.is_by_cell = like, colors, like.is_cuda
-        self.size, self.rows, self.kept = 0, list[dict[str, int]](), list[Tensor]()
+        self.size, self.rows, self.tensors = 0, list[dict[str, int]](), list[Tensor]()
 
     def new_vector(self, shape: Sequence[int], *, has_twin: bool = False) -> Vector:
         """Room for a vector on a grid of this `shape` [z, y, x], or for two."""
@@ -79,12 +80,12 @@ class KernelPasses(Passes):
         faces, cells = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
         below, above, *results = (self.like.new_empty(faces) for _ in range(5))
         results.append(self.like.new_empty(cells))
-        way = [Coarsening(axis, grid[axis - 1], below, above)]
+        coarsening = Coarsening(axis, grid[axis - 1], below, above)
         weights = [below, above, results[axis - 1]]
-        self._add_transfer("WEIGH", faces, grid, way, operator, results=weights)
-        self._add("COARSEN", cells, operator, way, grid=grid, rows=1, results=results)
+        self._add_transfer("WEIGH", faces, grid, [coarsening], operator, results=weights)
+        self._add("COARSEN", cells, operator, [coarsening], grid=grid, rows=1, results=results)
         z, y, x, loss = results
-        return way[0], Operator((z, y, x), loss, operator.periodic)
+        return coarsening, Operator((z, y, x), loss, operator.periodic)
 
     def matrix(self, operator: Operator) -> Tensor:
         count = operator.loss[0].numel()
@@ -93,40 +94,40 @@ class KernelPasses(Passes):
         return matrix
 
     def run(self) -> None:
-        program = Program(self, prepare_kernel(8 * self.like.itemsize))
+        program = Program(self, "prepare")
         launch(program.bind(self.like.new_empty(1)), program.cut(0, len(self.rows)))
         self.rows.clear()
 
-    def product(self, operator: Operator, u: Vector) -> Vector:
+    def product(self, operator: Operator, u: Vector, out: Vector) -> None:
         """A u."""
-        out = self.new_vector(u.shape)
-        self._add("PRODUCT", self._all(u.shape), operator, u=u, out=out)
-        return out
+        self._add("PRODUCT", (self.colors, *u.shape), operator, u=u, out=out)
 
     def smooth(self, level: Level, source: Vector) -> Vector:
         out = self.new_vector(source.shape, has_twin=True)
-        return self._add_level("SMOOTH", level, source=source, out=out)
+        return self._add_level("SMOOTH", level, out, source=source)
 
     def relax(self, level: Level, u: Vector, source: Vector, step: float) -> Vector:
         out = Vector(u.twin, u.shape, u.place)
-        return self._add_level("RELAX", level, u=u, source=source, out=out, step=STEPS.index(step))
+        return self._add_level("RELAX", level, out, u=u, source=source, step=STEPS.index(step))
 
     def residual(self, level: Level, u: Vector, source: Vector) -> Vector:
         out = Vector(u.twin, u.shape)
-        return self._add_level("RESIDUAL", level, u=u, source=source, out=out)
+        return self._add_level("RESIDUAL", level, out, u=u, source=source)
 
     def restrict(self, level: Level, residual: Vector) -> Vector:
         for together in self._groups(level.coarsenings):
             grid, out = residual.shape, self.new_vector(together[-1].below.shape[1:])
-            shape, vectors = self._all(out.shape), {"source": residual, "out": out}
+            shape, vectors = (self.colors, *out.shape), {"source": residual, "out": out}
             self._add_transfer("RESTRICT", shape, grid, together, level.operator, **vectors)
             residual = out
         return residual
 
     def solve(self, inverse: Tensor, source: Vector) -> Vector:
-        out = self.new_vector(source.shape)
-        given = {"inverse": inverse, "cell_colors": len(inverse), "source": source, "out": out}
-        self._add("SOLVE", self._all(out.shape), rows=0, **given)
+        out = self.new_vector(source.shape, has_twin=True)
+        shape, colors = (self.colors, *out.shape), len(inverse)
+        self._add(
+            "SOLVE", shape, rows=0, inverse=inverse, cell_colors=colors, source=source, out=out
+        )
         return out
 
     def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
@@ -136,26 +137,22 @@ class KernelPasses(Passes):
             grid = [cells.get(axis, n) for axis, n in enumerate(coarse.shape, 1)]
             # The last one, to the grid of u, adds to that what is kept.
             kept, out = (None, self.new_vector(grid)) if number else (level.kept, u)
-            given = {"source": coarse, "out": out, "kept": kept}
-            self._add_transfer("CORRECT", self._all(grid), grid, together, level.operator, **given)
+            shape, values = (self.colors, *grid), {"source": coarse, "out": out, "kept": kept}
+            self._add_transfer("CORRECT", shape, grid, together, level.operator, **values)
             coarse = out
         return u
 
     def _groups(self, coarsenings: Sequence[Coarsening]) -> list[Sequence[Coarsening]]:
         """Those of one pass: all on a GPU, where launches cost most; else one, as vector code."""
-        return [coarsenings] if self.is_by_cell else [[one] for one in coarsenings]
-
-    def _all(self, shape: Sequence[int]) -> tuple[int, ...]:
-        return self.colors, *shape
+        return [coarsenings] if self.is_by_cell else [[coarsening] for coarsening in coarsenings]
 
     def _width(self, shape: Sequence[int], rows: int) -> int:
         """How many cells an item does: one, a row, or a slice."""
         return 1 if self.is_by_cell else math.prod(shape[len(shape) - rows :])
 
-    def _add_level(self, kind: str, level: Level, **given: Any) -> Vector:
-        out: Vector = given["out"]
-        given |= {"inverse": level.inverse, "kept": level.kept}
-        self._add(kind, self._all(out.shape), level.operator, **given)
+    def _add_level(self, kind: str, level: Level, out: Vector, **values: Any) -> Vector:
+        values |= {"inverse": level.inverse, "kept": level.kept, "out": out}
+        self._add(kind, (self.colors, *out.shape), level.operator, **values)
         return out
 
     def _add_transfer(
@@ -165,13 +162,13 @@ class KernelPasses(Passes):
         grid: Sequence[int],
         coarsenings: Sequence[Coarsening],
         operator: Operator,
-        **given: Any,
+        **values: Any,
     ) -> None:
         """Lists a pass along one axis, or more on a GPU. Across it rows need not be told apart."""
         axes = {coarsening.axis for coarsening in coarsenings}
         if not self.is_by_cell:
-            shape, grid = (_merge_axes(each, axes) for each in (shape, grid))
-        self._add(kind, shape, operator, coarsenings, grid=grid, rows=1, **given)
+            shape, grid = (_merge_axes(sizes, axes) for sizes in (shape, grid))
+        self._add(kind, shape, operator, coarsenings, grid=grid, rows=1, **values)
 
     def _add(
         self,
@@ -180,12 +177,12 @@ class KernelPasses(Passes):
         operator: Operator | None = None,
         coarsenings: Sequence[Coarsening] = (),
         rows: int = 2,
-        **given: Any,
+        **values: Any,
     ) -> None:
         """Lists a pass whose items fill `shape` [C, z, y, x]; the grid is that, or another one."""
         width = self._width(shape, rows)
         row: dict[str, Any] = {"kind": Kind[kind], "width": width}
-        row |= {"items": math.prod(shape) // width, "n": given.pop("grid", shape[1:]), **given}
+        row |= {"items": math.prod(shape) // width, "n": values.pop("grid", shape[1:]), **values}
         if operator:
             row |= {"c": operator.conductances, "loss": operator.loss}
             row |= {"face_colors": len(operator.conductances[0]), "cell_colors": len(operator.loss)}
@@ -200,7 +197,7 @@ class KernelPasses(Passes):
         """Each number of a `row` of the table, with its name."""
         for name, value in row.items():
             if isinstance(value, Tensor):
-                self.kept.append(value)
+                self.tensors.append(value)
                 yield name, value.data_ptr()
             elif isinstance(value, Vector):
                 yield name, value.place
@@ -211,9 +208,9 @@ class KernelPasses(Passes):
                     yield from self._numbers_of({f"{name}_{number}": entry})
 
 
-def entries_of(given: str) -> Iterator[str]:
-    """The names of the numbers and addresses that `given` declares, each entry of lists."""
-    for _, _, name, count in declarations(given):
+def entries_of(declared: str) -> Iterator[str]:
+    """The names of the numbers and addresses that are `declared`, each entry of lists."""
+    for _, _, name, count in declarations(declared):
         yield from [f"{name}_{entry}" for entry in range(count)] or [name]
 
 
@@ -237,8 +234,8 @@ def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
     table = like.new_empty(len(numbers), dtype=torch.int64)
     for start in range(0, len(numbers), TOGETHER):
         row = [*numbers[start : start + TOGETHER]]
-        given = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
-        table_kernel().launch(1, given, {"table": table})
+        values = {"start": start, "count": len(row), "n": row + [0] * (TOGETHER - len(row))}
+        table_kernel().launch(1, values, {"table": table})
     return table
 
 
@@ -246,24 +243,27 @@ def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
 def table_kernel() -> TextKernel:
     """Writes numbers that it is given to a table."""
     text = "".join(f"if ({k} < count) table[start + {k}] = n[{k}];\n" for k in range(TOGETHER))
-    given = f"long n[{TOGETHER}], start, count, *table"
-    return TextKernel("multigrid_table", 64, text, given, "table")
+    declared = f"long n[{TOGETHER}], start, count, *table"
+    return TextKernel("multigrid_table", 64, text, declared, "table")
 
 
 class Program:
-    """A table of passes where kernels see it, with the launches that do them.
+    """A table of passes where kernels see it, and the launches that do them.
 
-    `kept`: what the table points to; `size`: how many numbers vectors take.
+    `size`: how many numbers vectors take.
     """
 
-    def __init__(self, passes: KernelPasses, kernel: TextKernel):
-        self.rows, self.kept, self.size = [*passes.rows], [*passes.kept], passes.size
-        self.kernel, self.colors, self.is_on_gpu = kernel, passes.colors, passes.like.is_cuda
+    def __init__(self, passes: KernelPasses, name: str):
+        like, self.colors, self.size = passes.like, passes.colors, passes.size
+        self.kernel = passes_kernel(name, 8 * like.itemsize)
+        self.rows, self.tensors = [*passes.rows], [*passes.tensors]
         names = [*entries_of(PASS)]
-        self.table = _write_table(
-            [row.get(name, 0) for row in self.rows for name in names], passes.like
-        )
-        self.is_alone = not self.is_on_gpu and thread_count(passes.like) <= passes.colors
+        numbers = [row.get(name, 0) for row in self.rows for name in names]
+        self.table = _write_table(numbers, like)
+        # So many cells of all colors are best done by one thread for each color.
+        self.most = -1 if like.is_cuda else SMALL
+        if not like.is_cuda and thread_count(like) <= self.colors:
+            self.most = sys.maxsize
 
     def bind(self, work: Tensor) -> Bound:
         """The kernel, for vectors in `work`."""
@@ -273,55 +273,45 @@ class Program:
         """Launches of the passes from `first` to `last`: each all of one, or a color of several."""
         launches = list[dict[str, int]]()
         for number, row in enumerate(self.rows[first:last], first):
-            is_large = row["items"] * row["width"] > SMALL and not self.is_alone
-            if self.is_on_gpu or is_large:
-                launches.append(
-                    {"count": row["items"], "begin": number, "end": number + 1, "parts": 0}
-                )
-            elif launches and launches[-1]["parts"]:
+            is_shared = row["items"] * row["width"] > self.most
+            if launches and launches[-1]["parts"] and not is_shared:
                 launches[-1]["end"] = number + 1
-            else:
-                parts = {"count": self.colors, "parts": self.colors}
-                launches.append({"begin": number, "end": number + 1, **parts})
+                continue
+            count, parts = (row["items"], 0) if is_shared else (self.colors, self.colors)
+            launches.append({"count": count, "begin": number, "end": number + 1, "parts": parts})
         return launches
 
 
 def launch(bound: Bound, launches: Sequence[Mapping[str, int]]) -> None:
     """Does the passes of a `bound` program, as it was `cut`."""
-    for one in launches:
-        bound.launch(**one)
+    for arguments in launches:
+        bound.launch(**arguments)
 
 
+@functools.cache
 def passes_kernel(name: str, bits: int) -> TextKernel:
-    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`."""
+    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`.
+
+    `name`: those that `prepare` a hierarchy, or those of a `cycle`.
+    """
+    steps = ", ".join(f"F({step!r})" for step in STEPS)
     text = f"""
     for (int k = begin; k < end; ++k) {{
         const Pass<F>& pass = ((const Pass<F>*)table)[k];
         const Size from = parts ? pass.items * item / parts : item;
         const Size to = parts ? pass.items * (item + 1) / parts : item + 1;
-        for (Size i = from; i < to; ++i) {name}(pass, work, F({STEPS[0]!r}), F({STEPS[1]!r}), i);
+        for (Size i = from; i < to; ++i) {name}(pass, work, {steps}, i);
     }}
     """
-    given = "long *table; int begin, end, parts; F *work"
-    return TextKernel(f"multigrid_{name}", bits, text, given, "work", "diffusion/fused/passes.h")
-
-
-@functools.cache
-def prepare_kernel(bits: int) -> TextKernel:
-    """The passes that prepare a hierarchy."""
-    return passes_kernel("prepare", bits)
-
-
-@functools.cache
-def cycle_kernel(bits: int) -> TextKernel:
-    """The passes of a cycle, and products."""
-    return passes_kernel("cycle", bits)
+    declared = "long *table; int begin, end, parts; F *work"
+    header = "diffusion/fused/passes.h"
+    return TextKernel(f"multigrid_{name}", bits, text, declared, "work", header)
 
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled meanwhile."""
-    for kernel in (cycle_kernel, prepare_kernel):
-        launch_later(kernel(8 * like.itemsize).kernel, like)
+    for name in ("cycle", "prepare"):
+        launch_later(passes_kernel(name, 8 * like.itemsize).kernel, like)
 
 
 class KernelGrids:
@@ -338,15 +328,16 @@ class KernelGrids:
         self.programs: dict[int, tuple[Program, list[Vector]]] = {}
 
     def program(self, colors: int) -> tuple[Program, list[Vector]]:
-        """The program, a product before a cycle; direction and residual, product and solution."""
+        """The program, a cycle before a product; direction and residual, product and solution."""
         if colors not in self.programs:
             loss = self.operator.loss
             passes = KernelPasses(loss, colors)
-            given = [passes.new_vector(loss.shape[1:]) for _ in range(2)]
-            product = passes.product(self.operator, given[0])
-            solution = self.hierarchy.cycle(passes, given[1])
-            program = Program(passes, cycle_kernel(8 * loss.itemsize))
-            self.programs[colors] = program, [*given, product, solution]
+            direction, residual = (passes.new_vector(loss.shape[1:]) for _ in range(2))
+            solution = self.hierarchy.cycle(passes, residual)
+            product = Vector(solution.twin, solution.shape)
+            passes.product(self.operator, direction, product)
+            vectors = [direction, residual, product, solution]
+            self.programs[colors] = Program(passes, "cycle"), vectors
         return self.programs[colors]
 
 
@@ -358,17 +349,18 @@ class KernelCycle:
         program, vectors = grids.program(len(source))
         work = source.new_empty(program.size)
         self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
-        self._first, self._others = program.cut(0, 1), program.cut(1, len(program.rows))
-        self.direction, self.residual, self._product, self._solution = (
+        last = len(program.rows) - 1
+        self._cycle, self._product = program.cut(0, last), program.cut(last, last + 1)
+        self.direction, self.residual, self.room, self._solution = (
             work[vector.place :][: source.numel()].view_as(source) for vector in vectors
         )
 
     def product(self) -> Tensor:
         """A times the direction."""
-        launch(self._bound, self._first)
-        return self._product
+        launch(self._bound, self._product)
+        return self.room
 
     def cycle(self) -> Tensor:
         """Roughly A^-1 times the residual."""
-        launch(self._bound, self._others)
+        launch(self._bound, self._cycle)
         return self._solution

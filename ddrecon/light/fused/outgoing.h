@@ -6,9 +6,9 @@
 namespace ddrecon {
 
 INLINE constexpr double find_root(double x) {
-    double found = 1.0 + x;
-    for (int i = 0; i < 40; ++i) found = 0.5 * (found + x / found);
-    return found;
+    double root = 1.0 + x;
+    for (int i = 0; i < 40; ++i) root = 0.5 * (root + x / root);
+    return root;
 }
 // What makes the mean square of a harmonic 1; and (2 M - 1)!!.
 template <int L, int M> constexpr double NORM =
@@ -16,16 +16,15 @@ template <int L, int M> constexpr double NORM =
 template <int M> constexpr double ODD = FACTORIAL<2 * M> / (FACTORIAL<M> * (1 << M));
 
 // y_k of a vector v, z first, from those of order M and degree L on (`numerics/harmonics.py`):
-// `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `before` that of L
-// - 1.
+// `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `below` that of L - 1.
 template <class F, int DEGREE, int M, int L, class N> INLINE void fill_order(
-    const N* v, const N& square, const N& cosine, const N& sine, const N& legendre, const N& before,
+    const N* v, const N& square, const N& cosine, const N& sine, const N& legendre, const N& below,
     N* y) {
     const N value = F(NORM<L, M>) * legendre;
     y[L * L + L + M] = M ? value * cosine : value;
     if constexpr (M > 0) y[L * L + L - M] = value * sine;
     if constexpr (L < DEGREE) {
-        const N next = F(2 * L + 1) * v[0] * legendre - F(L + M) * square * before;
+        const N next = F(2 * L + 1) * v[0] * legendre - F(L + M) * square * below;
         fill_order<F, DEGREE, M, L + 1>(
             v, square, cosine, sine, F(1.0 / (L + 1 - M)) * next, legendre, y);
     }
@@ -38,31 +37,16 @@ INLINE void fill_harmonics(const N* v, const N& square, const N& cosine, const N
             v, square, v[2] * cosine - v[1] * sine, v[2] * sine + v[1] * cosine, y);
 }
 
-// `even` + `along`, floored below a `margin` of their sizes; with its slopes by both.
-template <class F> struct Bent {
-    F value, by_even, by_along;
-    INLINE Bent(F even, F along, F margin, F least) {
-        const F r = even + along, size = margin * (size_of(even) + size_of(along));
-        const F divisor = size > least ? size : least, part = r / divisor;
-        const F opened = F(1) + (part < F(-1) ? F(-1) : (part > F(1) ? F(1) : part));
-        const bool is_inside = (r >= -divisor) & (r <= divisor), is_whole = r >= size;
-        const F slope = is_inside ? F(0.5) * opened * (size / divisor) : F(0);
-        const F moved = size >= least ? slope * part : F(0);
-        const F by_size = is_whole ? F(0) : margin * (F(0.25) * opened * opened - moved);
-        value = is_whole ? r : F(0.25) * size * opened * opened;
-        by_even = (is_whole ? F(1) : slope) + by_size * sign_of(even);
-        by_along = (is_whole ? F(1) : slope) + by_size * sign_of(along);
-    }
-    static INLINE F size_of(F x) { return x < F(0) ? -x : x; }
-    static INLINE F sign_of(F x) { return x < F(0) ? F(-1) : (x > F(0) ? F(1) : F(0)); }
-};
-template <class F> INLINE F floored(F even, F along, F margin, F least) {
-    return Bent<F>(even, along, margin, least).value;
+// `even` + `along`, floored below a `margin` of their sizes: `floored` in `light/moments.py`.
+template <class N> INLINE N size_of(const N& x) {
+    return pick(value_of(x) > 0, x, pick(value_of(x) < 0, -x, N(0)));
 }
-template <class F>
-INLINE Dual<F> floored(const Dual<F>& even, const Dual<F>& along, F margin, F least) {
-    const Bent<F> found(even.value, along.value, margin, least);
-    return even.chain(found.value, found.by_even, along, found.by_along);
+template <class N, class F> INLINE N floored(const N& even, const N& along, F margin, F least) {
+    const N r = even + along, size = margin * (size_of(even) + size_of(along));
+    const N ratio = r / pick(value_of(size) >= least, size, N(least));
+    const N low = pick(value_of(ratio) >= F(-1), ratio, N(F(-1)));
+    const N opened = F(1) + pick(value_of(low) <= F(1), low, N(F(1)));
+    return pick(value_of(r) >= value_of(size), r, F(0.25) * size * opened * opened);
 }
 
 // Where the camera is: at a point, or without `is_eye` in a direction; and what cells see of it.
@@ -93,8 +77,8 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
     };
     template <class F, class N, class W, class In> static INLINE void direct(
         const View<F>& view, const F* first, int i, const N* eye, const W* factor, const In* in,
-        Directed<N>& found) {
-        N *const y = found.y, v[3];
+        Directed<N>& seen) {
+        N *const y = seen.y, v[3];
         const F center[3] = {first[0], first[1], first[2] + view.hx * F(i)};
         UNROLLED
         for (int a = 0; a < 3; ++a) v[a] = view.is_eye ? eye[a] - center[a] : N(eye[a]);
@@ -104,16 +88,14 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
         UNROLLED
         for (int a = 0; a < 3; ++a) v[a] = shortened * v[a];
         fill_harmonics<F, DEGREE>(v, v[0] * v[0] + v[1] * v[1] + v[2] * v[2], N(F(1)), N(F(0)), y);
-        found.along = N(F(0));
-        if constexpr (HAS_MORE) found.along = N(in[COUNT][i]);
+        seen.along = N(F(0));
+        if constexpr (HAS_MORE) seen.along = N(in[COUNT][i]);
         UNROLLED
         for (int l = 1; l <= DEGREE; ++l) {
-            found.sum[l] = N(F(0));
+            seen.sum[l] = N(F(0));
             UNROLLED
-            for (int k = l * l; k < (l + 1) * (l + 1); ++k) {
-                found.sum[l] += in[k][i] * y[k];
-            }
-            found.along += factor[l] * found.sum[l];
+            for (int k = l * l; k < (l + 1) * (l + 1); ++k) seen.sum[l] += in[k][i] * y[k];
+            seen.along += factor[l] * seen.sum[l];
         }
     }
 
@@ -125,9 +107,9 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
         INDEPENDENT
         for (int i = 0; i < row.width; ++i) {
             const N even = number[FACTOR] * in[0][i];
-            Directed<N> found;
-            direct(view, first, i, number + EYE, number + FACTOR, in, found);
-            out[i] = change_of(floored(even, found.along, view.margin, view.least));
+            Directed<N> seen;
+            direct(view, first, i, number + EYE, number + FACTOR, in, seen);
+            out[i] = change_of(floored(even, seen.along, view.margin, view.least));
         }
     }
 
@@ -146,23 +128,24 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
         for (int k = 0; k < NUMBERS; ++k) sum[k] = F(0);
         INDEPENDENT
         for (int i = 0; i < row.width; ++i) {
-            Directed<N> found;
-            direct(view, first, i, eye, factor, in, found);
-            const F even = factor[0] * in[0][i];
-            const Bent<F> whole(even, value_of(found.along), view.margin, view.least);
-            const F even_bar = bar[i] * whole.by_even, along_bar = bar[i] * whole.by_along;
+            Directed<N> seen;
+            direct(view, first, i, eye, factor, in, seen);
+            Dual<F, 2> even(factor[0] * in[0][i]), along(value_of(seen.along));
+            even.by[0] = along.by[1] = F(1);
+            const Dual<F, 2> radiance = floored(even, along, view.margin, view.least);
+            const F even_bar = bar[i] * radiance.by[0], along_bar = bar[i] * radiance.by[1];
             sum[FACTOR] += in[0][i] * even_bar;
             out[0][i] = factor[0] * even_bar;
             UNROLLED
             for (int l = 1; l <= DEGREE; ++l) {
-                sum[FACTOR + l] += value_of(found.sum[l]) * along_bar;
+                sum[FACTOR + l] += value_of(seen.sum[l]) * along_bar;
                 UNROLLED
                 for (int k = l * l; k < (l + 1) * (l + 1); ++k)
-                    out[k][i] = factor[l] * along_bar * value_of(found.y[k]);
+                    out[k][i] = factor[l] * along_bar * value_of(seen.y[k]);
             }
             if constexpr (HAS_MORE) out[COUNT][i] = along_bar;
             if constexpr (VARIES)
-                for (int a = 0; a < 3; ++a) sum[EYE + a] += along_bar * found.along.by[a];
+                for (int a = 0; a < 3; ++a) sum[EYE + a] += along_bar * seen.along.by[a];
         }
         UNROLLED
         for (int k = 0; k < NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
@@ -171,20 +154,20 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
 
 template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
-    const F* const* d_fields, const F* numbers, const F* d_numbers, F* const* made) {
-    const Inputs<N, Cell::INS, Cell::NUMBERS, F> given(
+    const F* const* d_fields, const F* numbers, const F* d_numbers, F* const* outputs) {
+    const Inputs<N, Cell::INS, Cell::NUMBERS, F> inputs(
         row, channels, fields, d_fields, numbers, d_numbers);
-    Cell::scatter(row, view, given.in, given.number, made[0]);
+    Cell::scatter(row, view, inputs.in, inputs.number, outputs[0]);
 }
 
 template <class Cell, class F> INLINE void find_cotangents(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
-    const F* numbers, const F* const* bars, F* const* made, F* sums) {
+    const F* numbers, const F* const* bars, F* const* outputs, F* sums) {
     const F* in[Cell::INS];
     F number[Cell::NUMBERS], *out[Cell::INS];
     row.in_all<Cell::INS>(fields, channels, in);
     row.of_color<Cell::NUMBERS>(numbers, number);
-    row.in_all<Cell::INS>(made, out);
+    row.in_all<Cell::INS>(outputs, out);
     Cell::scatter_back(row, view, in, number, bars[0] + row.at, out, sums);
 }
 

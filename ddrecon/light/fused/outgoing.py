@@ -26,15 +26,16 @@ def scatter_fused(
     """
     degree = math.isqrt(len(light)) - 1
     fields = [light] if more is None else [light, more]
-    colors = max(factors.shape[1], *(one.shape[-4] for one in fields))
+    colors = max(factors.shape[1], *(field.shape[-4] for field in fields))
     point = -rays.direction[0] if rays.eye is None else rays.eye
-    each = point[:, None], factors[: degree + 1].reshape(degree + 1, -1)
-    numbers = torch.cat([one.expand(-1, colors) for one in each])
+    rows = point[:, None], factors[: degree + 1].reshape(degree + 1, -1)
+    numbers = torch.cat([row.expand(-1, colors) for row in rows])
     _, y, x = grid.shape
-    given = {"ny": y, "nx": x, "is_eye": rays.eye is not None, "margin": MARGIN}
-    given |= zip(("hz", "hy", "hx", "lz", "ly", "lx"), (*grid.spacing, *grid.lower), strict=True)
-    given["least"] = 1e6 * torch.finfo(light.dtype).tiny
+    camera = {"ny": y, "nx": x, "is_eye": rays.eye is not None, "margin": MARGIN}
+    camera |= zip(("hz", "hy", "hx", "lz", "ly", "lx"), (*grid.spacing, *grid.lower), strict=True)
+    camera["least"] = 1e6 * torch.finfo(light.dtype).tiny
     name = f"Outgoing<{degree}, {int(more is not None)}, {int(point.requires_grad)}>"
     shape = colors, *grid.shape
-    (radiance,) = RowFunction(HEADER, name, (shape,), x, VIEW, GIVEN, given).apply(numbers, *fields)
+    function = RowFunction(HEADER, name, (shape,), x, VIEW, GIVEN, camera)
+    (radiance,) = function.apply(numbers, *fields)
     return radiance

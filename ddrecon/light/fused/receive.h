@@ -6,21 +6,13 @@
 
 namespace ddrecon {
 
-// exp(-mass) phi(depth), with its slopes by both.
-template <class F> struct Visible {
-    F value, by_mass, by_depth;
-    INLINE Visible(F mass, F depth) {
-        const F clear = decay(mass);
-        const Decayed<F> cell = decayed(depth);
-        value = clear * cell.phi;
-        by_mass = -value;
-        by_depth = clear * (cell.psi - cell.phi);
-    }
-};
-template <class F> INLINE F visible(F mass, F depth) { return Visible<F>(mass, depth).value; }
-template <class F> INLINE Dual<F> visible(const Dual<F>& mass, const Dual<F>& depth) {
-    const Visible<F> found(mass.value, depth.value);
-    return mass.chain(found.value, found.by_mass, depth, found.by_depth);
+// exp(-mass) phi(depth).
+template <class N> INLINE N visible(const N& mass, const N& depth) {
+    const auto clear = decay(value_of(mass));
+    const auto cell = decayed(value_of(depth));
+    typedef Sloped<decltype(cell.phi + clear)> Function;
+    return along(mass, Function{clear, -clear}) *
+           along(depth, Function{cell.phi, cell.psi - cell.phi});
 }
 
 // What all beams have: fields [channels, cells], weights [lights, moments, colors], and the path of
@@ -36,10 +28,10 @@ template <class F, int CHUNK> struct Receiver {
     // Where moment number a in color c begins.
     INLINE long long moment(int a, int c) const { return ((long long)a * colors + c) * cells; }
 
-    // Writes to moments `made` what is received of at most BEAMS beams; as dual numbers N, given as
-    // `In`, its change.
+    // Writes moments `phi` of what is received of at most BEAMS beams; as dual numbers N, given as
+    // `In`, their changes.
     template <class N, int BEAMS, class In> INLINE void receive(
-        int item, In field, In scale, In entered, In steps, In weights, F* made) const {
+        int item, In field, In scale, In entered, In steps, In weights, F* phi) const {
         const long long begin = (long long)item * CHUNK;
         const int count = count_from(begin);
         for (int c = 0; c < colors; ++c) {
@@ -56,22 +48,22 @@ template <class F, int CHUNK> struct Receiver {
             for (int a = 0; a < moments; ++a) {
                 N sums[CHUNK];
                 for (int t = 0; t < count; ++t) sums[t] = N(F(0));
-                const auto own = [&](int i) HERE { return N(weights[weight(i, a, c)]); };
+                const auto by = [&](int i) HERE { return N(weights[weight(i, a, c)]); };
                 int i = 0;
                 // Of many beams four at a time.
                 for (; i + 4 <= lights; i += 4) {
-                    const N one = own(i), two = own(i + 1), three = own(i + 2), four = own(i + 3);
+                    const N w0 = by(i), w1 = by(i + 1), w2 = by(i + 2), w3 = by(i + 3);
                     INDEPENDENT
                     for (int t = 0; t < count; ++t)
-                        sums[t] += one * seen[i][t] + two * seen[i + 1][t] +
-                                   three * seen[i + 2][t] + four * seen[i + 3][t];
+                        sums[t] += w0 * seen[i][t] + w1 * seen[i + 1][t] + w2 * seen[i + 2][t] +
+                                   w3 * seen[i + 3][t];
                 }
                 for (; i < lights; ++i) {
-                    const N one = own(i);
+                    const N w = by(i);
                     INDEPENDENT
-                    for (int t = 0; t < count; ++t) sums[t] += one * seen[i][t];
+                    for (int t = 0; t < count; ++t) sums[t] += w * seen[i][t];
                 }
-                F* __restrict out = made + moment(a, c) + begin;
+                F* __restrict out = phi + moment(a, c) + begin;
                 for (int t = 0; t < count; ++t) out[t] = change_of(sums[t]);
             }
         }
@@ -86,46 +78,43 @@ template <class F, int CHUNK> struct Receiver {
         const long long begin = ((long long)item + first_item) * CHUNK;
         const int count = count_from(begin);
         for (int i = 0; i < lights * channels; ++i) {
-            const int one = i / channels, channel = i % channels;
+            const int light = i / channels, channel = i % channels;
             const F* __restrict e = entered + i * cells + begin;
             const F* __restrict f = field + channel * cells + begin;
-            const F own_step = steps[one];
-            double* found = sums + ((long long)item * lights + one) * (1 + (1 + moments) * colors);
-            F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
-            for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
+            F* __restrict e_bar = entered_bar + i * cells + begin;
+            F* __restrict f_bar = field_bar + channel * cells + begin;
+            double* sum = sums + ((long long)item * lights + light) * (1 + (1 + moments) * colors);
+            for (int t = 0; t < count; ++t) e_bar[t] = F(0);
             const int last = channels == 1 ? colors : channel + 1;
             for (int c = channels == 1 ? 0 : channel; c < last; ++c) {
-                const F s = scale[c];
-                F bar[CHUNK], seen[CHUNK], of_scale[CHUNK];
+                const F s = scale[c], step = s * steps[light];
+                F bar[CHUNK], seen[CHUNK], of_scale[CHUNK], of_step[CHUNK];
                 for (int t = 0; t < count; ++t) bar[t] = F(0);
                 for (int a = 0; a < moments; ++a) {
-                    const F own = weights[weight(one, a, c)];
+                    const F w = weights[weight(light, a, c)];
                     const F* __restrict from = bars + moment(a, c) + begin;
-                    for (int t = 0; t < count; ++t) bar[t] += own * from[t];
+                    for (int t = 0; t < count; ++t) bar[t] += w * from[t];
                 }
                 for (int t = 0; t < count; ++t) {
-                    const F path = own_step * f[t];
-                    const Visible<F> tau(s * e[t], s * path);
-                    const F mass_bar = tau.by_mass * bar[t], depth_bar = tau.by_depth * bar[t];
+                    Dual<F, 2> mass(s * e[t]), depth(step * f[t]);
+                    mass.by[0] = depth.by[1] = F(1);
+                    const Dual<F, 2> tau = visible(mass, depth);
+                    const F mass_bar = tau.by[0] * bar[t], depth_bar = tau.by[1] * bar[t];
                     seen[t] = tau.value;
-                    of_entered[t] += s * mass_bar;
-                    of_field[t] += s * own_step * depth_bar;
-                    of_scale[t] = path * depth_bar + e[t] * mass_bar;
+                    e_bar[t] += s * mass_bar;
+                    f_bar[t] += step * depth_bar;
+                    of_scale[t] = steps[light] * f[t] * depth_bar + e[t] * mass_bar;
                     of_step[t] = s * f[t] * depth_bar;
                 }
                 if (!varies) continue;
-                found[0] += total(of_step, count);
-                found[1 + c] = total(of_scale, count);
+                sum[0] += total(of_step, count);
+                sum[1 + c] = total(of_scale, count);
                 for (int a = 0; a < moments; ++a) {
                     const F* __restrict from = bars + moment(a, c) + begin;
                     for (int t = 0; t < count; ++t) of_scale[t] = from[t] * seen[t];
-                    found[1 + (1 + a) * colors + c] = total(of_scale, count);
+                    sum[1 + (1 + a) * colors + c] = total(of_scale, count);
                 }
             }
-            F* __restrict out = entered_bar + i * cells + begin;
-            F* __restrict of_cell = field_bar + channel * cells + begin;
-            for (int t = 0; t < count; ++t) out[t] = of_entered[t];
-            for (int t = 0; t < count; ++t) of_cell[t] += of_field[t];
         }
     }
 };

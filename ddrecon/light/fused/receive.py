@@ -38,9 +38,9 @@ class _Received(torch.autograd.Function):
 
     @staticmethod
     def forward(*tensors: Tensor) -> Tensor:
-        if any(one.requires_grad for one in tensors):
+        if any(tensor.requires_grad for tensor in tensors):
             launch_later(receive_kernel("receive_back", 8 * tensors[0].itemsize).kernel, tensors[0])
-        return _receive("receive", tensors)
+        return _receive("receive", _arguments(tensors))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -54,22 +54,22 @@ class _Received(torch.autograd.Function):
         _, needs_scale, _, needs_steps, needs_weights = ctx.needs_input_grad
         varies = needs_scale or needs_steps or needs_weights
         lights, moments, colors = weights.shape
-        given = _given(tensors) | {"varies": varies, "bars": bar}
+        arguments = _arguments(tensors) | {"varies": varies, "bars": bar}
         field_bar, entered_bar = field.new_zeros(field.shape), field.new_empty(entered.shape)
-        made = {"field_bar": field_bar, "entered_bar": entered_bar}
+        bars = {"field_bar": field_bar, "entered_bar": entered_bar}
         items, _ = cut(field[0].numel(), CHUNK, field)
         width = 1 + (1 + moments) * colors
-        found = field.new_zeros(lights, width, dtype=torch.float64)
-        part = max(1, MOST_SUMS // found.numel()) if varies else items
-        for first in range(0, items, part):
-            count = min(part, items - first)
-            sums = found.new_zeros(count * varies, lights, width)
-            kernel = receive_kernel("receive_back", 8 * field.element_size())
-            kernel.launch(count, given | {"first_item": first}, made | {"sums": sums})
-            found += sums.sum(0)
+        total = field.new_zeros(lights, width, dtype=torch.float64)
+        most = max(1, MOST_SUMS // total.numel()) if varies else items
+        kernel = receive_kernel("receive_back", 8 * field.element_size())
+        for first in range(0, items, most):
+            count = min(most, items - first)
+            sums = total.new_zeros(count * varies, lights, width)
+            kernel.launch(count, arguments | {"first_item": first}, bars | {"sums": sums})
+            total += sums.sum(0)
         if not varies:
             return field_bar, None, entered_bar, None, None
-        steps_bar, scale_bar, weights_bar = found.to(field).split([1, colors, moments * colors], 1)
+        steps_bar, scale_bar, weights_bar = total.to(field).split([1, colors, moments * colors], 1)
         weights_bar = weights_bar.reshape(weights.shape)
         return field_bar, scale_bar.sum(0), entered_bar, steps_bar[:, 0], weights_bar
 
@@ -77,9 +77,10 @@ class _Received(torch.autograd.Function):
     def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
             values, d_values = tensors[:5], tensors[5:]
-            pairs = zip(values, d_values, strict=True)
-            changes = [torch.zeros_like(one) if d_one is None else d_one for one, d_one in pairs]
-            return _receive("tangent", values, changes)
+            arguments = _arguments(values)
+            for name, value, d_value in zip(_ARRAYS, values, d_values, strict=True):
+                arguments[f"d_{name}"] = torch.zeros_like(value) if d_value is None else d_value
+            return _receive("tangent", arguments)
 
         d_moments: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_moments
@@ -89,39 +90,39 @@ _ARRAYS = "field", "scale", "entered", "steps", "weights"
 _SIZES = "cells, channels, colors, moments, lights"
 
 
-def _given(tensors: Sequence[Tensor]) -> dict[str, Any]:
-    """What all kernels are given."""
-    field, weights, given = tensors[0], tensors[-1], dict(zip(_ARRAYS, tensors, strict=True))
+def _arguments(tensors: Sequence[Tensor]) -> dict[str, Any]:
+    """What all kernels are given: arrays and their sizes, by name."""
+    field, weights = tensors[0], tensors[-1]
     lights, moments, colors = weights.shape
     sizes = field[0].numel(), len(field), colors, moments, lights
-    return given | dict(zip(_SIZES.split(", "), sizes, strict=True))
+    names = *_ARRAYS, *_SIZES.split(", ")
+    return dict(zip(names, (*tensors, *sizes), strict=True))
 
 
-def _receive(kind: str, tensors: Sequence[Tensor], changes: Sequence[Tensor] = ()) -> Tensor:
+def _receive(kind: str, arguments: dict[str, Any]) -> Tensor:
     """Moments, or of kind "tangent" their changes."""
-    given, (field, *_) = _given(tensors), tensors
-    given |= {f"d_{name}": change for name, change in zip(_ARRAYS, changes, strict=False)}
-    made = field.new_empty(given["moments"], given["colors"], *field.shape[1:])
+    field: Tensor = arguments["field"]
+    phi = field.new_empty(arguments["moments"], arguments["colors"], *field.shape[1:])
     items, _ = cut(field[0].numel(), CHUNK, field)
-    receive_kernel(kind, 8 * field.element_size()).launch(items, given, {"made": made})
-    return made
+    receive_kernel(kind, 8 * field.element_size()).launch(items, arguments, {"phi": phi})
+    return phi
 
 
 @functools.cache
 def receive_kernel(kind: str, bits: int) -> TextKernel:
     """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
-    arrays, more, made = ", ".join(_ARRAYS), "F *made", "made"
-    call = f"receive<F, {MOST_BEAMS}>(item, {arrays}, made)"
+    arrays, more, written = ", ".join(_ARRAYS), "F *phi", "phi"
+    call = f"receive<F, {MOST_BEAMS}>(item, {arrays}, phi)"
     if kind == "tangent":
-        pairs = ", ".join(f"Changing<F>{{{one}, d_{one}}}" for one in _ARRAYS)
-        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, {pairs}, made)"
-        more = ", ".join([more, *(f"*d_{one}" for one in _ARRAYS)])
+        pairs = ", ".join(f"Changing<F>{{{name}, d_{name}}}" for name in _ARRAYS)
+        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, {pairs}, phi)"
+        more = ", ".join([more, *(f"*d_{name}" for name in _ARRAYS)])
     elif kind == "receive_back":
-        own = "bars, field_bar, entered_bar, sums"
-        call = f"receive_back(item, first_item, varies, {arrays}, {own})"
+        bars = "bars, field_bar, entered_bar, sums"
+        call = f"receive_back(item, first_item, varies, {arrays}, {bars})"
         more = "F *bars, *field_bar, *entered_bar; double *sums"
-        made = "field_bar entered_bar sums"
+        written = "field_bar entered_bar sums"
     text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SIZES}}};\nreceiver.{call};"
-    given = "long cells; int first_item, channels, colors, moments, lights, varies;"
-    given += f" F *{', *'.join(_ARRAYS)}; {more}"
-    return TextKernel(f"beams_{kind}", bits, text, given, made, "light/fused/receive.h")
+    declared = "long cells; int first_item, channels, colors, moments, lights, varies;"
+    declared += f" F *{', *'.join(_ARRAYS)}; {more}"
+    return TextKernel(f"beams_{kind}", bits, text, declared, written, "light/fused/receive.h")

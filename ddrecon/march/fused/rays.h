@@ -26,10 +26,10 @@ struct Layout {
     static constexpr int CHANNELS = FIRST_REMAINING + REMAINING;
     // Coefficients of p over the depth of the peak, and over the number of the cell.
     static constexpr int TERMS = HAS_PEAK ? COEFFICIENTS : 1, POWERS = POWER_COUNT;
-    static constexpr int CURVE = TERMS * POWERS, CURVES = TABLES * CURVE;
+    static constexpr int CURVE = TERMS * POWERS;
     // Whether a thread holds those of an angle all together: on a GPU many are read one by one.
     static constexpr bool HOLDS = !IS_GPU || POWERS == 1;
-    static constexpr int HELD = HOLDS ? CURVES : TABLES * TERMS;
+    static constexpr int HELD = TABLES * (HOLDS ? CURVE : TERMS);
 
     static constexpr INLINE int at(int first, int channels, int c) {
         return first + (channels > 1 ? c : 0);

@@ -116,15 +116,16 @@ class _Sweep(torch.autograd.Function):
             pairs = (mass, swept.extinction), (scattered, swept.scattering)
             sums = [(bar * field).sum((1, 2, 3), dtype=torch.float64) for bar, field in pairs]
             scales_bar = torch.stack([*(one.to(inflow) for one in sums), inflow])
-        bars_of_fields: list[Tensor | None] = [
+        of_extinction, of_scattering = (
             _of_field(bar, scale, field)
             for bar, scale, field in zip(
                 (mass, scattered), swept.scales, (swept.extinction, swept.scattering), strict=False
             )
-        ]
+        )
+        of_fields: tuple[Tensor, Tensor | None] = of_extinction, of_scattering
         if fields[2] is None:
-            bars_of_fields = [torch.add(*bars_of_fields), None]
-        return None, None, scales_bar, *bars_of_fields, gradient, source, returning
+            of_fields = of_extinction + of_scattering, None
+        return None, None, scales_bar, *of_fields, gradient, source, returning
 
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, Tensor | None]:
