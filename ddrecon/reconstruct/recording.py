@@ -77,8 +77,8 @@ class Recording:
         # By `data`, whose changes nobody counts: the way back was recorded with other numbers.
         for name, value in self.values.items():
             value.data.copy_(values[name].detach())
-        for key, guess in self.guesses.items():
-            guess.copy_(memory.last[key])
+        for solve, guess in self.guesses.items():
+            guess.copy_(memory.last[solve])
         programs = []
         for view in compared.views:
             key = view.name, compared.share(view)
