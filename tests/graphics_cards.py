@@ -1,15 +1,14 @@
 """Fused kernels are compiled for graphics cards where there are none as well."""
 
-import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 ARCHITECTURES = 80, 90, 120
 """Of cards of three generations (sm_80 and so on): no kernel's text depends on which it is."""
-INFO = 0x70000000
-"""Type of the sections of an ELF file that say what a function needs."""
+INFO, SIZED, REGISTERS, STACK = 0x70000000, 4, 0x2F, 0x11
+"""Of an ELF file for graphics cards: a type of sections, a format and two attributes in these."""
 
 
 def assert_compiles(kernels: Sequence[Any], folder: Path) -> None:
@@ -23,25 +22,35 @@ def assert_compiles(kernels: Sequence[Any], folder: Path) -> None:
 
 
 def find_resources(kernel: Any, architecture: int, folder: Path) -> tuple[int, int]:
-    """Registers of a thread and bytes of its stack, of a Warp `kernel` compiled into `folder`.
-
-    They stand in a cubin's sections of type `INFO`: a format (4: with a size), an attribute (0x2f:
-    registers; 0x11: the stack's frame), a size of 8 bytes, then which function's and how many.
-    """
+    """Registers of a thread and bytes of its stack, of a Warp `kernel` compiled into `folder`."""
     import warp as wp
 
     (path,) = wp.compile_aot_module(
         kernel.module, arch=architecture, use_ptx=False, module_dir=folder
     )
-    code = path.read_bytes()
+    most = {REGISTERS: 0, STACK: 0}
+    for attribute, value in _attributes(path.read_bytes()):
+        if attribute in most:
+            most[attribute] = max(most[attribute], struct.unpack("<2I", value)[1])
+    return most[REGISTERS], most[STACK]
+
+
+def _attributes(code: bytes) -> Iterator[tuple[int, bytes]]:
+    """What the sections of type `INFO` of a cubin, which is an ELF file, say of its functions.
+
+    An entry is a format and an attribute of a byte each, then two bytes: its value, or of format
+    `SIZED` the length of the value behind them. Those of functions are a number of the function
+    and one of what it needs.
+    """
     (table,), (width, count) = (
         struct.unpack_from("<Q", code, 40),
         struct.unpack_from("<2H", code, 58),
     )
-    headers = (struct.unpack_from("<2I4Q", code, table + width * k) for k in range(count))
-    info = b"".join(code[at : at + size] for _, kind, _, _, at, size in headers if kind == INFO)
-    found = (
-        re.findall(b"\x04" + one + b"\x08\0.{4}(.{4})", info, re.S) for one in (b"\x2f", b"\x11")
-    )
-    registers, stack = (max(int.from_bytes(each, "little") for each in many) for many in found)
-    return registers, stack
+    for section in range(count):
+        _, kind, _, _, at, size = struct.unpack_from("<2I4Q", code, table + width * section)
+        end = at + size if kind == INFO else at
+        while at < end:
+            form, attribute, length = struct.unpack_from("<2BH", code, at)
+            length = length if form == SIZED else 0
+            yield attribute, code[at + 4 : at + 4 + length]
+            at += 4 + length

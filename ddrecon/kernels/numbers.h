@@ -43,9 +43,14 @@
 
 namespace ddrecon {
 
-#if IS_GPU && !defined(__CUDA_ARCH__)
-template <class F> INLINE void atomicAdd(F* to, F value) { *to += value; }
+// Adds to a number to which other threads of a GPU may add meanwhile.
+template <class F> INLINE void add_to(F* number, F value) {
+#if defined(__CUDA_ARCH__)
+    atomicAdd(number, value);
+#else
+    *number += value;
 #endif
+}
 
 // How numbers are written, and log(2) in two parts, for `decay`; how many terms of series count.
 template <class F> struct Format;

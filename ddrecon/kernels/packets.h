@@ -11,8 +11,6 @@ namespace ddrecon {
 #if IS_GPU
 constexpr int LANES = 1;
 #else
-// No packet crosses into code that was compiled for other vector registers.
-#pragma GCC diagnostic ignored "-Wpsabi"
 constexpr int LANES = 16;
 // Packets are no part of an interface between compilers, which is what is warned of.
 #pragma GCC diagnostic ignored "-Wpsabi"
@@ -58,10 +56,9 @@ template <class F> struct Packets {
     static INLINE V read(const F* p) { return *p; }
     static INLINE void write(F* p, V x) { *p = x; }
     static INLINE V gather(const F* p, I at) { return p[at]; }
-    static INLINE void add(F* p, I at, V x) { atomicAdd(p + at, x); }
+    static INLINE void add(F* p, I at, V x) { add_to(p + at, x); }
     static INLINE V log(V x) { return ::log(x); }
     static INLINE V decay(V depth) { return ddrecon::decay(depth); }
-    static INLINE void add_one(F* p, F x) { atomicAdd(p, x); }
 #else
     static INLINE V all(F x) { return x - V{}; }
     static INLINE I whole(V x) { return __builtin_convertvector(x, I); }
@@ -105,7 +102,6 @@ template <class F> struct Packets {
     static INLINE void add(F* p, I at, V x) {
         for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
     }
-    static INLINE void add_one(F* p, F x) { *p += x; }
     static INLINE V decay(V depth) { return decay_of<F, M>(depth); }
     // log x = n log 2 + log m with x = 2^n m > 0 and m between the root of 1/2 and that of 2:
     // log m = 2 (s + s^3 / 3 + s^5 / 5 + ...), where s = (m - 1) / (m + 1).

@@ -6,11 +6,11 @@
 namespace ddrecon {
 
 // A place among `size` points on a line, the part a of the way from point n to the next.
-template <class N> struct Place {
+template <class N> struct Position {
     typedef decltype(value_of(N(0))) F;
     int n;
     N a;
-    INLINE Place(double q, int size) {
+    INLINE Position(double q, int size) {
         const double place = q + NEARLY<F> * size;
         n = (int)place;
         n -= n > place;

@@ -63,8 +63,8 @@ AGREES = [
     ),
     *(
         (
-            f"Taps<double> taps(Place<double>(10.0 * x, 9).a); out = taps.{each};",
-            f"typedef Dual<double, 1> N; Place<N> at(10.0 * x, 9); at.a.by[0] = 10.0;"
+            f"Taps<double> taps(Position<double>(10.0 * x, 9).a); out = taps.{each};",
+            f"typedef Dual<double, 1> N; Position<N> at(10.0 * x, 9); at.a.by[0] = 10.0;"
             f" out = (Taps<N>(at.a).{each}).by[0];",
         )
         for each in (*(f"linear[{t}]" for t in (1, 2)), *(f"bend[{t}]" for t in range(4)))

@@ -70,14 +70,6 @@ template <class F, int BLOCK> struct Ways {
         }
     }
 
-    static INLINE void add(F* to, F value) {
-#if IS_GPU
-        atomicAdd(to, value);
-#else
-        *to += value;
-#endif
-    }
-
     // The field's cotangent, from those of `totals`.
     INLINE void integrate_back(int item, const F* totals, F* fields_bar) const {
         const int begin = item * BLOCK, count = count_from(begin);
@@ -94,7 +86,7 @@ template <class F, int BLOCK> struct Ways {
                 for (int t = 0; t < count; ++t) {
                     auto add_row = [&](int from, F value) HERE {
                         F* const to = fields_bar + channel * cells() + corner[t] + from;
-                        add(to, value - value * ax[t]), add(to + up_x(), value * ax[t]);
+                        add_to(to, value - value * ax[t]), add_to(to + up_x(), value * ax[t]);
                     };
                     auto add_layer = [&](int from, F value) HERE {
                         add_row(from, value - value * ay[t]), add_row(from + up_y(), value * ay[t]);

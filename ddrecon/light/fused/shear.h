@@ -63,13 +63,13 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
           bound(number[3]) {}
 
     // Cell 0 of slice k among rays.
-    static INLINE Place<N> place(int first, double k, const N& slope, int size) {
-        Place<N> found(less_product(first, k, value_of(slope)), size);
+    static INLINE Position<N> place(int first, double k, const N& slope, int size) {
+        Position<N> found(less_product(first, k, value_of(slope)), size);
         if constexpr (IS_DUAL<N>) found.a.by[0] = F(-k) * slope.by[0];
         return found;
     }
-    INLINE Place<N> row_place(double k) const { return place(first_row, k, slope_row, rows); }
-    INLINE Place<N> column_place(double k) const {
+    INLINE Position<N> row_place(double k) const { return place(first_row, k, slope_row, rows); }
+    INLINE Position<N> column_place(double k) const {
         return place(first_column, k, slope_column, columns);
     }
     INLINE long long window_row(int channel, int k, int m) const {
@@ -125,7 +125,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
     // The field where rays are a `shift` after slice k: on that, or midway from there to the next.
     INLINE void look(const Rays& own, int k, double shift, const N* field, N* found) const {
         const int last = shift > 0 ? k + 1 : k, size = own.hi - own.lo;
-        const Place<N> r = row_place(k + shift), c = column_place(k + shift);
+        const Position<N> r = row_place(k + shift), c = column_place(k + shift);
         const Taps<N> row(r.a), column(c.a);
         N cells[BLOCK + 1];
         clear(cells, size + 1);
@@ -238,7 +238,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         clear(passed, BLOCK), clear(bends, BLOCK);
         for (int k = slices - 1; k >= 0; --k) {
             if (!meet(own, k)) continue;
-            const Place<F> r = row_place(k), c = column_place(k);
+            const Position<F> r = row_place(k), c = column_place(k);
             // Of rays, by gathering from cells: rows first, then columns.
             const Taps<F> row(r.a), column(c.a);
             const int size = own.hi - own.lo, left = own.lo - c.n - 2;
@@ -292,7 +292,7 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         F* __restrict out = field_bar + own.at;
         // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet these cells.
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
-            const Place<F> r = row_place(s + shift), c = column_place(s + shift);
+            const Position<F> r = row_place(s + shift), c = column_place(s + shift);
             const int up = own.row + r.n - row_place(s).n,
                       left = own.begin + c.n - column_place(s).n;
             const Taps<F> row(r.a), column(c.a);

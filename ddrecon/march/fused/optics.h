@@ -200,7 +200,7 @@ template <class F, int COUNT> struct Table {
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < 4; ++j)
                 for (int k = 0; k < COUNT; ++k)
-                    P::add_one(
+                    add_to(
                         table_bar + (2 * P::lane_of(angle.first, l) + j) * COUNT + k,
                         P::lane(weights[j], l) * P::lane(bar[k], l));
     }
