@@ -33,6 +33,8 @@ CAPTURE = (
     "optimize.parameters={density: {init: 0, min: 0, support: auto, support_margin: 4},"
     " lights.0.irradiance: {}, views.cam_0.exposure: {}, views.cam_0.camera: {}}"
 )
+EVERY_RAY = "render.tolerance=0"
+"""A processor interpolates pixels that are finer than cells, and a GPU does not."""
 Operation = Callable[[Tensor, Tensor], Any]
 OPERATIONS: dict[str, Operation] = {
     "sum": lambda far, near: far + near,
@@ -95,7 +97,7 @@ def test_indices_and_masks_go_to_the_device_and_not_back() -> None:
 def run(device: torch.device) -> Result:
     """Two iterations; rounds are among the derivatives below."""
     overrides = ["optimize.refine_at=[]", "diffusion.tolerance=0.01", CAPTURE]
-    overrides += ["diffusion.transport_rounds=0"]
+    overrides += ["diffusion.transport_rounds=0", EVERY_RAY]
     path = CONFIGS / "capture.yaml"
     scene = load_scene(path, overrides=overrides, dtype=torch.float64, device=device)
     views = {view.is_test: view for view in reversed(scene.views)}
@@ -158,7 +160,7 @@ def test_every_kind_of_derivative_is_found_there(
         with kernels_for(place, engine):
             kind = {"dtype": torch.float64, "device": place}
             path = CONFIGS / f"{config}.yaml"
-            scene = load_scene(path, overrides=[*SMALL, *overrides], **kind)
+            scene = load_scene(path, overrides=[*SMALL, *overrides, EVERY_RAY], **kind)
             scene = scene if overrides is GROUND else replace(scene, ground=None)
             names = scene.optimize.parameters.keys() & set(variable_names(scene))
             values = {name: value_of(scene, name).requires_grad_() for name in names}
