@@ -12,7 +12,7 @@ from click.testing import Result
 
 from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import LOCK, hold
-from ddrecon.reconstruct import loop
+from ddrecon.reconstruct import recording
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.page import REFRESH
 from ddrecon.run import drive, quality
@@ -48,7 +48,7 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
 
 
 MOMENTS = {
-    "after a render at a new resolution": (loop, "differentiate", 3),
+    "after a render at a new resolution": (recording, "differentiate", 3),
     "after the first step": (Parameter, "step", 1),
     "after a later step": (Parameter, "step", 3),
 }

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import count_shares
+from ddrecon.kernels.launch import count_shares, launch_later
 from ddrecon.kernels.text import Bound, TextKernel, names_of
 from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
 
@@ -101,6 +101,8 @@ class Sweep:
         if saves and self.by_rows:
             shape = len(stages), len(self.tables.numbers), self.colors, *self._plane
             saved = self.like.new_empty(shape)
+        for call in ("follow<true>()", "go_back()") if saves else ():
+            launch_later(self._kernel(call).kernel, self.like)
         for chunk, colors in self._parts():
             light, outputs = self._ring(chunk, colors, planes), self._outputs(chunk, 1)
             arrays = {"light": light, "moments": moments, "outputs": outputs}
@@ -228,9 +230,7 @@ class Sweep:
         names = "scales", "extinction", "scattering", "gradient", "source"
         fields = {name: getattr(swept, name) for name in names}
         d_fields = {f"d_{name}": changes and getattr(changes, name) for name in names}
-        kernel = _kernel(
-            call, changes is not None, self.by_rows, self.has_faces, 8 * self.like.itemsize
-        )
+        kernel = self._kernel(call)
         given = (
             dict.fromkeys(kernel.names - kernel.made, 0)
             | dict.fromkeys(kernel.arrays.keys() - kernel.made)
@@ -248,6 +248,10 @@ class Sweep:
             },
             dict.fromkeys(kernel.made) | arrays,
         )  # fmt: skip
+
+    def _kernel(self, call: str) -> TextKernel:
+        is_dual, bits = self.d_swept is not None, 8 * self.like.itemsize
+        return _kernel(call, is_dual, self.by_rows, self.has_faces, bits)
 
     def _launch(self, bound: Bound, chunk: Chunk, colors: slice, stage: range) -> None:
         items, threads = chunk.teams * (colors.stop - colors.start) * self.lanes, None
