@@ -10,7 +10,7 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Any
 from unittest.mock import patch
 
@@ -30,12 +30,12 @@ ORDERS: dict[str, Callable[[int], int]] = {
 
 
 @contextlib.contextmanager
-def as_on_a_gpu(order: str = "forward") -> Iterator[set[str]]:
+def as_on_a_gpu(order: str = "forward") -> Iterator[Collection[Any]]:
     """Runs kernels as on a GPU, with their items in one of `ORDERS`.
 
-    Yields the set of headers, by path, that kernels launched meanwhile were compiled from.
+    Yields the kernels that are launched meanwhile, in their order.
     """
-    headers: set[str] = set()
+    kernels: dict[Any, None] = {}
 
     def launch(
         kernel: Any,
@@ -46,7 +46,7 @@ def as_on_a_gpu(order: str = "forward") -> Iterator[set[str]]:
     ) -> None:
         assert threads in (None, 1), "a GPU has no shares"
         (record,) = arguments(0) if callable(arguments) else arguments
-        headers.update(re.findall('#line 1 "ddrecon/(.*)"', _preamble(kernel)))
+        kernels[kernel] = None
         wp.launch(_reordered(kernel), count, [ORDERS[order](count), count, record], device="cpu")
 
     with (
@@ -54,7 +54,14 @@ def as_on_a_gpu(order: str = "forward") -> Iterator[set[str]]:
         patch.object(Tensor, "is_cpu", False),
         patch.object(text, "launch", launch),
     ):
-        yield headers
+        yield kernels
+
+
+def headers_of(kernels: Iterable[Any]) -> set[str]:
+    """The headers that `kernels` were compiled from, by path."""
+    return {
+        path for one in kernels for path in re.findall('#line 1 "ddrecon/(.*)"', _preamble(one))
+    }
 
 
 def _preamble(kernel: Any) -> str:

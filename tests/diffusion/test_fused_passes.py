@@ -11,7 +11,7 @@ from ddrecon.diffusion.solve import Solution, solve_by_multigrid
 from ddrecon.engine import use_engine
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from as_on_a_gpu import ORDERS, as_on_a_gpu
+from as_on_a_gpu import ORDERS, as_on_a_gpu, headers_of
 
 from ddrecon.diffusion.fused.passes import KernelCycle
 
@@ -52,9 +52,9 @@ def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int, wrap
 @pytest.mark.parametrize("wraps", [False, True])
 def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
     operator, source = patchy_box((7, 8, 9), wraps), random_values(2, 7, 8, 9, seed=4) - 0.5
-    with as_on_a_gpu(order) as headers:
+    with as_on_a_gpu(order) as launched:
         assert_cycles_agree(operator, source)
-    assert "diffusion/fused/passes.h" in headers
+    assert "diffusion/fused/passes.h" in headers_of(launched)
 
 
 @pytest.mark.parametrize("form", FORMS)
