@@ -44,7 +44,8 @@ class Tape(TorchDispatchMode):
             return result
 
         def repeat() -> None:
-            again = function(*tree_map_only(Tensor, _plain, arguments), **options)
+            plain, named = tree_map_only(Tensor, _plain, (arguments, options))
+            again = function(*plain, **named)
             for tensor, new in zip(_tensors(result), _tensors(again), strict=True):
                 if _address(tensor) != _address(new):
                     tensor.data.copy_(new)

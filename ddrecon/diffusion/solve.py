@@ -121,8 +121,8 @@ def _iterate(
         torch.sub(source, cycle.product(), out=residual)
         # A guess that is worse than zero is not used.
         helps = square_norm(residual) <= source_square
-        u = torch.where(helps, guess, u)
-        residual.copy_(torch.where(helps, residual, source))
+        torch.where(helps, guess, u, out=u)
+        torch.where(helps, residual, source, out=residual)
     direction.zero_()
     power, iteration = torch.ones_like(source_square), 0
     while True:

@@ -64,10 +64,10 @@ def run_rounds(
     began, is_open, light = perf_counter(), tolerance > 0, cut(phi)
     factors = [None] * rounds if is_open else _blending(medium, rounds)
     for round_index, factor in enumerate(factors, 1):
-        is_last, before = round_index == rounds, light[0][0]
+        is_last, before = round_index == rounds, light[0].detach()[0]
         cosine = _flux_factor(medium, is_last and not is_open)
         light = _round(every_round, light, round_index, cosine, factor)
-        residual = _residual(light[0][0], before) if is_open or is_last else 1.0
+        residual = _residual(light[0].detach()[0], before) if is_open or is_last else 1.0
         if is_last or residual < tolerance:
             break
     record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
@@ -135,12 +135,12 @@ def _round(
     if rounds.emitted is not None:
         low, high = add(low, rounds.emitted[0]), high + rounds.emitted[1]
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
-    mean, first = mean_and_first(light[0])
-    off = None
+    off, start = None, light[0].detach()[0]
     if round_index > 1:
+        mean, first = mean_and_first(light[0])
         off = _imbalance(operator, right, mean), problem.flux(mean, begun=first, sign=-1)
     gain, source, turned = _gain(medium, low, off, directions, cosine)
-    solve_round = replace(rounds.solve, round_index=round_index, start=mean.detach())
+    solve_round = replace(rounds.solve, round_index=round_index, start=start)
     u = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
     gained, gained_first = mean_and_first(gain)

@@ -113,8 +113,9 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    gradient = steep_gradient(medium, light[0][0] + source[0][0], directions)
     scatters = fill(_scatter(light, source, factors), medium.degree)
+    # p_0 is 1: the first moment is L0 + Q0.
+    gradient = steep_gradient(medium, scatters[0], directions)
     if mirror is not None:
         mirror.begin(_without(fill(torch.cat(light), medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
