@@ -39,9 +39,17 @@ def moments_of_flux(flux: Sequence[Tensor]) -> Tensor:
 
 def cut(phi: Tensor) -> Cut:
     """The moments `phi` of degrees 0 and 1, and those of higher degree."""
+    if len(phi) <= 4:
+        return phi, phi.detach()[:0]
     # Cut, not indexed: on the way back this is put together once.
-    low, high = phi.split([min(4, len(phi)), max(0, len(phi) - 4)])
+    low, high = phi.split([4, len(phi) - 4])
     return low, high
+
+
+def join(moments: Cut) -> Tensor:
+    """All moments of a `cut`."""
+    low, high = moments
+    return torch.cat([low, high]) if len(high) else low
 
 
 def mean_and_first(low: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -19,7 +19,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveRecord, SolverWithMemory
 from ddrecon.diffusion.operator import Operator
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Cut, add, cut, mean_and_first
+from ddrecon.light.moments import Cut, add, cut, join, mean_and_first
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
@@ -72,7 +72,7 @@ def run_rounds(
             break
     record = SolveRecord("rounds", round_index, residual, perf_counter() - began)
     solve.memory.records.append(record)
-    return torch.cat(light)
+    return join(light)
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill
+from ddrecon.light.moments import Cut, add, by_harmonic, cut, fill, join
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -117,7 +117,7 @@ def sweep_change(
     # p_0 is 1: the first moment is L0 + Q0.
     gradient = steep_gradient(medium, scatters[0], directions)
     if mirror is not None:
-        mirror.begin(_without(fill(torch.cat(light), medium.degree), inflow))
+        mirror.begin(_without(fill(join(light), medium.degree), inflow))
     swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
     if mirror is not None:
         mirror.end(_without(swept, inflow))
