@@ -25,7 +25,7 @@ from ddrecon.diffusion.solve import name_kernels, solve_by_multigrid
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import AmbientLight
 from ddrecon.light.moments import Cut, add, cut, weigh
-from ddrecon.light.pairs import TurnedBeam
+from ddrecon.light.pairs import ReversedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import (
     Received,
@@ -83,7 +83,7 @@ class LightField:
     received: Received
     diffuse: Tensor
     skies: tuple[Sky, ...] = ()
-    turned: tuple[TurnedBeam, ...] = ()
+    turned: tuple[ReversedBeam, ...] = ()
     at_faces: FaceLight | None = None
     leaving: Tensor | None = None
     ground: LitGround | None = None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.light.moments import radiance_along, weigh
-from ddrecon.light.pairs import TurnedBeam
+from ddrecon.light.pairs import ReversedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
@@ -42,7 +42,7 @@ def scatter_towards(
     medium: Medium,
     light: Tensor,
     rays: Rays,
-    turned: Sequence[TurnedBeam] = (),
+    turned: Sequence[ReversedBeam] = (),
     more: Tensor | None = None,
 ) -> Tensor:
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
@@ -77,13 +77,13 @@ def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
     ]
 
 
-def sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:
+def sum_turned(medium: Medium, rays: Rays, turned: Sequence[ReversedBeam]) -> Tensor:
     """What light of all `turned` beams scatters towards the camera of `rays`."""
     towards = rays.towards_eye(medium.grid)
     return functools.reduce(torch.add, (_scatter_turned(medium, beam, towards) for beam in turned))
 
 
-def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Sequence[Tensor]) -> Tensor:
+def _scatter_turned(medium: Medium, beam: ReversedBeam, towards: Sequence[Tensor]) -> Tensor:
     """What light of `beam` scatters `towards` a camera: its phase function is that of E8.12.
 
     It is per unit of what `scatter_once_more` is.

@@ -32,7 +32,7 @@ MOST = 1e30
 
 
 @dataclass(frozen=True)
-class TurnedBeam:
+class ReversedBeam:
     """Light of a beam that its backward peak has turned at least once.
 
     `radiance` [C, z, y, x]: mean over the sphere; `direction` [3]: the way it goes, in array order;
@@ -45,7 +45,7 @@ class TurnedBeam:
 
 
 @dataclass(frozen=True)
-class Pair:
+class BeamPair:
     """The beams `along` a light's `direction` [3] and `against` it, E / (4 pi) times F and G.
 
     Both are [C, z, y, x], averaged over each cell; `received` is the part of F never scattered.
@@ -63,15 +63,15 @@ class Pair:
         return weigh(add(forth, back), unturned_moments(medium))
 
     @property
-    def turned(self) -> tuple[TurnedBeam, TurnedBeam]:
+    def turned(self) -> tuple[ReversedBeam, ReversedBeam]:
         """Light turned an odd, and an even number of times."""
         return (
-            TurnedBeam(self.against, -self.direction, 1),
-            TurnedBeam(self.along - self.received, self.direction, 2),
+            ReversedBeam(self.against, -self.direction, 1),
+            ReversedBeam(self.along - self.received, self.direction, 2),
         )
 
 
-def follow_pair(medium: Medium, light: DirectionalLight) -> Pair:
+def follow_pair(medium: Medium, light: DirectionalLight) -> BeamPair:
     """The pair that the beam of `light` becomes in `medium`."""
     extinction = medium.extinction
     directions, direction = unit_directions(light.direction)
@@ -88,7 +88,7 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> Pair:
 
     irradiance = along_colors(light.irradiance) / (4 * math.pi)
     received, along, against = (irradiance * share for share in recompute(find_shares))
-    return Pair(direction, received, along, against)
+    return BeamPair(direction, received, along, against)
 
 
 def turn_in_cells(

@@ -16,10 +16,10 @@ from torch import Tensor
 from ddrecon.light.beam import Beam, attenuate, attenuate_few, follow_beams, receive_beams
 from ddrecon.light.lights import AmbientLight, BeamLight, DirectionalLight, PointLight
 from ddrecon.light.moments import add, moments_of_flux, weigh
-from ddrecon.light.pairs import TurnedBeam, follow_pair
+from ddrecon.light.pairs import ReversedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light, receive_point_light
 from ddrecon.light.profile import profile_in
-from ddrecon.light.refracted import Confined, enter_faces, refract_skies
+from ddrecon.light.refracted import RefractedBeam, enter_faces, refract_skies
 from ddrecon.light.sky import Sky, Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
@@ -41,7 +41,7 @@ class Received:
 
     source: Tensor
     mean: Tensor
-    turned: tuple[TurnedBeam, ...] = ()
+    turned: tuple[ReversedBeam, ...] = ()
 
     def plus(self, other: Received) -> Received:
         """The light of both."""
@@ -67,13 +67,13 @@ def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | Poin
     return tuple(beams)
 
 
-def _confine(medium: Medium, light: Source) -> tuple[Confined, ...]:
+def _confine(medium: Medium, light: Source) -> tuple[RefractedBeam, ...]:
     """The beams of `light` that shine on a part of the box, or on each cell differently."""
     if medium.index != 1 and isinstance(light, DirectionalLight | BeamLight):
         return enter_faces(medium.grid, medium.index, light)
     if isinstance(light, BeamLight):
         beam = light.position, light.direction, light.radius
-        return (Confined(light.unconfined, profile_in(medium.grid, *beam)),)
+        return (RefractedBeam(light.unconfined, profile_in(medium.grid, *beam)),)
     return ()
 
 

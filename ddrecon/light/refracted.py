@@ -21,7 +21,7 @@ from ddrecon.numerics.remember import remember
 
 
 @dataclass(frozen=True)
-class Confined:
+class RefractedBeam:
     """A `light` whose irradiance is `profile` [1, z, y, x] times as much in each cell.
 
     `face` is the array axis across which it has come in, and `at_face` [1, 1, ...] the profile in
@@ -36,7 +36,7 @@ class Confined:
 
 def enter_faces(
     grid: Grid, index: float, light: DirectionalLight | BeamLight
-) -> tuple[Confined, ...]:
+) -> tuple[RefractedBeam, ...]:
     """What `light` becomes in the box of `grid`, one beam for each face that it falls on."""
     if isinstance(light, BeamLight):
         return _enter(grid, index, light.direction, light.power, light.position, light.radius)
@@ -46,8 +46,8 @@ def enter_faces(
 @remember
 def _enter(
     grid: Grid, index: float, direction: Tensor, power: Tensor, *beam: Tensor
-) -> tuple[Confined, ...]:
-    travel, found = normalize(array_order(direction), dim=0), list[Confined]()
+) -> tuple[RefractedBeam, ...]:
+    travel, found = normalize(array_order(direction), dim=0), list[RefractedBeam]()
     for axis in range(3):
         cosine = travel[axis].abs()
         if not cosine > 0:
@@ -68,7 +68,7 @@ def _enter(
             profile = profile * mean_profile(centers, grid.spacing, *given)
             at_face = mean_profile(line, size, *given)
         light = DirectionalLight(array_order(inside), entered)
-        found.append(Confined(light, profile[None], axis, at_face[None]))
+        found.append(RefractedBeam(light, profile[None], axis, at_face[None]))
     return tuple(found)
 
 

@@ -93,7 +93,7 @@ def light_texels(
     each = sent.diffuse.split(len(sent.diffuse) // len(sights))
     alike = dict[int | None, list[int]]()
     for number, sight in enumerate(sights):
-        alike.setdefault(sight.way.axis if sight.way else None, []).append(number)
+        alike.setdefault(sight.sampling.axis if sight.sampling else None, []).append(number)
     # Directions across the same slices have their fields up to the faces together.
     for axis, numbers in alike.items():
         some = replace(sent, diffuse=torch.cat([each[number] for number in numbers]))
@@ -119,7 +119,11 @@ def upwards(plane: Plane) -> tuple[Tensor, Tensor]:
 
 @remember
 def _sights(
-    grid: Grid, plane: Plane, settings: RenderSettings, dtype: torch.dtype, device: torch.device
+    grid: Grid,
+    plane: Plane,
+    settings: RenderSettings,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> tuple[Sight, ...]:
     """Those of rays from all texels, one for each direction."""
     like = torch.empty(0, dtype=dtype, device=device)

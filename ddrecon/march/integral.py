@@ -55,10 +55,10 @@ def _march_alone(
     outgoing: OutgoingLight, sight: Sight, settings: RenderSettings, behind: Tensor | None
 ) -> Tensor:
     """As `march`, of `outgoing` light without that of beams with a profile, its `lit`."""
-    if sight.way is None:
+    if sight.sampling is None:
         nothing = outgoing.diffuse.new_zeros(outgoing.colors, len(sight.rays.direction))
         return nothing if behind is None else nothing + behind
-    sampler = Sampler(outgoing, sight.way, settings.steps)
+    sampler = Sampler(outgoing, sight.sampling, settings.steps)
 
     def march_these(rays: Rays, crossing: Crossing) -> Tensor:
         """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""

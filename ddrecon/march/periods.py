@@ -49,8 +49,8 @@ def march_periods(
     outgoing, period = sampler.outgoing, sampler.outgoing.period
     assert period is not None
     grid, scale = period.grid, outgoing.extinction.scale.view(-1, 1)
-    longest = min(sampler.way.longest, math.hypot(*grid.extent))
-    sampler = replace(sampler, way=replace(sampler.way, longest=longest))
+    longest = min(sampler.sampling.longest, math.hypot(*grid.extent))
+    sampler = replace(sampler, sampling=replace(sampler.sampling, longest=longest))
     samplers = dict[tuple[int, ...], Sampler]()
 
     def from_copy(copy: list[int]) -> Sampler:

@@ -37,7 +37,7 @@ THICK = 0.75
 
 
 @dataclass(frozen=True)
-class Way:
+class RaySampling:
     """How rays are sampled: in slices across `axis`, the last one first where it `is_reversed`.
 
     Where `axis` is None it is at equal steps, and the longest ray is `longest` [u] in the box.
@@ -48,7 +48,7 @@ class Way:
     longest: float = 0.0
 
 
-def choose_way(grid: Grid, rays: Rays, crossing: Crossing) -> Way:
+def choose_sampling(grid: Grid, rays: Rays, crossing: Crossing) -> RaySampling:
     """Slices where every ray crosses them in one sense and steeply enough, from outside the box."""
     speed = normalize(rays.direction[crossing.hit] / rays.direction.new_tensor(grid.spacing), dim=1)
     mean = speed.abs().mean(0)
@@ -56,16 +56,16 @@ def choose_way(grid: Grid, rays: Rays, crossing: Crossing) -> Way:
     along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
-        return Way(axis, bool(along[0] < 0))
-    return Way(None, longest=float((crossing.far - crossing.near).detach().max()))
+        return RaySampling(axis, bool(along[0] < 0))
+    return RaySampling(None, longest=float((crossing.far - crossing.near).detach().max()))
 
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """Fields of `outgoing` light at nodes of rays, `steps` a cell, in the `way` that these run."""
+    """Fields of `outgoing` light at nodes of rays, `steps` a cell, by `sampling` these."""
 
     outgoing: OutgoingLight
-    way: Way
+    sampling: RaySampling
     steps: int
 
     @property
@@ -75,34 +75,34 @@ class Sampler:
 
     @functools.cached_property
     def planes(self) -> Tensor:
-        """Where nodes are [N]: planes across the axis of slices [u], or parts of a ray's way."""
+        """Where nodes are [N]: planes across the axis of slices [u], or fractions of a ray."""
         grid, like = self.outgoing.grid, self.outgoing.diffuse
-        if self.way.axis is not None:
-            return planes_across(grid, self.way, self.steps, like.dtype, like.device)
-        nodes = self.steps * math.ceil(self.way.longest / min(grid.spacing)) + 1
+        if self.sampling.axis is not None:
+            return planes_across(grid, self.sampling, self.steps, like.dtype, like.device)
+        nodes = self.steps * math.ceil(self.sampling.longest / min(grid.spacing)) + 1
         return torch.linspace(0, 1, nodes, dtype=like.dtype, device=like.device)
 
     @functools.cached_property
     def fields(self) -> Mapping[str, Tensor]:
         """Those of `outgoing` up to the faces of the box, [channels, z + 2, y + 2, x + 2]."""
-        return self.outgoing.extended or extend_fields(self.outgoing, self.way.axis)
+        return self.outgoing.extended or extend_fields(self.outgoing, self.sampling.axis)
 
     @functools.cached_property
     def values(self) -> Tensor:
         """All channels in all planes [N, channels, rows, columns], or of all `fields`."""
         cells = torch.cat(list(self.fields.values()))
-        if self.way.axis is None:
+        if self.sampling.axis is None:
             return cells
-        row, column = across(self.way.axis)
-        slices = cells.permute(1 + self.way.axis, 0, 1 + row, 1 + column)
-        order = order_of_slices(cells.shape[1 + self.way.axis], self.way, cells.device)
+        row, column = across(self.sampling.axis)
+        slices = cells.permute(1 + self.sampling.axis, 0, 1 + row, 1 + column)
+        order = order_of_slices(cells.shape[1 + self.sampling.axis], self.sampling, cells.device)
         return subdivide(slices.index_select(0, order), self.steps, self.outgoing.third_order)
 
     def sample(
         self, values: Tensor, rays: Rays, near: Tensor, far: Tensor
     ) -> tuple[Tensor, Tensor]:
         """`values` as [N, channels, R], and distances [N, R], at the nodes of `rays`."""
-        axis, planes, grid = self.way.axis, self.planes[:, None], self.outgoing.grid
+        axis, planes, grid = self.sampling.axis, self.planes[:, None], self.outgoing.grid
         third_order = self.outgoing.third_order
         axes: tuple[int, ...] = (0, 1, 2) if axis is None else across(axis)
         if axis is None:
@@ -124,10 +124,10 @@ class Sampler:
 
 def next_node(grid: Grid, rays: Rays, distance: Tensor, sampler: Sampler) -> Tensor:
     """The distance [R] of the node on each of `rays` in `grid` nearest to `distance` [u]."""
-    axis, like = sampler.way.axis, rays.direction
+    axis, like = sampler.sampling.axis, rays.direction
     if axis is None:
         return distance
-    planes = planes_across(grid, Way(axis), sampler.steps, like.dtype, like.device)
+    planes = planes_across(grid, RaySampling(axis), sampler.steps, like.dtype, like.device)
     origin, direction = rays.origin[:, axis], rays.direction[:, axis]
     place = (origin + distance * direction).detach()
     nearest = planes[torch.searchsorted(0.5 * (planes[1:] + planes[:-1]), place)]
@@ -135,32 +135,32 @@ def next_node(grid: Grid, rays: Rays, distance: Tensor, sampler: Sampler) -> Ten
 
 
 @remember
-def order_of_slices(count: int, way: Way, device: torch.device) -> Tensor:
+def order_of_slices(count: int, sampling: RaySampling, device: torch.device) -> Tensor:
     """Which of `count` slices lies in each plane, before cells are subdivided."""
     index = torch.arange(count, dtype=torch.int32, device=device)
-    return index.flip(0) if way.is_reversed else index
+    return index.flip(0) if sampling.is_reversed else index
 
 
 @remember
 def planes_across(
-    grid: Grid, way: Way, steps: int, dtype: torch.dtype, device: torch.device
+    grid: Grid, sampling: RaySampling, steps: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
     """The planes of slices of `grid` [u]: through all centers of cells, and both faces."""
-    assert way.axis is not None
+    assert sampling.axis is not None
     # In cells: 0, 0.5, 1.5, ...
-    count = grid.shape[way.axis]
+    count = grid.shape[sampling.axis]
     place = torch.arange(count + 2, dtype=dtype, device=device) - 0.5
-    planes = grid.lower[way.axis] + place.clamp(0, count) * grid.spacing[way.axis]
-    return subdivide(planes.flip(0) if way.is_reversed else planes, steps)
+    planes = grid.lower[sampling.axis] + place.clamp(0, count) * grid.spacing[sampling.axis]
+    return subdivide(planes.flip(0) if sampling.is_reversed else planes, steps)
 
 
 @remember
-def support_of_planes(support: Tensor, way: Way, steps: int) -> Tensor:
+def support_of_planes(support: Tensor, sampling: RaySampling, steps: int) -> Tensor:
     """Where `support` [z, y, x] is not 0 in the planes of slices: bool [N, rows, columns]."""
-    assert way.axis is not None
+    assert sampling.axis is not None
     longer = pad((support != 0)[None, None].float(), [1] * 6, mode="replicate")[0, 0]
-    slices = longer.permute(way.axis, *across(way.axis))
-    slices = slices.flip(0) if way.is_reversed else slices
+    slices = longer.permute(sampling.axis, *across(sampling.axis))
+    slices = slices.flip(0) if sampling.is_reversed else slices
     return subdivide(slices[:, None], steps)[:, 0] > 0
 
 

@@ -12,21 +12,21 @@ from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
 from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice
-from ddrecon.march.samplers import Way, choose_way
+from ddrecon.march.samplers import RaySampling, choose_sampling
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
 
 @dataclass(frozen=True)
 class Sight:
-    """The `rays` of one camera, their `crossing` of the box, and the `way` they are sampled.
+    """The `rays` of one camera, their `crossing` of the box, and their `sampling`.
 
-    `way` is None where no ray meets the box, `lattice` where every pixel has a ray of its own.
+    `sampling` is None where no ray meets the box, `lattice` where every pixel has a ray of its own.
     """
 
     rays: Rays
     crossing: Crossing
-    way: Way | None
+    sampling: RaySampling | None
     lattice: Lattice | None = None
 
 
@@ -35,10 +35,12 @@ def look_along(grid: Grid, rays: Rays, settings: RenderSettings) -> Sight:
     crossing = cross_box(grid, rays)
     if crossing.hit.numel() == 0:
         return Sight(rays, crossing, None)
-    way = choose_way(grid, rays, crossing)
-    if settings.tolerance == 0 or way.axis is None or way.axis in grid.periodic:
-        return Sight(rays, crossing, way)
-    return Sight(rays, crossing, way, choose_lattice(grid, way.axis, rays.select(crossing.hit)))
+    sampling = choose_sampling(grid, rays, crossing)
+    if settings.tolerance == 0 or sampling.axis is None or sampling.axis in grid.periodic:
+        return Sight(rays, crossing, sampling)
+    return Sight(
+        rays, crossing, sampling, choose_lattice(grid, sampling.axis, rays.select(crossing.hit))
+    )
 
 
 def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:

@@ -13,13 +13,13 @@ from torch import Tensor
 from ddrecon.grid import array_order
 from ddrecon.light.lights import BeamLight, DirectionalLight
 from ddrecon.light.moments import add, beam_moments
-from ddrecon.light.refracted import Confined, enter_faces
+from ddrecon.light.refracted import RefractedBeam, enter_faces
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import reflectance
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decay_mean
-from ddrecon.transport.characteristics import Course, Ends, follow
+from ddrecon.transport.characteristics import Characteristic, Ends, follow
 from ddrecon.transport.mirror import lay_face
 
 TURNS = 4
@@ -29,7 +29,7 @@ LEAST = 1e-7
 
 
 @dataclass(frozen=True)
-class Passage:
+class BoxTransit:
     """Parallel light that goes through the box once, from its faces to others.
 
     `direction` [3]: unit, array order; `irradiance` [C, z, y, x]: its mean in cells; `turns`: how
@@ -42,14 +42,14 @@ class Passage:
     released: Tensor
 
 
-def follow_inside(medium: Medium, beam: Confined, most: int = TURNS) -> Iterator[Passage]:
+def follow_inside(medium: Medium, beam: RefractedBeam, most: int = TURNS) -> Iterator[BoxTransit]:
     """The passages of a `beam` that has come in, which is reflected so often at `most`."""
     assert beam.face is not None and beam.at_face is not None
     grid, travel = medium.grid, array_order(beam.light.direction)
     value, power = medium.extinction.value, beam.light.irradiance.view(-1, 1, 1, 1)
     entering = (power * beam.at_face).squeeze(1 + beam.face)
     entering = entering.expand(max(len(entering), len(value)), -1, -1)
-    course = Course.along(grid, travel)
+    course = Characteristic.along(grid, travel)
     place = course.axes.index(beam.face)
     flows: dict[tuple[int, ...], dict[int, Tensor]] = {
         (1, 1, 1): {place: lay_face(entering, place, course)}
@@ -61,7 +61,7 @@ def follow_inside(medium: Medium, beam: Confined, most: int = TURNS) -> Iterator
             if max(float(one.detach().abs().max()) for one in ends.values()) < LEAST * strongest:
                 continue
             way = travel * travel.new_tensor(signs)
-            course = Course.along(grid, way)
+            course = Characteristic.along(grid, way)
             irradiance, gone = recompute(_pass, value, course, ends)
             released = value.new_zeros(6, len(entering))
             for place, axis in enumerate(course.axes):
@@ -75,11 +75,11 @@ def follow_inside(medium: Medium, beam: Confined, most: int = TURNS) -> Iterator
                 image = tuple(-s if a == axis else s for a, s in enumerate(signs))
                 back = turned.setdefault(image, {})
                 back[place] = back.get(place, 0) + inner * gone[place]
-            yield Passage(way, irradiance, turns, released)
+            yield BoxTransit(way, irradiance, turns, released)
         flows = turned
 
 
-def _pass(value: Tensor, course: Course, ends: dict[int, Tensor]) -> tuple[Tensor, Ends]:
+def _pass(value: Tensor, course: Characteristic, ends: dict[int, Tensor]) -> tuple[Tensor, Ends]:
     """The mean in cells of extinction `value` of light that enters at `ends`, and what leaves."""
     depth = course.lay(value * course.step)
     colors = next(one.shape[int(place > 0)] for place, one in ends.items())

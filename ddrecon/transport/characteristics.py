@@ -41,7 +41,7 @@ nothing more comes but rounding, or for so many.
 
 
 @dataclass(frozen=True)
-class Course:
+class Characteristic:
     """How a direction crosses a grid, slice by slice.
 
     `order`: the array axes, slices first; `forward`: 1 or -1, the way the slice number changes;
@@ -59,7 +59,7 @@ class Course:
     wraps: tuple[bool, bool, bool] = (False, False, False)
 
     @staticmethod
-    def of(grid: Grid, direction: Direction) -> Course:
+    def of(grid: Grid, direction: Direction) -> Characteristic:
         """The course of unit `direction` (array order) through `grid`."""
         speed = [
             component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)
@@ -73,14 +73,14 @@ class Course:
         )
         forward, wraps = -1 if slicing.is_reversed else 1, (slices, rows, columns)
         count = grid.shape[slicing.axis]
-        return Course(slicing.order, forward, (row, column), 1 / fastest, count, wraps)
+        return Characteristic(slicing.order, forward, (row, column), 1 / fastest, count, wraps)
 
     @staticmethod
-    def along(grid: Grid, direction: Tensor) -> Course:
+    def along(grid: Grid, direction: Tensor) -> Characteristic:
         """The same of unit `direction` [3], which may be varied."""
         slicing, (row, column), step = cross_grid(grid, direction)
         forward = -1 if slicing.is_reversed else 1
-        return Course(slicing.order, forward, (row, column), step, grid.shape[slicing.axis])
+        return Characteristic(slicing.order, forward, (row, column), step, grid.shape[slicing.axis])
 
     @property
     def axes(self) -> list[int]:
@@ -120,7 +120,7 @@ def radiance_along(
     from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
     which what leaves is counted.
     """
-    course = Course.of(medium.grid, direction)
+    course = Characteristic.of(medium.grid, direction)
     depth, strength = (
         course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
     )
@@ -142,7 +142,7 @@ def radiance_along(
 
 
 def follow(
-    passed: Tensor, source: Tensor, course: Course, ends: Ends | None = None
+    passed: Tensor, source: Tensor, course: Characteristic, ends: Ends | None = None
 ) -> tuple[Tensor, Ends]:
     """I_in, where rays enter a slice [slices, C, rows, columns], and what leaves the box.
 
@@ -165,7 +165,7 @@ def follow(
 def _follow_once(
     passed: Tensor,
     source: Tensor,
-    course: Course,
+    course: Characteristic,
     arriving: Tensor,
     sides: Sequence[Tensor | None] = (None, None),
 ) -> tuple[list[Tensor], Ends]:
@@ -193,7 +193,7 @@ def _follow_once(
 
 
 def enter_again(
-    leave: Callable[..., list[Tensor]], courses: Sequence[Course], nothing: Sequence[Tensor]
+    leave: Callable[..., list[Tensor]], courses: Sequence[Characteristic], nothing: Sequence[Tensor]
 ) -> list[Tensor]:
     """What enters the first slices of `courses` where the last come before them, of all periods.
 
@@ -232,7 +232,7 @@ def _is_at_rest(before: Tensor, after: Tensor) -> bool:
     return bool((after - before).abs().max() <= rounding * after.abs().max())
 
 
-def _double(entering: Tensor, share: Tensor, course: Course) -> Tensor:
+def _double(entering: Tensor, share: Tensor, course: Characteristic) -> Tensor:
     """Light of 2^DOUBLINGS periods, of what is `entering` after one and the `share` that passes."""
     moved = [course.count * int(drift) for drift in course.drift]
     for _ in range(DOUBLINGS):

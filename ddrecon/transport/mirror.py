@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.medium.fresnel import quadrature_reflectances
-from ddrecon.transport.characteristics import Course, Direction, Ends
+from ddrecon.transport.characteristics import Characteristic, Direction, Ends
 
 SIDES = tuple((axis, end) for axis in range(3) for end in (0, -1))
 """Of each face, the array axis across which it lies and the index of cells there."""
@@ -62,7 +62,7 @@ class Mirror:
     def entering(self, number: int) -> Ends:
         """What enters along direction `number`."""
         direction = self.directions[number]
-        course, ends = Course.of(self.grid, direction), list[Tensor]()
+        course, ends = Characteristic.of(self.grid, direction), list[Tensor]()
         for place, axis in enumerate(course.axes):
             image = self.images[number][axis]
             layer = self.more[2 * axis + (direction[axis] < 0)]
@@ -79,7 +79,7 @@ class Mirror:
 
     def released(self, number: int) -> Ends:
         """What goes out of the box along direction `number` after the last sweep."""
-        axes = Course.of(self.grid, self.directions[number]).axes
+        axes = Characteristic.of(self.grid, self.directions[number]).axes
         gone = (
             (1 - self.reflected[number][axis]) * one
             for axis, one in zip(axes, self.left[number], strict=True)
@@ -92,7 +92,7 @@ def _layers(light: Tensor) -> list[Tensor]:
     return [light.select(2 + axis, end) for axis, end in SIDES]
 
 
-def lay_face(layer: Tensor, place: int, course: Course) -> Tensor:
+def lay_face(layer: Tensor, place: int, course: Characteristic) -> Tensor:
     """`layer` [C, ...] of a face, its other axes in array order, as that at a `place` in `Ends`."""
     if place == 0:
         return layer

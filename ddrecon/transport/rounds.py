@@ -27,7 +27,7 @@ from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
-from ddrecon.transport.characteristics import Course
+from ddrecon.transport.characteristics import Characteristic
 from ddrecon.transport.mirror import Mirror
 from ddrecon.transport.sweep import count_directions, sweep_change, sweep_rule
 
@@ -247,7 +247,7 @@ def _mean_step(grid: Grid, directions: int) -> tuple[float, float]:
     varies = [n > 1 or axis in grid.periodic for axis, n in enumerate(grid.shape)]
     shared = [0.0, 0.0, 0.0]
     for point, weight in zip(points.tolist(), weights.tolist(), strict=True):
-        course = Course.of(grid, tuple(point))
+        course = Characteristic.of(grid, tuple(point))
         if varies[course.order[0] - 1]:
             total, weight_of_steps = total + weight * course.step, weight_of_steps + weight
         for axis, moved in enumerate(course.moved):

@@ -24,7 +24,7 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import add, fill, weigh
-from ddrecon.light.pairs import TurnedBeam
+from ddrecon.light.pairs import ReversedBeam
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.refracted import enter_faces
 from ddrecon.light.sky import Sky, Source, decompose_lights
@@ -40,7 +40,7 @@ from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.transport.bounced import TURNS, follow_inside
-from ddrecon.transport.characteristics import Course, radiance_along
+from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.rounds import face_mirror
 from ddrecon.transport.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
 
@@ -279,7 +279,10 @@ class _Box:
                 if mirror is not None:
                     mirror.left.append(out)
                     out = mirror.released(number)
-                course, gone = Course.of(grid, direction), power.new_zeros(6, out[0].shape[-3])
+                course, gone = (
+                    Characteristic.of(grid, direction),
+                    power.new_zeros(6, out[0].shape[-3]),
+                )
                 scale = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
                 for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
                     moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
@@ -290,7 +293,7 @@ class _Box:
         return power
 
 
-def _leave_turned(beam: TurnedBeam, grid: Grid, up: int) -> Tensor:
+def _leave_turned(beam: ReversedBeam, grid: Grid, up: int) -> Tensor:
     """The power of a turned `beam` (E8.11), at faces the line through two cells."""
     power = beam.radiance.new_zeros(len(FACES), len(beam.radiance), dtype=torch.float64)
     for axis, along in enumerate(beam.direction.tolist()):

@@ -14,7 +14,7 @@ from ddrecon.lighting import send, solve_light
 from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice, interpolate
-from ddrecon.march.samplers import choose_way
+from ddrecon.march.samplers import choose_sampling
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -51,7 +51,7 @@ def lattice_of(scene: Scene) -> tuple[Lattice, Rays, int]:
     """The lattice for a scene's camera, the rays of that which hit the box, and the axis."""
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    axis, hitting = choose_way(grid, bundle, crossing).axis, bundle.select(crossing.hit)
+    axis, hitting = choose_sampling(grid, bundle, crossing).axis, bundle.select(crossing.hit)
     return choose_lattice(grid, axis, hitting), hitting, axis
 
 

@@ -8,7 +8,7 @@ from media import make_camera
 from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
-from ddrecon.march.samplers import choose_way
+from ddrecon.march.samplers import choose_sampling
 
 
 def test_rounding_does_not_choose_between_axes() -> None:
@@ -18,4 +18,4 @@ def test_rounding_does_not_choose_between_axes() -> None:
     for _ in range(8):
         noise = 1 + 1e-15 * torch.randn(3, dtype=torch.float64)
         bundle = replace(rays, direction=rays.direction * noise)
-        assert choose_way(grid, bundle, cross_box(grid, bundle)).axis == 0
+        assert choose_sampling(grid, bundle, cross_box(grid, bundle)).axis == 0

@@ -118,12 +118,12 @@ def test_what_it_leaves_out_is_not_walked():
     scene = scene_with(two_blobs(), {}, half_width=0.6)
     grid = scene.volume.grid
     sight = look_through(scene.views[0].camera, grid, scene.render)
-    planes = planes_across(grid, sight.way, 1, torch.float64, torch.device("cpu"))
+    planes = planes_across(grid, sight.sampling, 1, torch.float64, torch.device("cpu"))
     rays, ends = sight.rays, vars(sight.crossing).values()
-    bundle = pack_rays(grid, sight.way.axis, rays.origin, rays.direction, *ends).bundle
+    bundle = pack_rays(grid, sight.sampling.axis, rays.origin, rays.direction, *ends).bundle
 
     def count(support: Tensor) -> int:
-        bits = find_walked(support_of_planes(support, sight.way, 1), planes, bundle)
+        bits = find_walked(support_of_planes(support, sight.sampling, 1), planes, bundle)
         return sum(number.bit_count() for number in bits.flatten().tolist())
 
     none, some, all_of_them = map(count, (torch.zeros(SHAPE), two_blobs(), torch.ones(SHAPE)))

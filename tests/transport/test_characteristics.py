@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.transport.characteristics import Course, radiance_along
+from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.sweep import cell_gradient
 
 DIRECTIONS = (
@@ -97,7 +97,7 @@ def test_what_is_emitted_is_absorbed_or_leaves_the_box(direction, thickness: flo
     medium = medium_of(thickness * half_empty(4, 5, 3), grid)
     scatters, room = random_source(grid), outside(0.7)
     mean, gone = radiance_along(medium, scatters, cell_gradient(scatters), room, direction)
-    course = Course.of(grid, direction)
+    course = Characteristic.of(grid, direction)
     emitted = (medium.remaining.value * scatters).sum() * course.step
     absorbed = (medium.extinction.value * mean).sum() * course.step
     # All of what leaves the last slice, and of the outermost rows and columns what drifts out.

@@ -72,15 +72,15 @@ class Cells:
 
 def cells_of(sampler: Sampler) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
-    planes, way, support = sampler.planes, sampler.way, sampler.outgoing.support
+    planes, sampling, support = sampler.planes, sampler.sampling, sampler.outgoing.support
     fields = list(sampler.fields.values())
-    if way.axis is None:
+    if sampling.axis is None:
         return Cells(planes), fields
     if support is not None:
-        support = support_of_planes(support, way, sampler.steps)
+        support = support_of_planes(support, sampling, sampler.steps)
     if sampler.steps == 1:
-        order = order_of_slices(len(planes), way, planes.device)
-        return Cells(planes, way.axis, order, support), fields
+        order = order_of_slices(len(planes), sampling, planes.device)
+        return Cells(planes, sampling.axis, order, support), fields
     # Slices between those of cells are interpolated beforehand.
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
     return Cells(planes, 0, order, support), [sampler.values.transpose(0, 1)]

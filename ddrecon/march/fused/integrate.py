@@ -43,7 +43,7 @@ def march_rays(
 ) -> tuple[Tensor, Tensor]:
     """Radiance [C, P] and mass [K, P] along rays: as `integral.march_rays`."""
     outgoing, ends = sampler.outgoing, (crossing.hit, crossing.near, crossing.far)
-    packed = pack_rays(outgoing.grid, sampler.way.axis, rays.origin, rays.direction, *ends)
+    packed = pack_rays(outgoing.grid, sampler.sampling.axis, rays.origin, rays.direction, *ends)
     layout, (cells, fields) = Layout.of(outgoing), cells_of(sampler)
     angles = see_beams(outgoing, packed)
     out, masses, _ = Integrate.apply(

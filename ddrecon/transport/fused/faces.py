@@ -14,7 +14,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
-from ddrecon.transport.characteristics import Course, Ends, enter_again
+from ddrecon.transport.characteristics import Characteristic, Ends, enter_again
 from ddrecon.transport.fused.ordinates import ordinate_tables
 from ddrecon.transport.fused.sweep import sweep_chunk
 from ddrecon.transport.sweep import sweep_rule
@@ -37,7 +37,7 @@ def sweep_faces(
     moments, gone = torch.zeros_like(source), dict[int, Ends]()
     for number, chunk in enumerate(tables.chunks):
         numbers = tables.numbers[chunk.ordinates]
-        courses = [Course.of(medium.grid, points[n]) for n in numbers]
+        courses = [Characteristic.of(medium.grid, points[n]) for n in numbers]
         entering = None if ends is None else [ends[n] for n in numbers]
         light, place = (source, gradient, inflow), (directions, number)
         part, left = recompute(_sweep_chunk, medium, light, place, courses, entering)
@@ -50,7 +50,7 @@ def _sweep_chunk(
     medium: Medium,
     emitted: tuple[Tensor, Tensor, Tensor | None],
     place: tuple[int, int],
-    courses: list[Course],
+    courses: list[Characteristic],
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
     """The moments of the ordinates of a chunk, and what leaves along each.
@@ -88,7 +88,7 @@ def _sweep_chunk(
     return follow(across)
 
 
-def _nothing(course: Course, like: Tensor) -> Ends:
+def _nothing(course: Characteristic, like: Tensor) -> Ends:
     colors, (slices, rows, columns) = like.shape[1], (like.shape[2 + axis] for axis in course.axes)
     return (
         like.new_zeros(colors, rows, columns),
@@ -107,7 +107,7 @@ def _behind(values: Tensor, dim: int, drift: float, is_around: bool) -> Tensor:
     return moved * kept.view([-1 if d == dim else 1 for d in range(values.ndim)]).to(values)
 
 
-def _place(grid: Grid, course: Course, ends: Ends) -> Tensor:
+def _place(grid: Grid, course: Characteristic, ends: Ends) -> Tensor:
     """The ring [C, planes, y + 2, x + 2] of what enters cells."""
     across, row_side, column_side = ends
     (row, column), (_, rows_wrap, columns_wrap) = course.drift, course.wraps
@@ -126,7 +126,7 @@ def _place(grid: Grid, course: Course, ends: Ends) -> Tensor:
     return _ring_of(grid, course, cells, beyond)
 
 
-def _leave(grid: Grid, course: Course, ring: Tensor, ends: Ends) -> Ends:
+def _leave(grid: Grid, course: Characteristic, ring: Tensor, ends: Ends) -> Ends:
     """What leaves the box, of the `ring` of light where it leaves cells and what has entered."""
     (row, column), (_, rows_wrap, _) = course.drift, course.wraps
     cells, beyond = _cells_of(grid, course, ring)
@@ -146,12 +146,12 @@ def _leave(grid: Grid, course: Course, ring: Tensor, ends: Ends) -> Ends:
     return beyond, rows, columns
 
 
-def _from_entry(course: Course, values: Tensor, dim: int) -> Tensor:
+def _from_entry(course: Characteristic, values: Tensor, dim: int) -> Tensor:
     """`values` with planes counted along `dim` from where light enters them, or the inverse."""
     return values.flip(dim) if course.moved[0] < 0 else values
 
 
-def _beyond(grid: Grid, course: Course) -> tuple[int | slice, ...]:
+def _beyond(grid: Grid, course: Characteristic) -> tuple[int | slice, ...]:
     """Where in a ring [C, planes, y, x] the cells lie that are beyond the last slice."""
     depth, height, width = grid.shape
     places: list[int | slice] = [slice(depth), slice(1, -1), slice(1, -1)]
@@ -161,7 +161,7 @@ def _beyond(grid: Grid, course: Course) -> tuple[int | slice, ...]:
     return slice(None), *places
 
 
-def _ring_of(grid: Grid, course: Course, cells: Tensor, beyond: Tensor) -> Tensor:
+def _ring_of(grid: Grid, course: Characteristic, cells: Tensor, beyond: Tensor) -> Tensor:
     """The ring with numbers of `cells` [C, z, y, x] and of those `beyond` [C, rows, columns]."""
     depth, height, width = grid.shape
     ring = cells.new_zeros(len(cells), depth + 2, height + 2, width + 2)
@@ -171,7 +171,7 @@ def _ring_of(grid: Grid, course: Course, cells: Tensor, beyond: Tensor) -> Tenso
     return ring
 
 
-def _cells_of(grid: Grid, course: Course, ring: Tensor) -> tuple[Tensor, Tensor]:
+def _cells_of(grid: Grid, course: Characteristic, ring: Tensor) -> tuple[Tensor, Tensor]:
     """The inverse of `_ring_of`."""
     beyond, is_across = ring[_beyond(grid, course)], course.order[0] == 1
     cells = _from_entry(course, ring[:, : grid.shape[0], 1:-1, 1:-1], 1)

@@ -408,7 +408,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
             const N rise = path.moved[0] * rises[c] + path.moved[1] * rises[all + c] +
                            path.moved[2] * rises[2 * all + c];
             const Emitted<N> emitted = {scatters * source[c], scatters * rise};
-            const Passage<N> by = pass_through(decay_at(decays, pitch, c), depth);
+            const Attenuation<N> by = pass_through(decay_at(decays, pitch, c), depth);
             if constexpr (RESULT != WITHIN) {
                 const N after = light_after(arriving, emitted, inflow, by);
                 to[c] = value_of(after);
@@ -514,7 +514,7 @@ template <class N, class F, Kind KIND> struct Ordinates {
                            path.moved[2] * rises[2 * all + c];
             const Emitted<F> emitted = {scatters * q, scatters * rise};
             const Decay<F> decay = decay_at(decays, pitch, c);
-            const Passage<Dual<F>> by = pass_through(decay, Dual<F>(depth, F(1)));
+            const Attenuation<Dual<F>> by = pass_through(decay, Dual<F>(depth, F(1)));
             const F depth_bar = after_bar * light_after(arriving, emitted, inflow, by).by[0] +
                                 within_bar * light_within(arriving, emitted, inflow, by).by[0];
             const F whole_bar = after_bar * by.phi.value + within_bar * by.psi.value;

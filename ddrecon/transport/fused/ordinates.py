@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.transport.characteristics import Course, Direction
+from ddrecon.transport.characteristics import Characteristic, Direction
 from ddrecon.transport.sweep import sweep_rule
 
 POINTS = 4
@@ -76,7 +76,7 @@ class Ordinate:
     @staticmethod
     def of(grid: Grid, number: int, direction: Direction) -> Ordinate:
         """The ordinate of a `direction` through `grid` (E2.9)."""
-        course = Course.of(grid, direction)
+        course = Characteristic.of(grid, direction)
         axis, moved = course.order[0] - 1, course.moved
         points, weights = list[tuple[int, ...]](), list[float]()
         for point in product(*((1,) if other == axis else (0, 1) for other in range(3))):

@@ -23,10 +23,10 @@ template <bool IS_THIN, class F> INLINE Decay<F> decay_along(F d) {
     }
 }
 // The same with d eta as `rising` and what is lost, and slopes where the depth is a dual number.
-template <class N> struct Passage {
+template <class N> struct Attenuation {
     N phi, psi, eta, rising, passed, lost;
 };
-template <class F, class N> INLINE Passage<N> pass_through(const Decay<F>& by, const N& depth) {
+template <class F, class N> INLINE Attenuation<N> pass_through(const Decay<F>& by, const N& depth) {
     const F d = value_of(depth);
     return {
         along(depth, Sloped<F>{by.phi, by.psi - by.phi}),
@@ -44,13 +44,13 @@ template <class N> struct Emitted {
 };
 // I where light leaves the cell, less the light from outside, `inflow`, which is there without a
 // medium; and its mean along the way, less the same.
-template <class N, class E, class D> INLINE D
-light_after(const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Passage<D>& by) {
+template <class N, class E, class D> INLINE D light_after(
+    const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Attenuation<D>& by) {
     return arriving * by.passed +
            (by_cell.whole * by.phi + by_cell.rise * by.rising - inflow * by.lost);
 }
-template <class N, class E, class D> INLINE D
-light_within(const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Passage<D>& by) {
+template <class N, class E, class D> INLINE D light_within(
+    const N& arriving, const Emitted<E>& by_cell, const N& inflow, const Attenuation<D>& by) {
     return (arriving + inflow) * by.phi + (by_cell.whole * by.psi - by_cell.rise * by.eta - inflow);
 }
 
