@@ -110,9 +110,10 @@ def free_memory(device: torch.device) -> int | None:
         free, _ = torch.cuda.mem_get_info(device)
         return int(free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device))
     amounts = []
-    with suppress(OSError, TypeError):
+    with suppress(OSError, ValueError):
         text = Path("/proc/meminfo").read_text()
-        amounts.append(1024 * int(re.search(r"MemAvailable: *(\d+)", text)[1]))  # type: ignore[index]
+        [kibibytes] = re.findall(r"MemAvailable: *(\d+)", text)
+        amounts.append(1024 * int(kibibytes))
     for limit, used in LIMITS.items():
         for allowed, text in _group_files(limit, "memory.stat"):
             with suppress(ValueError, TypeError):  # "max" is no number; `used` may be missing

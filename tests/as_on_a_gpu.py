@@ -10,7 +10,7 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 from unittest.mock import patch
 
@@ -37,13 +37,7 @@ def as_on_a_gpu(order: str = "forward") -> Iterator[Collection[Any]]:
     """
     kernels: dict[Any, None] = {}
 
-    def launch(
-        kernel: Any,
-        count: int,
-        arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
-        like: Tensor,
-        threads: int | None = None,
-    ) -> None:
+    def launch(kernel: Any, count: int, arguments: Any, _: Tensor, threads: Any = None) -> None:
         assert threads in (None, 1), "a GPU has no shares"
         (record,) = arguments(0) if callable(arguments) else arguments
         kernels[kernel] = None

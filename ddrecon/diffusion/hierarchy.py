@@ -254,13 +254,13 @@ class Hierarchy:
 
     def cycle(self, passes: Passes, source: Any) -> Any:
         """Roughly u of A u = `source` [C, z, y, x]: linear, symmetric, positive definite."""
-        begun = []
+        descent = []
         for level in self.levels:
             u = passes.smooth(level, source)
-            begun.append((level, u, source))
+            descent.append((level, u, source))
             source = passes.restrict(level, passes.residual(level, u, source))
         u = passes.solve(self.inverse, source)
-        for level, smoothed, source in reversed(begun):
+        for level, smoothed, source in reversed(descent):
             u = passes.correct(level, smoothed, u)
             for step in reversed(STEPS):
                 u = passes.relax(level, u, source, step)

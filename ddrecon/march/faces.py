@@ -29,8 +29,8 @@ GRAZING = 0.1
 a face, what lies closely behind that is lit through others.
 """
 RAISED, UNEVEN = 0.4, 4 / 3
-"""Of what light lacks on a face, the part that it has more of at the outermost centers, which keeps
-cells' means; and the optical depth of cells in which half of it is within the outermost cell.
+"""What outermost centers gain, as a fraction of what light lacks on their face: it keeps the means of
+cells. And the optical depth of cells in which half of the lack is within the outermost cell.
 """
 OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
@@ -39,19 +39,19 @@ FACES = tuple(product(range(3), range(2)))
 _Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Along an axis, for each place: of two cells, which and how much of it."""
 _Entries = tuple[Tensor, Tensor, Tensor]
-"""Rows, columns and parts of a sparse matrix."""
+"""Rows, columns and weights of a sparse matrix."""
 
 
 class _Table(NamedTuple):
-    """A sparse matrix: `parts` [E] in its `rows` [E] and `columns` [E]."""
+    """A sparse matrix: `weights` [E] in its `rows` [E] and `columns` [E]."""
 
     rows: Tensor
     columns: Tensor
-    parts: Tensor
+    weights: Tensor
 
     def add_to(self, total: Tensor, values: Tensor) -> Tensor:
         """`total` [C, rows], to which the product with `values` [C, columns] is added in place."""
-        return total.index_add_(1, self.rows, values.index_select(1, self.columns) * self.parts)
+        return total.index_add_(1, self.rows, values.index_select(1, self.columns) * self.weights)
 
 
 class _Shell(NamedTuple):
@@ -139,8 +139,8 @@ def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tenso
         for one, (axis, _) in zip(inflow.backward, FACES, strict=True)
         if emission.grid.shape[axis] > 1
     ]
-    part = shell.width * kept * torch.cat(backward, 1)
-    lack = part * sent / (UNEVEN + shell.width * lost + part * scattered)
+    weight = shell.width * kept * torch.cat(backward, 1)
+    lack = weight * sent / (UNEVEN + shell.width * lost + weight * scattered)
     return lack if emitted is None else scale * lack
 
 
@@ -155,12 +155,12 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     A point light does so fully if it is at least a cell away from the face.
     """
     if isinstance(beam, Beam):
-        part = torch.stack([beam.direction, -beam.direction], 1) / GRAZING
+        lit = torch.stack([beam.direction, -beam.direction], 1) / GRAZING
     else:
         low, high, cell = map(beam.position.new_tensor, (grid.lower, grid.upper, grid.spacing))
-        part = torch.stack([low - beam.position, beam.position - high], 1) / cell[:, None]
-    part = part.clamp(0, 1)
-    return (part * part * (3 - 2 * part)).flatten()
+        lit = torch.stack([low - beam.position, beam.position - high], 1) / cell[:, None]
+    lit = lit.clamp(0, 1)
+    return (lit * lit * (3 - 2 * lit)).flatten()
 
 
 def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
@@ -195,22 +195,22 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         face = torch.where(low, 2 * along, 2 * along + 1)
         faces.append(torch.where((low | high) & (count > 1), face, len(FACES)))
     line = _multiply(on_line, grid.shape, places)
-    rows, columns, parts = _multiply(beyond, wide, places)
+    rows, columns, weights = _multiply(beyond, wide, places)
     is_inner = ~is_outside.flatten()[columns]
-    inner = rows[is_inner], nearest.flatten()[columns[is_inner]], parts[is_inner]
-    rows, columns, parts = (one[~is_inner] for one in (rows, columns, parts))
+    inner = rows[is_inner], nearest.flatten()[columns[is_inner]], weights[is_inner]
+    rows, columns, weights = (column[~is_inner] for column in (rows, columns, weights))
     # Light on faces, then what is made of cells.
     around = (
         torch.cat([places[rows], places]),
         torch.cat([number[columns], len(places) + torch.arange(len(places))]),
-        torch.cat([parts, torch.ones(len(places), dtype=torch.float64)]),
+        torch.cat([weights, torch.ones(len(places), dtype=torch.float64)]),
     )
     by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)[:, places]
     lacking, outermost, width, outward = _find_layers(grid, axis, nearest)
 
     def on_device(entries: _Entries) -> _Table:
-        rows, columns, parts = (one.to(device) for one in entries)
-        return _Table(rows, columns, parts.to(dtype))
+        rows, columns, weights = (column.to(device) for column in entries)
+        return _Table(rows, columns, weights.to(dtype))
 
     return _Shell(
         nearest.flatten()[places].to(device),
@@ -230,15 +230,15 @@ def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _E
 
     `size`: how many columns each matrix has.
     """
-    rows, columns, parts = list[Tensor](), list[Tensor](), list[Tensor]()
+    rows, columns, weights = list[Tensor](), list[Tensor](), list[Tensor]()
     for (z, a), (y, b), (x, c) in product(*axes):
         column = (z[:, None, None] * size[1] + y[:, None]) * size[2] + x
-        part = (a[:, None, None] * b[:, None] * c).flatten()[places]
-        row = part.nonzero()[:, 0]
+        weight = (a[:, None, None] * b[:, None] * c).flatten()[places]
+        row = weight.nonzero()[:, 0]
         rows.append(row)
         columns.append(column.flatten()[places[row]])
-        parts.append(part[row])
-    return torch.cat(rows), torch.cat(columns), torch.cat(parts)
+        weights.append(weight[row])
+    return torch.cat(rows), torch.cat(columns), torch.cat(weights)
 
 
 def _find_layers(
@@ -251,7 +251,7 @@ def _find_layers(
     place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
     number = torch.zeros(grid.cells, dtype=torch.long)
     none = torch.zeros(0, dtype=torch.long)
-    found = [(none, none, none.double(), none, none.double(), none.double().view(3, 0))]
+    layers = [(none, none, none.double(), none, none.double(), none.double().view(3, 0))]
     for along, side in FACES:
         if grid.shape[along] == 1:
             continue
@@ -262,12 +262,12 @@ def _find_layers(
         count += len(cells)
         # What stands for a face is less by what that lacks, and by what the last cell has more.
         less = -1.0 if along == axis else -2.0 - RAISED
-        parts = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
+        weights = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
         width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
         outward = torch.zeros(3, len(cells), dtype=torch.float64)
         outward[along] = 2 * side - 1
-        found.append((rows, number[nearest.flatten()[rows]], parts, cells, width, outward))
-    rows, columns, parts, cells, width, outward = (
-        torch.cat(many, -1) for many in zip(*found, strict=True)
+        layers.append((rows, number[nearest.flatten()[rows]], weights, cells, width, outward))
+    rows, columns, weights, cells, width, outward = (
+        torch.cat(many, -1) for many in zip(*layers, strict=True)
     )
-    return (rows, columns, parts), cells, width, outward
+    return (rows, columns, weights), cells, width, outward

@@ -79,21 +79,20 @@ class Recording:
             value.data.copy_(values[name].detach())
         for solve, guess in self.guesses.items():
             guess.copy_(memory.last[solve])
-        programs = []
-        for view in compared.views:
-            key = view.name, compared.share(view)
+        keys = [(view.name, compared.share(view)) for view in compared.views]
+        if not self.views.keys() >= set(keys):
+            # What is recorded runs once before: with the light of these values.
+            self.light.replay()
+        for key, view in zip(keys, compared.views, strict=True):
             if key not in self.views:
-                # Views are recorded in light that there can be.
-                self.light.replay()
-                look = partial(self._view, view, compared)
-                self.views[key] = self._recorded(look)
-            programs.append(self.views[key])
+                self.views[key] = self._recorded(partial(self._view, view, compared))
         if self.back is None:
             self.back = self._recorded(self._follow_back)
         # The light's program sets the sums to zero, to which views add.
         self.light.replay()
         images, loss = list[Tensor](), self.sums[0].new_zeros(())
-        for view, program in zip(compared.views, programs, strict=True):
+        for key, view in zip(keys, compared.views, strict=True):
+            program = self.views[key]
             program.replay()
             image, view_loss, psnr = (tensor.clone() for tensor in program.result)
             images.append(image)
@@ -144,7 +143,7 @@ class Recording:
     def _follow_back(self) -> dict[str, Tensor]:
         self.memory.records = []
         # Each run begins where the last iteration ended, also the second while it is recorded.
-        self.memory.last |= {key: one for key, one in self.guesses.items() if key[0] == "adjoint"}
+        self.memory.last |= {key: u for key, u in self.guesses.items() if key[0] == "adjoint"}
         count, values = len(self.values), list(self.values.values())
         through = follow_back(self.cut.tensors, self.sums[count:], values, is_last=False)
         self.back_records = self.memory.records
@@ -164,8 +163,9 @@ class Replays:
         self.scene, self.new_recorder = scene, new_recorder
         self.recording: Recording | None = None
         settings = scene.diffusion
-        is_fixed = (settings.model, settings.scheme) in _FIXED and rank_count() == 1
-        if is_fixed and scene.volume.density.is_cuda:
+        # Other models' solves look at each of their iterations, and ranks wait for each other.
+        is_fixed = settings.is_conservative_p1 or settings.model == "none"
+        if is_fixed and rank_count() == 1 and scene.volume.density.is_cuda:
             self.new_recorder = GraphRecorder
 
     def differentiate(
@@ -189,7 +189,3 @@ class Replays:
         names = [view.name for view in compared.views]
         compared.forget()
         return differentiate(self.scene, names, values, compared, memory)
-
-
-_FIXED = {("p1", "conservative"), ("none", "conservative")}
-"""Models and schemes whose solves can make a fixed number of iterations."""
