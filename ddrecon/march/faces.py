@@ -29,8 +29,8 @@ GRAZING = 0.1
 a face, what lies closely behind that is lit through others.
 """
 RAISED, UNEVEN = 0.4, 4 / 3
-"""What outermost centers gain, as a fraction of what light lacks on their face: it keeps the means of
-cells. And the optical depth of cells in which half of the lack is within the outermost cell.
+"""What outermost centers gain, as a fraction of what light lacks on their face: it keeps the means
+of cells. And the optical depth of cells in which half of the lack is within the outermost cell.
 """
 OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
