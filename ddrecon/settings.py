@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -124,16 +123,14 @@ MARGIN = 2.0
 class ParameterSettings:
     """How one parameter is optimized.
 
-    It starts from `init` (None: the scene's own value), stays within [`min`, `max`] and has the
-    learning rate `lr` (None: that of its kind). `field`: whether it differs from cell to cell
-    (None: if its start does; density always does). `tv` weighs its total variation, of density by
-    E11.3; 1 weighs it as much as the whole brightness of the targets. `support`: density is 0
-    outside what pictures show, by `masks` or, `auto`, by what is brighter than black, widened by
-    `support_margin` pixels, or `MARGIN`; None allows it anywhere.
+    It starts from `init` (None: the scene's own value) and stays within [`min`, `max`]. `field`:
+    whether it differs from cell to cell (None: if its start does; density always does). `tv` weighs
+    its total variation, of density by E11.3; 1 weighs it as much as the whole brightness of the
+    targets. `support`: density is 0 outside what pictures show, by `masks` or, `auto`, by what is
+    brighter than black, widened by `support_margin` pixels, or `MARGIN`; None allows it anywhere.
     """
 
     init: Start | None = None
-    lr: float | None = bounded(None, above=0)
     min: float | None = None
     max: float | None = None
     tv: float | None = bounded(None, minimum=0)
@@ -176,30 +173,16 @@ class NoiseSettings:
 class OptimizeSettings:
     """What is optimized, and how.
 
-    `iterations`: in all; with `auto` a run ends when it is done, see `reconstruct.schedule`.
+    `iterations`: the most; with `auto` a run ends when it is done, see `reconstruct.schedule`.
     `loss`: None is chosen by the kind of pictures. `noise`: of all pictures without their own, for
-    the loss `photon` and to know when only noise is left. `views_per_iteration`: training views
-    drawn at random for an iteration; 0 for all. `derivatives`: the radiance that passes
+    the loss `photon` and to know when only noise is left. `derivatives`: the radiance that passes
     derivatives on: all of it, that scattered once, or that of the diffusion (the paper's Fig. 9).
-    `refine_at`: fractions of the run at which the grid becomes finer. `begin_at`: the fraction that
-    counts as done, so that a film's frame begins at the resolution and rates of then.
-    `keep_start`: the share of the fields' start that is mixed into them in the end. `final_rate`:
-    the share of their value to which learning rates fall over a run. A twentieth takes fewer
-    iterations at full resolution where pictures agree (the plume); a fifth is better where they do
-    not (the capture).
+    `keep_start`: the share of the fields' start that is mixed into them in the end.
     """
 
     parameters: Mapping[str, ParameterSettings]
-    iterations: Iterations = bounded(300, minimum=1)
+    iterations: Iterations = bounded(AUTO, minimum=1)
     loss: str | None = one_of(None, ("l2", "l1", "huber", "relative_l2", "display", "photon"))
     noise: NoiseSettings | None = None
-    views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", ("all", "single", "diffusion"), expert=True)
-    refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
-    begin_at: float = bounded(0.0, minimum=0, below=1, expert=True)
     keep_start: float = bounded(0.0, minimum=0, below=1, expert=True)
-    final_rate: float = bounded(0.2, above=0, maximum=1, expert=True)
-
-    def violations(self) -> Iterator[Violation]:
-        if any(later <= earlier for earlier, later in pairwise(self.refine_at)):
-            yield "refine_at", "must increase from each entry to the next"

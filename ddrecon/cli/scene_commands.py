@@ -404,7 +404,7 @@ def uncertainty(
 
     require_no_film(run)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
-    if taken.stage + 1 < len(taken.problem.factors):
+    if taken.level.train.volume.grid != taken.problem.scene.volume.grid:
         raise UsageError(
             f"{run}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"

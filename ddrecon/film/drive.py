@@ -24,7 +24,7 @@ from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
-from ddrecon.reconstruct.together import Together
+from ddrecon.reconstruct.loop import Together
 from ddrecon.run.checkpoint import (
     PREVIOUS,
     continue_from,
@@ -171,14 +171,14 @@ def calibrate(film: Film) -> None:
         continue_from(loaded)
 
     def make_iteration() -> str:
-        return f"PSNR {mean(row.psnr for row in together.step()):.1f} dB"
+        return f"PSNR {mean(row.psnr for row in together.advance()):.1f} dB"
 
     title = f"calibrate by {len(numbers)} frames"
     saved = Checkpoints(folder, described)
     advance(together, make_iteration, saved, film.is_quiet, title)
-    for number, run in zip(numbers, together.runs, strict=True):
-        grid = run.problem.scene.volume.grid
-        for p in run.parameters:
+    for number, frame in zip(numbers, together.frames, strict=True):
+        grid = frame.problem.scene.volume.grid
+        for p in frame.parameters:
             if p.is_field:
                 write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
     write_shared(path, together, numbers)

@@ -37,10 +37,6 @@ from ddrecon.scene_file.load import (
 from ddrecon.scene_file.schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
-FEWER = 6
-"""How many times fewer iterations a frame makes that starts from another: the last of a run."""
-FINAL_RATE = 0.05
-"""The part of their value to which learning rates fall; with a larger one films flicker more."""
 MIXED = 0.2
 """The part of a frame's start that is mixed into its result: less noise and less flicker."""
 MOST_APART = 3
@@ -119,7 +115,7 @@ class Film:
             file = start / write_volume(start, name, value, self.grid)
             optimize["parameters"][name]["init"] = {"file": str(file)}
         if fields:
-            optimize |= {"begin_at": 1 - 1 / FEWER, "final_rate": FINAL_RATE, "keep_start": MIXED}
+            optimize["keep_start"] = MIXED
         return read_described(described, self.scene_file.path)
 
     def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from typing import Any
 from ddrecon.errors import FormatError, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.reconstruct.together import Together
+from ddrecon.reconstruct.loop import Together
 from ddrecon.run.report import list_numbers
 from ddrecon.run.result import plain, poses_of, put_values
 from ddrecon.run.run_folder import write_values
@@ -25,7 +25,7 @@ SHARED = "shared.json"
 
 def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
     """Writes what the frames `numbers` have found `together` to `path`."""
-    scene, values = together.runs[0].current_scene(), dict[str, Any]()
+    scene, values = together.frames[0].current_scene(), dict[str, Any]()
     poses = poses_of(scene, [p.name for p in together.shared])
     for p in together.shared:
         value = p.value.detach()
@@ -34,8 +34,8 @@ def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
             values[p.name] = {"file": write_values(stem, p.name, value, grid, is_map=True)}
         else:
             values[p.name] = poses.get(p.name) or plain(value)
-    spread = {name: value.tolist() for name, value in together.spread().items()}
-    start = together.runs[0].problem.scene
+    spread = {name: value.tolist() for name, value in together.deviations().items()}
+    start = together.frames[0].problem.scene
     texts = {name: text for name, _, text in list_numbers(together.shared, start, scene)}
     write_json(path, {"frames": numbers, "values": values, "spread": spread, "texts": texts})
 

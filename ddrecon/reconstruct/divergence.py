@@ -31,7 +31,7 @@ def explain_divergence(
 ) -> DivergenceError:
     """What is raised where `iteration`, counted from 1, failed by `error`.
 
-    It names the largest value of each of the `parameters`, and advises to lower their rates.
+    It names the largest value of each of the `parameters`, and advises to bound them.
     """
     reason, residual, advice = str(error), math.nan, ""
     if isinstance(error, SolveError):
@@ -46,12 +46,12 @@ def explain_divergence(
         index = [int(i) for i in torch.unravel_index(values.abs().argmax(), values.shape)]
         place = _name_entry(parameter.name, index, parameter.is_field)
         largest.append(f"{place} is {float(values[tuple(index)]):.4g}")
-    rates = " and ".join(
-        f"optimize.parameters.{parameter.name}.lr (now {parameter.largest_rate:.3g})"
-        for parameter in parameters
-    )
+    names = " and ".join(f"optimize.parameters.{parameter.name}" for parameter in parameters)
     return DivergenceError(
-        iteration, f"{reason}; at most, {'; '.join(largest)}", residual, f"{advice}lower {rates}"
+        iteration,
+        f"{reason}; at most, {'; '.join(largest)}",
+        residual,
+        f"{advice}give another start (init) or bounds (min, max) to {names}",
     )
 
 

@@ -11,20 +11,13 @@ from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 
 
-def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
-    """The coarsening factor of each stage, the last of them 1.
+def factors(scene: Scene) -> list[int]:
+    """The coarsening factor of each level of resolution, coarsest first, the last of them 1.
 
-    Stages too coarse for the scene's grid take the coarsest factor that fits.
+    They are powers of two that leave the grid's shortest side `FEWEST_CELLS`.
     """
-    longest = max(scene.volume.grid.shape)
-    powers = (2**k for k in range(len(refine_at), -1, -1))
-    fits = [power for power in powers if longest // power >= tuning.FEWEST_CELLS or power == 1]
-    return [fits[0]] * (len(refine_at) + 1 - len(fits)) + fits
-
-
-def stage_of(iteration: int, iterations: int, refine_at: tuple[float, ...]) -> int:
-    """The stage of `iteration`: how many fractions of `refine_at` have passed by then."""
-    return sum(iteration >= round(fraction * iterations) for fraction in refine_at)
+    most = max(min(scene.volume.grid.shape) // tuning.FEWEST_CELLS, 1)
+    return [2**k for k in reversed(range(most.bit_length()))]
 
 
 def scene_at_level(scene: Scene, factor: int) -> Scene:

@@ -1,38 +1,35 @@
 """The reconstruction: render, compare, differentiate, step; coarse to fine.
 
-It knows nothing of physics beyond `differentiate`. A `Reconstruction` is advanced
-one iteration at a time, so that whoever drives it may log, preview, stop or save between any two.
+It knows nothing of physics beyond `Frame.evaluate`. A `Reconstruction` is advanced one iteration at
+a time, so that whoever drives it may log, preview, stop or save between any two.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.numerics.remember import forget_changed
 from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
-from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
-from ddrecon.reconstruct.log import NO_ROWS, Result, Row
-from ddrecon.reconstruct.numbers import NumberSteps, Point
-from ddrecon.reconstruct.objective import Comparison, add_penalties, render_quality
+from ddrecon.reconstruct.frame import Evaluation, Frame
+from ddrecon.reconstruct.log import Result, Row
+from ddrecon.reconstruct.numbers import Numbers
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.recording import Replays
-from ddrecon.reconstruct.schedule import Progress, Schedule, pick_views
-from ddrecon.reconstruct.setup import Problem, start_parameters
+from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
+from ddrecon.reconstruct.search import Objective, Search, Space, Values
+from ddrecon.reconstruct.setup import Level
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
 from ddrecon.variables.legal import require_legal
-from ddrecon.variables.values import with_values
 
 
 def optimize(
@@ -53,210 +50,228 @@ def optimize(
     return Result(run.current_scene(), rows)
 
 
-class Reconstruction:
-    """A run: its `problem`, which stays, and its state.
+class Together:
+    """Frames of a run, the `search` that moves their parameters, and the `schedule` that ends it.
 
-    State: `parameters`; `level`, the current resolution; `total`, the running totals of the log;
-    `misfit` = sqrt(mean image loss / power of the targets) of the last iteration. `before_step` is
-    the state before the last step.
+    Frames are scenes that differ in their pictures: one, or several of a film that share all
+    parameters but their fields. `blocks` are the parameters of all, by their names in the search,
+    and `numbers` the single numbers among them. `diagonals` are the metric of fields and maps.
     """
 
-    def __init__(self, scene: Scene, iterations: Iterations | None = None):
-        require_legal(scene)
+    def __init__(self, scenes: Sequence[Scene], iterations: Iterations | None = None):
+        for scene in scenes:
+            require_legal(scene)
         forget_changed()
-        self.problem = Problem.of(scene, iterations)
-        settings, train = self.problem.settings, self.problem.train
-        self.parameters = start_parameters(scene, settings)
-        self.numbers = NumberSteps(train, self.parameters)
-        self.schedule = Schedule(settings, len(train.views))
-        self.total = NO_ROWS
-        self.misfit = 1.0
+        self.frames = [Frame(scene, iterations) for scene in scenes]
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
-        self.memory = SolveMemory(scene.diffusion.warm_start)
-        self.before_step: dict[str, Any] | None = None
-        self._enter_stage(self.schedule.stage(0))
+        self.blocks: dict[str, Parameter] = {}
+        shared = {p.name: p for p in self.frames[0].parameters if not p.is_field}
+        for frame in self.frames:
+            frame.parameters = [shared.get(p.name, p) for p in frame.parameters]
+            self.blocks |= {self._key(frame, p): p for p in frame.parameters}
+        every = list(self.blocks.values())
+        self.numbers = Numbers([frame.problem.train for frame in self.frames], every)
+        problem = self.frames[0].problem
+        stages = find_stages(len(problem.factors), problem.train, every)
+        self.schedule = Schedule(problem.settings.iterations, stages)
+        self.diagonals: Values = {}
+        self.search = Search(Space(self._project, self._free, self._precondition))
+        self._enter_stage()
 
     @property
     def iteration(self) -> int:
         """How many iterations have been made."""
-        return self.total.iteration
+        return self.frames[0].total.iteration
 
     @property
     def is_done(self) -> bool:
         """Whether all iterations have been made, or what ends the run by itself has come."""
         return self.schedule.is_over(self.iteration)
 
-    def step(self) -> Row:
-        """The log's row of one more iteration.
+    def advance(self) -> list[Row]:
+        """The log's rows, one of each frame, of one more iteration: one candidate of the search.
 
-        Raises DivergenceError when the iteration fails. The state is then that before the last
-        step, which caused the failure.
+        Raises DivergenceError when nothing can be evaluated. The state is then that before the
+        iteration.
         """
         start = perf_counter()
-        stage = self.schedule.stage(self.iteration)
-        if stage > self.stage:
-            self._enter_stage(stage)
-        try:
-            return self._iterate(start)
-        except (SolveError, NotFiniteError) as error:
-            failure = explain_divergence(self.iteration + 1, self.parameters, error)
-            if self.before_step is not None:
-                self.restore(self.before_step)
-            raise failure from error.__cause__
-        except RanksError:
-            # The state is that before the iteration, even amid the step, when some have moved.
-            if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
-                self.restore(self.before_step)
-            raise
-
-    def _iterate(self, start: float) -> Row:
-        """One iteration, begun at `start` [s]."""
-        # See: which views this iteration compares.
-        level, power = self.level, self.problem.power
-        views, count = level.train.views, self.problem.settings.views_per_iteration
-        drawn = pick_views(len(views), count, self.iteration, self.seed)
-        compared = Comparison([views[i] for i in drawn], level.targets, self._is_test_due)
-        # Differentiate: the objective and its derivative by every parameter.
-        values = {parameter.name: parameter.value for parameter in self.parameters}
-        objective = self._differentiate(values, compared)
-        loss, gradients = add_penalties(objective, self.parameters, power)
-        # Check: a derivative that is not finite would spoil the parameters for good.
-        read = compared.read(objective, loss, gradients, self.parameters)
-        total, of_images, psnr, ssim = read
-        # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
-        # Solutions are not in it: solves only begin there.
-        self.before_step = None
-        self.before_step = self.state()
-        del self.before_step["solutions"]
-        # Step: every parameter against its derivative.
-        self.misfit = math.sqrt(of_images / power) if power else 1.0
-        self._step(values, gradients, compared)
-        # Judge: is there more to be done, here or at all?
-        self.schedule.note(self.iteration, total)
-        # Keep: in the end, a part of what fields began with.
-        fraction = self.problem.settings.keep_start
-        if fraction and self.schedule.is_over(self.iteration + 1):
-            for p in self.parameters:
+        candidate, evaluations = self._evaluate_candidate()
+        objective = self._add_up(candidate, evaluations)
+        if not self.search.values:
+            self._find_metric(evaluations)
+        weight = self.search.weight
+        self.search.judge(candidate, objective)
+        self._put(self.search.values)
+        stage = self.schedule.stage
+        self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
+        is_over = self.schedule.is_over(self.iteration + 1)
+        fraction = self.frames[0].problem.settings.keep_start
+        if fraction and is_over:
+            # In the end, fields get back a part of what they began with.
+            for p in self.blocks.values():
                 if p.is_field:
                     p.keep_start(fraction)
-        # Test: now and then, how good the parameters are for views they were not made from.
-        solves = [(record.kind, record.iterations) for record in self.memory.records]
-        test_psnr, test_ssim = None, None
-        if self._is_test_due and level.test.views:
-            test_psnr, test_ssim = render_quality(
-                level.test, self.parameters, level.test_targets, self.memory
-            )
-        # Log.
-        row = Row(
-            iteration=self.iteration + 1,
-            seconds=self.total.seconds + perf_counter() - start,
-            loss=total,
-            data_loss=of_images,
-            penalty=total - of_images,
-            psnr=psnr,
-            test_psnr=test_psnr,
-            forward_iterations=sum(count for kind, count in solves if kind == "forward"),
-            adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
-            cells=level.train.volume.grid.cells,
-            ssim=ssim,
-            test_ssim=test_ssim,
-        )
-        # Sum: the solvers' iterations, and quality as last known.
-        unchanged = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
-        counts = "forward_iterations", "adjoint_iterations"
-        sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
-        self.total = replace(row, **unchanged, **sums)
-        return row
+        is_test_due = is_over or (self.iteration + 1) % tuning.TEST_EVERY == 0
+        seconds = perf_counter() - start
+        rows = [
+            frame.add_row(evaluation, weight, seconds, is_test_due)
+            for frame, evaluation in zip(self.frames, evaluations, strict=True)
+        ]
+        if self.schedule.stage != stage:
+            self._enter_stage()
+        return rows
 
-    def current_scene(self) -> Scene:
-        """The scene at full resolution, with everything as reconstructed so far."""
-        grid = self.problem.scene.volume.grid
-        with torch.no_grad():
-            values = {parameter.name: parameter.value_on(grid) for parameter in self.parameters}
-            return with_values(self.problem.scene, values)
+    @property
+    def shared(self) -> list[Parameter]:
+        """The parameters that all frames have in common."""
+        return [p for p in self.blocks.values() if not p.is_field]
+
+    def deviations(self) -> dict[str, Tensor]:
+        """The disagreement of the frames on each single number, entry by entry, by name."""
+        return self.numbers.deviations(
+            [frame.evaluate().objective.gradients for frame in self.frames]
+        )
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
         return {
-            "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
-            "stage": self.stage,
-            "total": dict(vars(self.total)),
-            "solutions": dict(self.memory.last),
-            "misfit": self.misfit,
+            "frames": [frame.state() for frame in self.frames],
+            "progress": asdict(self.schedule.progress),
+            "search": self.search.state(),
+            "diagonals": self.diagonals,
+            "numbers": self.numbers.state(),
             "seed": self.seed,
-            "schedule": asdict(self.schedule.progress),
-            "numbers": {"begun": self.numbers.begun, "curvatures": dict(self.numbers.curvatures)},
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where the run that made `state` stopped."""
-        for parameter in self.parameters:
-            parameter.restore(state["parameters"][parameter.name])
-        self.total = Row(**state["total"])
-        self.misfit, self.seed = state["misfit"], state["seed"]
-        self.schedule.progress = Progress(**state["schedule"])
-        self._enter_stage(state["stage"])
-        numbers = state["numbers"]
-        self.numbers.begun, self.numbers.curvatures = numbers["begun"], dict(numbers["curvatures"])
-        for kind, field in state.get("solutions", {}).items():
-            self.memory.last[kind] = field.to(self.problem.scene.volume.density)
+        self.schedule.progress = Progress(**state["progress"])
+        for frame, of_frame in zip(self.frames, state["frames"], strict=True):
+            frame.restore(of_frame)
+        self._enter_stage()
+        for frame, of_frame in zip(self.frames, state["frames"], strict=True):
+            frame.restore_solutions(of_frame)
+        like = {key: p.value for key, p in self.blocks.items()}
+        self.search.restore(state["search"], like)
+        self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
+        self.numbers.restore(state["numbers"])
+        self.seed = state["seed"]
 
-    def _enter_stage(self, stage: int) -> None:
-        """Takes scenes and parameters to the resolution of `stage`."""
-        self.stage, self.level = stage, self.problem.at(stage)
-        volume = self.level.train.volume
-        # These belong to another resolution.
-        self.memory.last, self.memory.iterations, self.numbers.curvatures = {}, {}, {}
-        self.replays = Replays(self.level.train)
-        for parameter in self.parameters:
-            if parameter.grid != volume.grid:
-                parameter.refine(volume.grid)
-            if volume.support is not None and parameter.name in ("density", "emission"):
-                parameter.restrict(volume.support)
+    def _enter_stage(self) -> None:
+        """Takes frames to the resolution of the stage; the search begins anew."""
+        for frame in self.frames:
+            frame.enter(self.schedule.stage.level)
+        # How long the metric is hardly changes with resolution.
+        space = Space(self._project, self._free, self._precondition)
+        old, self.diagonals = self.search, {}
+        self.search = Search(space, scale=old.scale, weight=old.weight)
+        self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
-    def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:
-        """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
-        self.memory.records.clear()
-        self.memory.tolerance_floor = solve_tolerances(self.misfit)
-        try:
-            return self.replays.differentiate(values, compared, self.memory)
-        except SolveError:
-            # The adjoint cannot be solved for a loss that is not finite.
-            compared.require_finite()
-            raise
-        finally:
-            self.memory.tolerance_floor = {}
+    def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
+        """The next candidate whose objective can be evaluated, and that of each frame."""
+        while True:
+            is_first = not self.search.values
+            candidate = self.search.candidate() if not is_first else self._values()
+            self._put(candidate)
+            try:
+                return candidate, [frame.evaluate() for frame in self.frames]
+            except (SolveError, NotFiniteError) as error:
+                every = list(self.blocks.values())
+                failure = explain_divergence(self.iteration + 1, every, error)
+                if not is_first:
+                    # Light that cannot be solved for is as bad as light that is far off.
+                    self.search.judge(candidate, Objective(math.inf, 0.0, {}, {}))
+                    self._put(self.search.values)
+                if is_first or self.search.is_stuck:
+                    raise failure from error.__cause__
+            except RanksError:
+                self._put(candidate if is_first else self.search.values)
+                raise
 
-    def _step(
-        self, values: Mapping[str, Tensor], gradients: Mapping[str, Tensor], compared: Comparison
-    ) -> None:
-        """Moves what is due: fields and maps by Adam, and single numbers all at once (E10.2)."""
-        rates = {p.name: self.schedule.rate(self.iteration, p.release) for p in self.parameters}
-        for p in self.parameters:
-            if rates[p.name] and (p.is_field or p not in self.numbers.numbers):
-                p.step(gradients[p.name], rates[p.name], self.problem.power)
-        due = [name for name, rate in rates.items() if rate]
-        point = self._point(values)
-        equations = self.numbers.find_equations(point, gradients, compared, due, self.iteration)
-        self.numbers.step(equations)
+    def _add_up(self, candidate: Values, evaluations: Sequence[Evaluation]) -> Objective:
+        """The objective of all frames, with what calibrations say."""
+        loss, gradients = self.numbers.penalty(candidate)
+        prior, prior_gradients = 0.0, dict[str, Tensor]()
+        for frame, evaluation in zip(self.frames, evaluations, strict=True):
+            objective = evaluation.objective
+            loss, prior = loss + objective.loss, prior + objective.prior
+            for p in frame.parameters:
+                key, bar = self._key(frame, p), objective.gradients[p.name]
+                gradients[key] = gradients[key] + bar if key in gradients else bar
+                if p.name in objective.prior_gradients:
+                    prior_gradients[key] = objective.prior_gradients[p.name]
+        return Objective(loss, prior, gradients, prior_gradients)
 
-    def _point(self, values: Mapping[str, Tensor]) -> Point:
-        """Where the numbers stand: at the `values` of all parameters."""
-        detached = {name: value.detach() for name, value in values.items()}
-        return Point(self.level.train, detached, self.memory.last)
+    def _find_metric(self, evaluations: Sequence[Evaluation]) -> None:
+        """Takes the metric where the parameters stand."""
+        compared = [evaluation.compared for evaluation in evaluations]
+        pairs = list(zip(self.frames, compared, strict=True))
+        for frame, comparison in pairs:
+            blocks = [p for p in frame.parameters if p not in self.numbers.places]
+            for name, diagonal in frame.find_diagonals(blocks, comparison).items():
+                key = next(self._key(frame, p) for p in blocks if p.name == name)
+                # Maps are shared: what all frames tell of one adds up.
+                known = self.diagonals.get(key)
+                self.diagonals[key] = diagonal if known is None else known + diagonal
+        if not self.schedule.stage.waiting:
+            self.numbers.prepare([frame.point(comparison) for frame, comparison in pairs])
 
-    def undamped_changes(self) -> dict[Parameter, Tensor]:
-        """The step, in units of rates, to what all pictures say of the numbers, undamped."""
-        values = {parameter.name: parameter.value for parameter in self.parameters}
-        compared = Comparison(self.level.train.views, self.level.targets)
-        gradients = self._differentiate(values, compared).gradients
-        self.numbers.curvatures = {}
-        point = self._point(values)
-        equations = self.numbers.find_equations(point, gradients, compared, values, self.iteration)
-        return self.numbers.changes([equations], damping=0.0)
+    def _project(self, values: Values) -> Values:
+        projected = {key: p.project(values[key]) for key, p in self.blocks.items()}
+        return projected | self.numbers.hold_gauges(projected)
+
+    def _free(self, values: Values, gradients: Values) -> Values:
+        waiting = self.schedule.stage.waiting
+        return {
+            key: torch.zeros_like(values[key])
+            if p.name in waiting
+            else p.free(values[key], gradients[key])
+            for key, p in self.blocks.items()
+        }
+
+    def _precondition(self, values: Values, residual: Values, free: Values) -> Values:
+        result = dict[str, Tensor]()
+        for key, diagonal in self.diagonals.items():
+            stiffness = self.blocks[key].stiffness(values[key])
+            total = diagonal if stiffness is None else diagonal + self.search.weight * stiffness
+            result[key] = residual[key] * free[key] / total
+        return result | self.numbers.precondition(residual, free)
+
+    def _values(self) -> Values:
+        return {key: p.value.detach() for key, p in self.blocks.items()}
+
+    def _put(self, values: Values) -> None:
+        for key, p in self.blocks.items():
+            p.value = values[key].detach().requires_grad_()
+
+    def _key(self, frame: Frame, p: Parameter) -> str:
+        """The search's name of a parameter of `frame`: fields are each frame's own."""
+        is_shared = len(self.frames) == 1 or not p.is_field
+        return p.name if is_shared else f"frame {self.frames.index(frame)} {p.name}"
+
+
+class Reconstruction(Together):
+    """A run of one `scene`: its `frame`, and what the run has of it."""
+
+    def __init__(self, scene: Scene, iterations: Iterations | None = None):
+        super().__init__([scene], iterations)
+        frame = self.frame = self.frames[0]
+        self.problem, self.memory, self.parameters = frame.problem, frame.memory, frame.parameters
 
     @property
-    def _is_test_due(self) -> bool:
-        """Whether test views, and SSIM, are looked at in this iteration."""
-        iteration = self.iteration + 1
-        return iteration % tuning.TEST_EVERY == 0 or self.schedule.is_over(iteration)
+    def level(self) -> Level:
+        """The problem at the current resolution."""
+        return self.frame.level
+
+    @property
+    def total(self) -> Row:
+        """The running totals of the log."""
+        return self.frame.total
+
+    def step(self) -> Row:
+        """The log's row of one more iteration; raises DivergenceError as `advance` does."""
+        return self.advance()[0]
+
+    def current_scene(self) -> Scene:
+        """The scene at full resolution, with everything as reconstructed so far."""
+        return self.frame.current_scene()

@@ -1,9 +1,8 @@
-"""Single numbers, such as exposures, lights, cameras and g: damped Gauss-Newton steps (E10.2).
+"""Single numbers, such as exposures, lights, cameras and g: the metric between them (E10.2).
 
-Numbers are few, and look alike in pictures: a camera's turn and its shift, a lamp and an exposure,
-and the level of a field. So all move at once, by the normal matrix J^T W J of the pictures. The
-matrix decides how far a step goes, not where steps end: J is made of differences of pictures, and
-renewed ever more rarely. The gradient is exact at every step.
+Numbers are few, and look alike in pictures: a camera's turn and its shift, a lamp and an exposure.
+So the search moves them by the whole normal matrix J^T W J of the pictures. The matrix decides how
+far a step goes, not where the search ends: its columns are differences of pictures.
 
 Gauges and the errors of calibrations are known without pictures. A gauge is a change of several
 parameters together that no picture shows, and that is not made: twice the exposure of all cameras
@@ -13,8 +12,9 @@ is half the light; all cameras moved together move the volume.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,11 +26,10 @@ from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
 from ddrecon.ranks import from_first, sum_over_ranks
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.shares import own_views
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import PIXELS, is_of_volume, kind_of
+from ddrecon.variables.kinds import PIXELS, kind_of
 from ddrecon.variables.values import with_values
 
 
@@ -43,152 +42,148 @@ def single_numbers(parameters: Sequence[Parameter]) -> list[Parameter]:
 class Point:
     """Where derivatives are taken: `scene` with the `values` of all parameters, by name.
 
-    `solutions` are near to the light there.
+    `weights` [3, h, w] are W of the views that this rank renders, by name; `solutions` are near to
+    the light there.
     """
 
     scene: Scene
     values: Mapping[str, Tensor]
+    weights: Mapping[str, Tensor]
     solutions: Mapping[tuple[str, int], Tensor]
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """The normal equations of the `moved` numbers by the pictures of one volume, entry by entry.
+class Numbers:
+    """The single numbers among `parameters`, which the views of several `scenes` show.
 
-    `matrix` is J^T W J, and `right` the derivative downhill, in units of the rates.
+    `matrix` is J^T W J between all entries, one after another, with what the calibrations of
+    cameras say; `prior` is the latter alone. Both are 0 until `prepare` was called.
     """
 
-    moved: Sequence[Parameter]
-    matrix: Tensor
-    right: Tensor
-
-
-class NumberSteps:
-    """The steps of the single numbers among `parameters`, which the views of `train` show.
-
-    Fields take part by their level, one number a color, where numbers of the medium are optimized,
-    since pictures show their product. `curvatures` are J^T W J of each view, by name, and the
-    iteration that it is of; `begun` is the first at this resolution. `sharing` volumes share the
-    numbers: equations are `pending` until those of all volumes are there.
-    """
-
-    def __init__(self, train: Scene, parameters: Sequence[Parameter], sharing: int = 1):
+    def __init__(self, scenes: Sequence[Scene], parameters: Sequence[Parameter]):
         self.numbers = single_numbers(parameters)
-        if any(is_of_volume(p.name) for p in self.numbers):
-            self.numbers += [p for p in parameters if p.is_field]
-        self.gauges = find_gauges(train, parameters)
+        self.places = _places(self.numbers)
+        size = sum(p.value.numel() for p in self.numbers)
+        self.matrix = self.prior = torch.zeros(size, size).double()
+        self.of_scenes = [self.matrix for _ in scenes]
+        train = scenes[0]
+        self.gauges = find_gauges(train, self.numbers)
         poses = [p for p in self.numbers if p.key == "camera"]
         # Where some cameras are optimized no calibration is to be mended: they may be far off.
         cameras = {view.name: view.camera for view in train.views}
         calibrated = poses if len(poses) == len(cameras) > 1 else []
-        self.priors = {p: calibration_prior(cameras[str(p.view)], p.grid).cpu() for p in calibrated}
-        self.curvatures: dict[str, tuple[int, Tensor]] = {}
-        self.begun, self.sharing, self.pending = 0, sharing, list[NormalEquations]()
+        self.precisions = {
+            p: calibration_prior(cameras[str(p.view)], p.grid).cpu() for p in calibrated
+        }
 
-    def step(self, equations: NormalEquations) -> None:
-        """Moves the numbers by `equations`, once those of all volumes are there."""
-        self.pending.append(equations)
-        if len(self.pending) < self.sharing:
-            return
-        all_equations, self.pending[:] = [*self.pending], []
-        if not any(equations.moved for equations in all_equations):
-            return
-        for p, change in self.changes(all_equations).items():
-            change = change / (change.abs().max() / tuning.LARGEST_STEP).clamp(min=1)
-            p.move(change * units_of(p))
-        for gauge in self.gauges:
-            gauge.hold()
-
-    def find_equations(
-        self,
-        point: Point,
-        gradients: Mapping[str, Tensor],
-        compared: Comparison,
-        due: Collection[str],
-        iteration: int,
-    ) -> NormalEquations:
-        """The normal equations of the numbers that are `due`, by the views that were `compared`.
-
-        `gradients` are those of the views, at `point`.
-        """
-        shares = dict.fromkeys((view.name for view in compared.views), 0.0)
-        for view in compared.views:
-            shares[view.name] += compared.share(view)
-        moved = [p for p in self.numbers if p.name in due and (p.view is None or p.view in shares)]
-        if not moved:
-            return NormalEquations([], torch.zeros(0, 0).double(), torch.zeros(0).double())
-        self._refresh(point, compared, iteration)
-        unit = torch.cat([units_of(p) for p in moved])
-        matrices = {name: share * self.curvatures[name][1] for name, share in shares.items()}
-        matrix = _sum_between(moved, matrices, self.numbers) * unit * unit[:, None]
-        slopes = [_gradient(p, point.values[p.name], gradients[p.name]) for p in moved]
-        return NormalEquations(moved, matrix, -torch.cat(slopes) * unit)
-
-    def changes(
-        self, all_equations: Sequence[NormalEquations], damping: float = tuning.DAMPING
-    ) -> dict[Parameter, Tensor]:
-        """The damped step of each number by the sum of `all_equations`, in units of rates."""
-        moved = list(dict.fromkeys(p for equations in all_equations for p in equations.moved))
-        places, size = _places(moved), sum(_count(p) for p in moved)
-        matrix, right = torch.zeros(size, size).double(), torch.zeros(size).double()
-        for equations in all_equations:
-            if equations.moved:
-                at = torch.cat([places[p] for p in equations.moved])
-                matrix[at[:, None], at] += equations.matrix
-                right[at] += equations.right
-        for p in moved:
-            at, unit = places[p], units_of(p)
-            block = matrix[at[:, None], at]
-            if p in self.priors:
-                # As strong as what one picture says of a shift in the image by `TRUST`.
-                count = sum(p in equations.moved for equations in all_equations)
-                of_shifts = tuning.TRUST**2 * block.diagonal()[3:5].mean() / PIXELS**2 / count
-                prior = self.priors[p] * of_shifts
-                prior = prior * unit * unit[:, None]
-                right[at] -= prior @ (p.value.detach().double().cpu() / unit)
-                block = block + prior
-            least = tuning.LEAST * block.diagonal().max() + torch.finfo(torch.float32).tiny
-            damped = (1 + damping) * block + least * torch.eye(len(at)).double()
-            matrix[at[:, None], at] = damped
+    def prepare(self, points: Sequence[Point]) -> None:
+        """Takes the metric at `points`, one for each scene."""
+        self.of_scenes = [find_matrix(point, self.numbers) for point in points]
+        matrix, prior = torch.stack(self.of_scenes).sum(0), torch.zeros_like(self.matrix)
+        for p, precision in self.precisions.items():
+            # As strong as what one picture says of a shift in the image by `TRUST` pixels.
+            at = self.places[p]
+            rate = torch.as_tensor(kind_of(p.name).rate(points[0].scene, p.name, p.value.detach()))
+            pixel = rate[3:5].double().cpu() / PIXELS
+            shifts = (matrix[at, at][3:5] * pixel**2).mean() / len(points)
+            prior[at[:, None], at] = precision * tuning.TRUST**2 * shifts
         # As the first rank has it: another machine may round in another way.
-        change = from_first(torch.linalg.solve(matrix, right))
-        return {p: change[at] for p, at in places.items()}
+        self.matrix, self.prior = from_first(matrix + prior), from_first(prior)
 
-    def _refresh(self, point: Point, compared: Comparison, iteration: int) -> None:
-        """Renews the curvatures of those `compared` views whose are too old."""
-        if not self.curvatures:
-            self.begun = iteration
-        names = dict.fromkeys(view.name for view in compared.views)
-        computed_at = {name: self.curvatures.get(name, (-math.inf,))[0] for name in names}
-        limits = {
-            name: min(max(at - self.begun, 1), tuning.REFRESH) for name, at in computed_at.items()
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {"matrix": self.matrix, "prior": self.prior, "of_scenes": self.of_scenes}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes up a `state`."""
+        self.matrix, self.prior, self.of_scenes = (
+            state[name] for name in ("matrix", "prior", "of_scenes")
+        )
+
+    def penalty(self, values: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
+        """What calibrations add to the objective at `values`, and its derivatives by name."""
+        if not self.precisions:
+            return 0.0, {}
+        vector = self._join(values)
+        slope = self.prior @ vector
+        return float(vector @ slope) / 2, self._split(slope, values)
+
+    def precondition(
+        self, residual: Mapping[str, Tensor], free: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """The inverse of the matrix times `residual`, of what is `free` and of no gauge."""
+        if not self.numbers:
+            return {}
+        at = self._join(free).nonzero()[:, 0]
+        result = torch.zeros(len(self.matrix)).double()
+        if len(at):
+            solution = self._solve(self.matrix, self._join(residual)[at], at)
+            result[at] = from_first(solution)
+        return self._split(result, residual)
+
+    def deviations(self, gradients: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+        """The disagreement of the scenes on each number, entry by entry, by name.
+
+        It is the standard deviation of the steps that each would make alone, by its `gradients`.
+        """
+        at = torch.arange(len(self.matrix))
+        steps = [
+            self._solve(matrix + self.prior, self._join(bars), at)
+            for matrix, bars in zip(self.of_scenes, gradients, strict=True)
+        ]
+        values = {p.name: p.value for p in self.numbers}
+        return self._split(torch.stack(steps).std(0), values) if len(steps) > 1 else {}
+
+    def hold_gauges(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """`values` without what gauges forbid."""
+        held = dict(values)
+        for gauge in self.gauges:
+            held |= gauge.hold(held)
+        return held
+
+    def _solve(self, matrix: Tensor, right: Tensor, at: Tensor) -> Tensor:
+        """The solution of the rows and columns `at` of `matrix`, within the gauges."""
+        matrix = matrix[at[:, None], at]
+        least = torch.zeros(len(self.matrix)).double()
+        for place in self.places.values():
+            diagonal = self.matrix.diagonal()[place]
+            least[place] = tuning.LEAST * diagonal.max() + torch.finfo(torch.float32).tiny
+        matrix = matrix + least[at].diag()
+        # In units of their own curvature, numbers are of one size.
+        unit = matrix.diagonal().rsqrt()
+        basis = torch.eye(len(at)).double()
+        if directions := [gauge.directions_in(self.places, len(least)) for gauge in self.gauges]:
+            forbidden = torch.cat(directions, 1)[at] * unit[:, None]
+            # What is orthogonal to the directions: the last columns of a complete basis.
+            rank = int(torch.linalg.matrix_rank(forbidden))
+            basis = torch.linalg.svd(forbidden)[0][:, rank:]
+        scaled = basis.T @ (matrix * unit * unit[:, None]) @ basis
+        solution: Tensor = basis @ torch.linalg.solve(scaled, basis.T @ (right * unit)) * unit
+        return solution
+
+    def _join(self, tensors: Mapping[str, Tensor]) -> Tensor:
+        """Entries of all numbers one after another, in float64."""
+        return torch.cat([tensors[p.name].detach().flatten().double().cpu() for p in self.numbers])
+
+    def _split(self, vector: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {
+            p.name: vector[at].view(p.value.shape).to(like[p.name]) for p, at in self.places.items()
         }
-        stale = [name for name in names if iteration - computed_at[name] >= limits[name]]
-        weights = {
-            name: compared.targets[name].weights_at(picture)
-            for name, picture in compared.pictures.items()
-            if name in stale
-        }
-        curvatures = find_curvatures(point, self.numbers, stale, weights)
-        self.curvatures = self.curvatures | {name: (iteration, m) for name, m in curvatures.items()}
 
 
-def find_curvatures(
-    point: Point,
-    numbers: Sequence[Parameter],
-    names: Sequence[str],
-    weights: Mapping[str, Tensor],
-) -> dict[str, Tensor]:
-    """J^T W J at `point` of the views called `names`, between the `numbers` that each shows.
+def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
+    """J^T W J at `point` between all entries of `numbers`, one after another, in float64.
 
-    Square matrices in float64, of all entries one after another. `weights` [3, h, w] are W of the
-    views that this rank renders. Columns of J are differences of pictures; those of a number of one
-    view are in the light as it is.
+    Columns of J are differences of pictures; those of a number of one view are in the light as it
+    is.
     """
-    if not names:
-        return {}
-    rank_names = own_views(point.scene, names)
-    jacobians: dict[str, list[Tensor]] = {name: [] for name in names}
+    places = _places(numbers)
+    size = sum(p.value.numel() for p in numbers)
+    total = torch.zeros(size, size, dtype=torch.float64)
+    if not numbers:
+        return total
+    names = own_views(point.scene, [view.name for view in point.scene.views])
+    columns: dict[str, list[Tensor]] = {name: [] for name in names}
+    entries: dict[str, list[Tensor]] = {name: [] for name in names}
     # Pictures differ by little: the light of each is solved closely, beginning where it is known.
     diffusion, values = point.scene.diffusion, point.values
     close = replace(diffusion, tolerance=min(diffusion.tolerance, tuning.CLOSE))
@@ -196,9 +191,9 @@ def find_curvatures(
     with torch.no_grad():
         world = with_values(scene, values)
         light = solve_light(world, memory)
-        pictures = {name: view_picture(light, world, world.view(name)) for name in rank_names}
+        pictures = {name: view_picture(light, world, world.view(name)) for name in names}
         for p in numbers:
-            shown = [name for name in rank_names if p.view in (None, name)]
+            shown = [name for name in names if p.view in (None, name)]
             changes: dict[str, list[Tensor]] = {name: [] for name in shown}
             steps, lengths = _small_changes(point, p)
             for step in steps if shown else ():
@@ -209,65 +204,26 @@ def find_curvatures(
                     image = view_picture(lit, world, world.view(name))
                     changes[name].append(image - pictures[name])
             for name, differences in changes.items():
-                columns = torch.stack(differences)
-                if len(columns) < len(lengths):  # all colors have changed at once
-                    columns = columns * torch.eye(len(lengths)).to(columns)[..., None, None]
-                jacobians[name].append(columns.flatten(1) / lengths[:, None])
-    matrices = []
+                rows = torch.stack(differences)
+                if len(rows) < len(lengths):  # all colors have changed at once
+                    rows = rows * torch.eye(len(lengths)).to(rows)[..., None, None]
+                columns[name].append(rows.flatten(1) / lengths[:, None])
+                entries[name].append(places[p])
     for name in names:
-        size = sum(_count(p) for p in _shown_by(name, numbers))
-        matrix = torch.zeros(size, size, dtype=torch.float64)
-        if name in rank_names and size:
-            # The square of J is taken of W^(1/2) J, whose numbers are nearer to each other.
-            root = weights[name].sqrt().expand(3, *scene.view(name).camera.size).flatten()
-            jacobian = (torch.cat(jacobians[name]) * root).double()
-            matrix = (jacobian @ jacobian.T).cpu()
-        matrices.append(matrix)
-    return dict(zip(names, sum_over_ranks(matrices), strict=True))
-
-
-def _sum_between(
-    chosen: Sequence[Parameter], matrices: Mapping[str, Tensor], numbers: Sequence[Parameter]
-) -> Tensor:
-    """The sum of `matrices` of views by name, between the `chosen` of the `numbers` they are of."""
-    places = _places(chosen)
-    size = sum(_count(p) for p in chosen)
-    total = torch.zeros(size, size, dtype=torch.float64)
-    for name, matrix in matrices.items():
-        shown = _places(_shown_by(name, numbers))
-        if common := [p for p in shown if p in places]:
-            rows, columns = (torch.cat([at[p] for p in common]) for at in (shown, places))
-            total[columns[:, None], columns] += matrix[rows[:, None], rows]
-    return total
-
-
-def _shown_by(view: str, numbers: Sequence[Parameter]) -> list[Parameter]:
-    return [p for p in numbers if p.view is None or p.view == view]
+        if not columns[name]:
+            continue
+        # The square of J is taken of W^(1/2) J, whose numbers are nearer to each other.
+        root = point.weights[name].sqrt().expand_as(pictures[name]).flatten()
+        jacobian, at = (torch.cat(columns[name]) * root).double(), torch.cat(entries[name])
+        total[at[:, None], at] += (jacobian @ jacobian.T).cpu()
+    return sum_over_ranks([total])[0]
 
 
 def _places(numbers: Sequence[Parameter]) -> dict[Parameter, Tensor]:
     """Where the entries of each of `numbers` stand, one after another."""
-    counts = [_count(p) for p in numbers]
+    counts = [p.value.numel() for p in numbers]
     places = torch.arange(sum(counts)).split(counts) if counts else ()
     return dict(zip(numbers, places, strict=True))
-
-
-def _count(p: Parameter) -> int:
-    """How many entries `p` has: all of a number, and of a field a level for each color."""
-    return p.value.numel() // p.grid.cells if p.is_field else p.value.numel()
-
-
-def units_of(p: Parameter) -> Tensor:
-    """The rate of each entry of `p`, in float64; that of a level is relative."""
-    rate = torch.as_tensor(tuning.LEVEL_RATE if p.is_field else p.rate)
-    return rate.double().cpu().expand(_count(p))
-
-
-def _gradient(p: Parameter, value: Tensor, gradient: Tensor) -> Tensor:
-    """The derivative by each entry of `p`, in float64; a level changes its field by factors."""
-    if p.is_field:
-        gradient = (gradient * value).sum((-3, -2, -1))
-    return gradient.flatten().double().cpu()
 
 
 def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
@@ -277,9 +233,6 @@ def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
     all change at once.
     """
     value = point.values[p.name]
-    if p.is_field:
-        lengths = value.new_full((_count(p),), -tuning.APART * tuning.LEVEL_RATE)
-        return (lengths[0] * value)[None], lengths
     rate = torch.as_tensor(kind_of(p.name).rate(point.scene, p.name, value)).to(value)
     lengths = tuning.APART * rate.expand(value.numel())
     lengths = torch.where(value.flatten() + lengths > p.high, -lengths, lengths)
@@ -297,21 +250,33 @@ class Gauge:
 
     def __init__(self, parameters: Sequence[Parameter], directions: Tensor, is_relative: bool):
         self.parameters, self.is_relative = parameters, is_relative
-        self.directions, self.start = torch.linalg.qr(directions)[0], self._values()
+        values = {p.name: p.value.detach() for p in parameters}
+        self.directions, self.start = torch.linalg.qr(directions)[0], self._join(values)
 
-    def hold(self) -> None:
-        """Takes the part of the directions out of the parameters' values."""
-        values = self._values()
-        values = values - self.directions @ (self.directions.T @ (values - self.start))
-        values = values.exp() if self.is_relative else values
-        sizes = [parameter.value.numel() for parameter in self.parameters]
-        for parameter, value in zip(self.parameters, values.split(sizes), strict=True):
-            value = value.view(parameter.value.shape).clamp(parameter.low, parameter.high)
-            parameter.value = value.requires_grad_()
+    def hold(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The `values` of its parameters without what lies in the directions."""
+        vector = self._join(values)
+        vector = vector - self.directions @ (self.directions.T @ (vector - self.start))
+        vector = vector.exp() if self.is_relative else vector
+        chunks = vector.split([p.value.numel() for p in self.parameters])
+        return {
+            p.name: chunk.view(p.value.shape).clamp(p.low, p.high)
+            for p, chunk in zip(self.parameters, chunks, strict=True)
+        }
 
-    def _values(self) -> Tensor:
-        values = torch.cat([parameter.value.detach().flatten() for parameter in self.parameters])
-        return values.log() if self.is_relative else values
+    def directions_in(self, places: Mapping[Parameter, Tensor], size: int) -> Tensor:
+        """The slopes [size, k] of what is held by all numbers, which stand at `places`."""
+        slopes = self.directions.double().cpu()
+        if self.is_relative:
+            values = [p.value.detach().flatten() for p in self.parameters]
+            slopes = slopes / torch.cat(values).double().cpu()[:, None]
+        directions = torch.zeros(size, slopes.shape[1]).double()
+        directions[torch.cat([places[p] for p in self.parameters])] = slopes
+        return directions
+
+    def _join(self, values: Mapping[str, Tensor]) -> Tensor:
+        vector = torch.cat([values[p.name].flatten() for p in self.parameters])
+        return vector.log() if self.is_relative else vector
 
 
 def find_gauges(train: Scene, parameters: Sequence[Parameter]) -> list[Gauge]:

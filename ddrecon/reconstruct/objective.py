@@ -32,16 +32,13 @@ def target_of(view: View) -> Tensor:
 class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
-    With `has_similarity` by SSIM as well. `pictures` are this rank's images so far, by name, and
-    `metrics` their losses, PSNRs and SSIMs in that order, by kind.
+    `pictures` are this rank's images so far, by name, and `metrics` their losses and PSNRs in that
+    order, by kind.
     """
 
-    def __init__(
-        self, views: Sequence[View], targets: Mapping[str, Target], has_similarity: bool = False
-    ):
+    def __init__(self, views: Sequence[View], targets: Mapping[str, Target]):
         self.views, self.targets = views, targets
-        kinds = ["loss", "psnr", *(["ssim"] if has_similarity else [])]
-        self.metrics: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
+        self.metrics: dict[str, list[Tensor]] = {"loss": [], "psnr": []}
         self.pictures: dict[str, Tensor] = {}
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
@@ -60,8 +57,11 @@ class Comparison:
         self.pictures[view.name] = image
         self.metrics["loss"].append(loss)
         self.metrics["psnr"].append(target.psnr_of(image) if psnr is None else psnr)
-        if "ssim" in self.metrics:
-            self.metrics["ssim"].append(target.ssim_of(image))
+
+    def similarity(self) -> float:
+        """The mean SSIM of all views."""
+        values = [self.targets[name].ssim_of(image) for name, image in self.pictures.items()]
+        return sum_numbers([float(sum(values))])[0] / len(self.views)
 
     def forget(self) -> None:
         """Forgets all images."""
@@ -83,44 +83,25 @@ class Comparison:
     def read(
         self,
         objective: Differentiated,
-        loss: Tensor,
-        gradients: Mapping[str, Tensor],
+        penalty: Tensor,
         parameters: Sequence[Parameter],
-    ) -> tuple[float, float, float, float | None]:
-        """The `loss` of an iteration, its part of the images, their mean PSNR [dB], and SSIM.
+    ) -> tuple[float, float, float]:
+        """The loss of images of an iteration, its `penalty`, and the images' mean PSNR [dB].
 
-        SSIM is None where it was not computed. All are read at once, with the extremes of
-        `gradients`. Raises NotFiniteError where a loss, or a derivative by one of the `parameters`,
-        is not finite.
+        All are read at once, with the extremes of the derivatives. Raises NotFiniteError where a
+        loss, or a derivative by one of the `parameters`, is not finite.
         """
+        gradients = objective.gradients
         extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-        groups = [[loss, objective.loss], extremes, *self.metrics.values()]
+        groups = [[objective.loss, penalty], extremes, *self.metrics.values()]
         flat = iter(torch.stack([number for group in groups for number in group]).tolist())
-        (total, of_images), ends, *rows = (list(islice(flat, len(group))) for group in groups)
-        if not all(map(math.isfinite, [total, *ends])):
+        (of_images, prior), ends, *rows = (list(islice(flat, len(group))) for group in groups)
+        if not all(map(math.isfinite, [of_images, prior, *ends])):
             self.require_finite()
             require_finite(parameters, gradients)
             raise NotFiniteError("the loss is not finite")
-        sums = sum_numbers([sum(row) for row in rows[1:]])
-        psnr, *ssim = (metric / len(self.views) for metric in sums)
-        return total, of_images, psnr, ssim[0] if ssim else None
-
-
-def add_penalties(
-    objective: Differentiated, parameters: Sequence[Parameter], power: float
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of `objective` and its gradients by name, with the penalties of `parameters` added.
-
-    `power` [radiance squared] is the mean square of the targets, the unit of penalties: brighter
-    light or a wider frame change nothing.
-    """
-    loss, gradients = objective.loss, dict(objective.gradients)
-    for parameter in parameters:
-        if parameter.tv:
-            penalty = parameter.penalty(power)
-            loss = loss + penalty.detach()
-            gradients[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]
-    return loss, gradients
+        (psnr,) = sum_numbers([sum(row) for row in rows[1:]])
+        return of_images, prior, psnr / len(self.views)
 
 
 def render_quality(

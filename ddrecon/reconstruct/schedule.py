@@ -1,124 +1,105 @@
-"""How far along a run is, what it looks at, and when it ends.
+"""When a run refines, when all numbers join in, and when it ends.
 
-That is after a number of iterations, or when more of them bring nothing.
-
-A run with `iterations: auto` has parts: a part for each resolution, and a last one at the lowest
-learning rates. A part ends when the loss has come to rest, or when its share of `PLANNED`
-iterations is used up; the last part only at rest, or after `MOST_ITERATIONS` iterations in all.
+A run has stages. Each lasts until what the loss can still fall by, as the search's metric has it,
+is a small part of the loss. A run of a fixed number of iterations leaves for later stages at least
+half of what is left.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-import torch
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.levels import stage_of
-from ddrecon.settings import AUTO, OptimizeSettings
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.search import Search
+from ddrecon.scene import Scene
+from ddrecon.settings import AUTO, Iterations
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a run: at one `level` of resolution; the parameters called `waiting` rest in it."""
+
+    level: int
+    waiting: frozenset[str] = frozenset()
 
 
 @dataclass
 class Progress:
-    """What a schedule remembers: `skipped` iterations of the plan, and `recent` losses of a part.
+    """What a schedule remembers: its `stage`, the iteration that it `began` with, if it is over.
 
-    And whether the last part has come to rest.
+    `rested` is the loss of images where the search came to rest last, with a heavier prior.
     """
 
-    skipped: int = 0
-    recent: list[float] = field(default_factory=list)
+    stage: int = 0
+    began: int = 0
     is_at_rest: bool = False
+    rested: float = math.inf
+
+
+def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> list[Stage]:
+    """The stages of a run that seeks `parameters` of `scene` through `levels`, coarse to fine.
+
+    Fields that begin with a structure keep it: they are never coarsened. While fields begin empty,
+    numbers wait: pictures of nothing say nothing of them. So does what glows among what is lit:
+    what is lit could as well glow.
+    """
+    fields = [p for p in parameters if p.is_field]
+    has_structure = any(bool((p.start != p.start.flatten()[0]).any()) for p in fields)
+    stages = [Stage(level) for level in range(levels - 1 if has_structure else 0, levels)]
+    lit = [p for p in fields if not (scene.lights and p.key == "emission" and len(fields) > 1)]
+    waiting = frozenset(p.name for p in parameters if p not in lit)
+    is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
+    return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages
 
 
 class Schedule:
-    """When a run of `settings` refines, slows down and ends, that is trained on `count` views."""
+    """When a run of `iterations` (or `auto`) through `stages` goes on and ends."""
 
-    def __init__(self, settings: OptimizeSettings, count: int):
-        self.is_auto = settings.iterations == AUTO
-        self.planned = tuning.PLANNED if self.is_auto else int(settings.iterations)
-        begun = round(settings.begin_at * self.planned)
-        self.most = tuning.MOST_ITERATIONS if self.is_auto else max(self.planned - begun, 1)
-        self.refine_at, self.final_rate = settings.refine_at, settings.final_rate
-        # As nearly whole passes as can be, so that a window hardly tells one view from another.
-        drawn = min(settings.views_per_iteration or count, count)
-        windows = range(tuning.WINDOW, tuning.WINDOW + count // drawn + 1)
-        self.window = min(windows, key=lambda window: window * drawn % count)
-        self.progress = Progress(begun)
+    def __init__(self, iterations: Iterations, stages: Sequence[Stage]):
+        self.is_auto, self.stages = iterations == AUTO, stages
+        self.most = tuning.MOST_ITERATIONS if iterations == AUTO else int(iterations)
+        self.progress = Progress()
+
+    @property
+    def stage(self) -> Stage:
+        """The stage that the run is in."""
+        return self.stages[self.progress.stage]
 
     def is_over(self, iteration: int) -> bool:
         """Whether a run ends that has made `iteration` iterations."""
-        return iteration >= self.most or (self.is_auto and self.progress.is_at_rest)
+        return self.progress.is_at_rest or iteration >= self.most
 
-    def place(self, iteration: int) -> int:
-        """Where in the plan a run is after `iteration` iterations."""
-        return iteration + self.progress.skipped
+    def note(self, iteration: int, search: Search, noise_loss: float) -> None:
+        """Takes in how `search` stands after `iteration` iterations; may end its stage.
 
-    def stage(self, iteration: int) -> int:
-        """The stage of resolution of `iteration`, counted from 0."""
-        return stage_of(self.place(iteration), self.planned, self.refine_at)
-
-    def rate(self, iteration: int, release: float) -> float:
-        """The part of their value that learning rates have in `iteration`, in [0, 1].
-
-        It is for parameters that begin to move after the part `release` of the run.
+        The smoothest volume is sought that explains the pictures (Morozov): the prior is halved
+        until the loss of images is the `noise_loss`, or hardly falls by that.
         """
-        begin = round(release * self.planned)
-        return rate_at(self.place(iteration), self.planned, begin, self.final_rate)
-
-    def note(self, iteration: int, loss: float) -> None:
-        """Takes in the `loss` of `iteration`, counted from 0; may end its stage."""
-        if not self.is_auto:
+        progress, is_last = self.progress, self.progress.stage == len(self.stages) - 1
+        share = (self.most - progress.began) // 2
+        is_short = not is_last and iteration - progress.began >= max(share, 1)
+        if not (search.is_stuck or search.gain < tuning.REST or is_short):
             return
-        progress, count, size = self.progress, iteration + 1, self.window
-        ends = *self.refine_at, 1.0
-        stage = stage_of(self.place(iteration), self.planned, ends)
-        progress.recent = [*progress.recent, loss][-2 * size :]
-        older, newer = sum(progress.recent[:-size]), sum(progress.recent[-size:])
-        is_due = count % size == 0 and len(progress.recent) == 2 * size
-        if is_due and newer > (1 - tuning.FALL) * older:
-            progress.is_at_rest = stage == len(self.refine_at) + 1
-            if not progress.is_at_rest:
-                progress.skipped += max(round(ends[stage] * self.planned) - self.place(count), 0)
-        # At another resolution, or at rates that fall no more, earlier losses say nothing.
-        if stage_of(self.place(count), self.planned, ends) > stage:
-            progress.recent = []
+        if not is_last:
+            self.progress = Progress(progress.stage + 1, iteration)
+            return
+        loss = search.objective.loss
+        has_fallen = loss < 2**-tuning.ELASTICITY * progress.rested
+        if search.objective.prior and loss > noise_loss and has_fallen:
+            progress.rested = loss
+            search.reweigh(search.weight / 2)
+        else:
+            progress.is_at_rest = True
 
     def ending(self, count: int) -> dict[str, str]:
         """Why a run of `count` iterations ended: the kind, and in words."""
-        if not self.is_auto:
-            kind, text = "iterations", f"{count} iterations were asked for"
-        elif self.progress.is_at_rest:
-            fall = f"it fell by less than {tuning.FALL:.0%} in {self.window} iterations"
-            kind, text = "rest", f"the loss has come to rest: {fall}"
-        else:
-            most = f"{self.most} iterations are the most that auto makes"
-            kind, text = "bound", f"{most}, though the loss fell"
-        return {"kind": kind, "text": f"ended: {text}"}
-
-
-def rate_at(iteration: int, iterations: int, begin: int, final: float) -> float:
-    """The part of their value that learning rates have in an iteration, in (0, 1].
-
-    It is for parameters that move from iteration `begin` on, and 0 before, and falls exponentially
-    to `final`. After the last of `iterations` it falls no more.
-    """
-    if iteration < begin:
-        return 0.0
-    return float(final ** min(1.0, (iteration - begin) / (iterations - begin)))
-
-
-def pick_views(count: int, drawn: int, iteration: int, seed: int) -> list[int]:
-    """The numbers of the views, of `count`, that `iteration` compares.
-
-    They are `drawn` views (0: all). Every view comes once before any comes again, in an order that
-    `seed` decides.
-    """
-    if not 0 < drawn < count:
-        return list(range(count))
-    # Over a run, views are taken from shuffled passes over all of them, one after another.
-    places = range(iteration * drawn, (iteration + 1) * drawn)
-    orders = dict[int, list[int]]()
-    for number in {place // count for place in places}:
-        generator = torch.Generator().manual_seed(seed % 2**32 * 1_000_003 + number)
-        orders[number] = torch.randperm(count, generator=generator).tolist()
-    return [orders[place // count][place % count] for place in places]
+        if self.progress.is_at_rest:
+            text = f"the loss can fall by less than {tuning.REST:.1%} of itself"
+            return {"kind": "rest", "text": f"ended: {text}"}
+        if self.is_auto:
+            text = f"{self.most} iterations are the most that auto makes, though the loss fell"
+            return {"kind": "bound", "text": f"ended: {text}"}
+        return {"kind": "iterations", "text": f"ended: {count} iterations were asked for"}

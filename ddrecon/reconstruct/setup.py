@@ -18,7 +18,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
-from ddrecon.variables.kinds import is_of_volume, kind_of, unit_of
+from ddrecon.variables.kinds import kind_of, unit_of
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 
@@ -28,7 +28,7 @@ class Problem:
 
     The objective is the weighted mean of the image loss of `train`'s views plus, for each
     parameter, its penalty times `power`, the mean square of the targets as the `loss` compares
-    them. `test` has the views that are held out, `factors` how much coarser each stage is.
+    them. `test` has the views that are held out, `factors` how much coarser each level is.
     """
 
     scene: Scene
@@ -58,12 +58,12 @@ class Problem:
         support = find_support(train, settings)
         if support is not None:
             support.on(train.volume.grid)  # or there is nothing to find
-        levels = factors(scene, settings.refine_at)
+        levels = factors(scene)
         return Problem(scene, settings, train, test, loss, noises, power, support, levels)
 
-    def at(self, stage: int) -> Level:
-        """The problem at the resolution of `stage`."""
-        factor = self.factors[stage]
+    def at(self, level: int) -> Level:
+        """The problem at a `level` of resolution, counted from the coarsest."""
+        factor = self.factors[level]
         train, test = (scene_at_level(scene, factor) for scene in (self.train, self.test))
         if self.support is not None:
             cells = self.support.on(train.volume.grid)
@@ -208,18 +208,12 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
         for name in settings.parameters
     }
-    parameters, begun = [], with_values(scene, starts)
-    for name, start in starts.items():
-        chosen = settings.parameters[name]
-        rate, unit = chosen.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
-        parameters.append(Parameter(name, chosen, rate, start, scene.volume.grid, unit))
-    # Lights wait for fields, emission for others that are lit; none for those whose level is moved
-    # with the lights (E10.2).
-    has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
-    for parameter in parameters:
-        other_fields = [field for field in parameters if field.is_field and field is not parameter]
-        if has_levels or not other_fields or (parameter.is_field and not scene.lights):
-            parameter.release = 0.0
-        if not other_fields and settings.parameters[parameter.name].tv is None:
-            parameter.tv *= kind_of(parameter.name).alone
+    started = with_values(scene, starts)
+    parameters = [
+        Parameter(name, settings.parameters[name], start, scene.volume.grid, unit_of(started, name))
+        for name, start in starts.items()
+    ]
+    fields = [parameter for parameter in parameters if parameter.is_field]
+    if len(fields) == 1 and settings.parameters[fields[0].name].tv is None:
+        fields[0].tv *= kind_of(fields[0].name).alone
     return parameters

@@ -8,33 +8,26 @@ from __future__ import annotations
 
 import math
 
-# How fields move: Adam (E10.1). Chosen on the plume, by its density error.
-BETAS = (0.9, 0.99)
-"""How much Adam's moments keep of themselves in a step; the second less than customary, since runs
-are short."""
-FLOOR = 0.3
-"""Added to the size of a cell's derivative, as a part of the root mean square of all.
+# How the search goes on (E10.1).
+PAIRS = 12
+"""Moves and changes of the derivative that stand for the second derivative, at most."""
+SUFFICIENT = 1e-4
+"""The least part of what the derivative promises that a step must bring (Armijo)."""
+SHORTEST = 1e-3
+"""A step is not shortened below this part of itself: then the metric is at fault."""
+PROBES = 1
+"""Random pictures by which the metric of fields is taken; neighbors share what they tell."""
+FLOOR = 0.01
+"""The least entry of that metric, as a part of the root mean square of all: what no picture shows
+does not move far."""
+GAINS, REST = 3, 0.004
+"""A level ends where the last few steps could still gain less than this part of the loss."""
 
-So noise moves cells of which pictures say little less far than others.
-"""
-STIFFNESS = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
-"""The part of smoothing's stiffness that is added as well. Derived, not chosen: half of it
-is where steps neither swell nor fade, in a field that smoothing alone moves."""
-WARM_UP = 5
-"""Iterations at a resolution over which rates rise to their value: Adam's first steps are all of
-full size, and would throw away what a coarser grid has found. With 10 the plume is less close."""
+MODEL_ERROR, ELASTICITY = 0.01, 0.3
+"""The part of its value by which a perfect image errs, and the power of the prior's weight with
+which the loss of images falls at least, or else it is not the prior that keeps it."""
 
-# How numbers move: damped Gauss-Newton steps (E10.2). Chosen on the capture at half size, and seen
-# on Fig. 10 and 14.
-DAMPING = 1.0
-"""How much of its own curvature each parameter is damped by: alone, it goes half of the way."""
-LARGEST_STEP = 4.0
-"""No number moves by more than so many times its rate."""
-LEVEL_RATE = 0.05
-"""The rate of a field's level, as a part of it."""
-REFRESH = 16
-"""Iterations after which a picture's curvature is renewed: sooner, early at a resolution. With 4
-results are the same, and take longer."""
+# The metric of numbers (E10.2).
 APART, CLOSE = 0.5, 1e-5
 """Parts of a default rate by which differences of pictures are taken, and the largest tolerance of
 the light in them. Of smaller parts, such as a tenth, what solves leave undone is seen: a sun's
@@ -49,13 +42,11 @@ TRUST = 0.5
 calibration as if each image were known no better."""
 
 # How long a run is, and how exact (`schedule`, `levels`).
-PLANNED, MOST_ITERATIONS = 300, 1000
-"""A run that ends by itself refines and slows down as one of so many iterations, or sooner; and
-makes at most so many."""
-WINDOW, FALL = 20, 0.01
-"""Iterations over which the loss must fall by more than this part of itself, or it is at rest."""
-FEWEST_CELLS, FEWEST_PIXELS = 8, 16
-"""No side of a grid or image longer than these is coarsened below them."""
+MOST_ITERATIONS = 300
+"""A run that ends by itself makes at most so many."""
+FEWEST_CELLS, FEWEST_PIXELS = 16, 16
+"""No side of a grid or image is coarsened below these: a grid of 9 x 6 x 8 cells spread fog that
+views from above did not take away."""
 GRADIENT_ERROR = 0.01
 """The relative error that each of the two solves may make in the gradient."""
 TEST_EVERY = 10

@@ -22,7 +22,7 @@ from ddrecon.io.files.atomic import refusals, replace_file_durably
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
-FORMAT = 8
+FORMAT = 9
 """The version of a checkpoint's contents."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
@@ -120,12 +120,10 @@ def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
 def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     """The resolved scene, the contents of the files it names and the precision.
 
-    Less what a resumed run may change: the number of iterations, and learning rates.
+    Less what a resumed run may change: the number of iterations.
     """
     scene = describe(scene_file)
     scene["optimize"].pop("iterations", None)
-    for settings in scene["optimize"]["parameters"].values():
-        settings.pop("lr", None)
     contents = {f"the content of {path}": _digest(path) for path in referenced_files(scene_file)}
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 

@@ -14,9 +14,8 @@ from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import Folder
 from ddrecon.progress import BAR, bar_settings, say, tell
 from ddrecon.ranks import from_first, is_any, leave_ranks
-from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.loop import Reconstruction, Together
 from ddrecon.reconstruct.support import support_text
-from ddrecon.reconstruct.together import Together
 from ddrecon.run.checkpoint import LAST, fingerprint, load_checkpoint, restore_run
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.run.report import FINER, registered_text
@@ -135,7 +134,7 @@ def drive_run(
 
 
 def advance(
-    run: Reconstruction | Together,
+    run: Together,
     make_iteration: Callable[[], str],
     folder: Checkpoints,
     is_quiet: bool,

@@ -18,9 +18,8 @@ from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.progress import Progress
-from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.loop import Reconstruction, Together
 from ddrecon.reconstruct.support import describe_support
-from ddrecon.reconstruct.together import Together
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import (
     continue_from,
@@ -71,9 +70,11 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
     Raises UsageError where the folder holds no run, FormatError where it is damaged.
     """
     state, loaded = load_checkpoint(require_run(folder))
-    if "parameters" not in state:
+    if "frames" not in state:
         raise UsageError(f"{folder}: holds no run; name the folder that `ddrecon optimize` wrote")
-    run = Reconstruction(build(next(iter(state["parameters"].values()))["value"].dtype))
+    run = Reconstruction(
+        build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
+    )
     restore_run(run, state, loaded)
     return run
 
@@ -96,19 +97,19 @@ class Checkpoints:
         self.checkpoints, self.result_of = path / CHECKPOINTS, result_of
         self.saved, self.next_save = -1, 0.0
 
-    def save(self, run: Reconstruction | Together) -> None:
+    def save(self, run: Together) -> None:
         """Writes a checkpoint, unless the last is of this very iteration."""
         if self.saved != run.iteration:
             start = monotonic()
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self.note_saved(run, monotonic() - start)
 
-    def save_in_time(self, run: Reconstruction | Together) -> None:
+    def save_in_time(self, run: Together) -> None:
         """Writes a checkpoint if the last is old."""
         if monotonic() >= self.next_save:
             self.save(run)
 
-    def note_saved(self, run: Reconstruction | Together, seconds: float) -> None:
+    def note_saved(self, run: Together, seconds: float) -> None:
         """Notes that the last checkpoint is of `run` as it is, and took so many `seconds`."""
         self.saved = run.iteration
         self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
@@ -146,12 +147,12 @@ class RunFolder(Checkpoints):
         self.log.cut(run.iteration)
         self.note_saved(run, 0.0)
 
-    def save(self, run: Reconstruction | Together) -> None:
+    def save(self, run: Together) -> None:
         """Writes a checkpoint after the log, which therefore has all rows that it counts."""
         flush(self.log.path)
         super().save(run)
 
-    def save_in_time(self, run: Reconstruction | Together) -> None:
+    def save_in_time(self, run: Together) -> None:
         """Writes a checkpoint if the last is old, and likewise the report of the run so far."""
         super().save_in_time(run)
         if isinstance(run, Reconstruction) and run.iteration:

@@ -146,9 +146,7 @@ class Kind:
     points matters, and a step keeps its length. `tv`: the default weight of total variation, of
     `is_compressed` kinds that of the logarithm (E11.3); it is `alone` times as much where no other
     field is sought, since it then only suppresses noise. `difference_steps`: those of finite
-    differences. `release`: the share of a run after which the variable begins to move where other
-    fields are optimized: a lamp would learn wrong things while they are empty, and emission, where
-    lights shine, stand for what is lit. Its rate rises over a warm-up by the power `rise`.
+    differences.
     """
 
     rate: Rate
@@ -162,8 +160,6 @@ class Kind:
     alone: float = 1.0
     is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
-    release: float = 0.0
-    rise: float = 1.0
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
@@ -171,7 +167,7 @@ _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
 _LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
-_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, release=0.3)
+_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
     "density": Kind(
@@ -192,10 +188,6 @@ KINDS: Mapping[str, Kind] = {
         tv=3e-3,
         alone=3.0,
         is_compressed=True,
-        # A first step lights all cells, and they shine together: it must not outshine the pictures.
-        rise=3.0,
-        # What is lit could as well glow: density comes first.
-        release=0.1,
     ),
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
@@ -207,7 +199,7 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
     "lights.N.power": _BRIGHTNESS,
-    "lights.N.scale": Kind(brightness_rate, low=0, release=0.3),
+    "lights.N.scale": Kind(brightness_rate, low=0),
     # in degrees
     "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
     # a turn by some 3 degrees

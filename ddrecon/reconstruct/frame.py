@@ -1,0 +1,188 @@
+"""One scene of a reconstruction: its pictures compared, and what the log has of that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.errors import SolveError
+from ddrecon.pictures.noise import estimate_noise
+from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.gradients import Differentiated, solve_tolerances
+from ddrecon.reconstruct.log import NO_ROWS, Row
+from ddrecon.reconstruct.metric import find_diagonals
+from ddrecon.reconstruct.numbers import Point
+from ddrecon.reconstruct.objective import Comparison, render_quality, target_of
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.recording import Replays
+from ddrecon.reconstruct.search import Objective
+from ddrecon.reconstruct.setup import Problem, given_noise, start_parameters
+from ddrecon.scene import Scene
+from ddrecon.settings import Iterations
+from ddrecon.variables.values import with_values
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A frame's `objective`, by names of parameters, and the images that were `compared` for it.
+
+    The objective is relative to the mean square of the targets; `psnr` [dB] is the images' mean.
+    """
+
+    objective: Objective
+    psnr: float
+    compared: Comparison
+
+
+class Frame:
+    """A scene of a run: its `problem`, which stays, its `parameters` and what solves begin from.
+
+    `level` is the problem at the current resolution; `total` are the running totals of the log;
+    `misfit` is sqrt(mean image loss / power of the targets) of the last evaluation.
+    """
+
+    def __init__(self, scene: Scene, iterations: Iterations | None):
+        self.problem = Problem.of(scene, iterations)
+        self.parameters = start_parameters(scene, self.problem.settings)
+        self.memory = SolveMemory(scene.diffusion.warm_start)
+        self.total, self.misfit = NO_ROWS, 1.0
+
+    def enter(self, level: int) -> None:
+        """Takes scenes and parameters to a `level` of resolution, counted from the coarsest."""
+        self.level = self.problem.at(level)
+        volume = self.level.train.volume
+        # These belong to another resolution.
+        self.memory.last, self.memory.iterations = {}, {}
+        self.replays = Replays(self.level.train)
+        for parameter in self.parameters:
+            if parameter.grid != volume.grid:
+                parameter.refine(volume.grid)
+            if volume.support is not None and parameter.name in ("density", "emission"):
+                parameter.restrict(volume.support)
+
+    def evaluate(self) -> Evaluation:
+        """The objective at the values of the parameters.
+
+        Raises SolveError and NotFiniteError.
+        """
+        values = {p.name: p.value for p in self.parameters}
+        compared = Comparison(self.level.train.views, self.level.targets)
+        unit = self.problem.power or 1.0
+        differentiated = self._differentiate(values, compared)
+        penalties = {p.name: p.penalty() for p in self.parameters}
+        priors = {name: pair for name, pair in penalties.items() if pair is not None}
+        penalty = sum((value for value, _ in priors.values()), differentiated.loss.new_zeros(()))
+        of_images, prior, psnr = compared.read(differentiated, penalty, self.parameters)
+        self.misfit = math.sqrt(of_images / unit)
+        relative = {name: bar / unit for name, bar in differentiated.gradients.items()}
+        bars = {name: bar for name, (_, bar) in priors.items()}
+        return Evaluation(Objective(of_images / unit, prior, relative, bars), psnr, compared)
+
+    def noise_loss(self) -> float:
+        """The loss of perfect images: that of the pictures' noise and of the model's own error."""
+        train, settings, total = self.level.train, self.problem.settings, 0.0
+        weights = sum(view.weight for view in train.views)
+        for view in train.views:
+            image, target = target_of(view), self.level.targets[view.name]
+            noise = given_noise(view, settings) or estimate_noise(image, view.step)
+            square = noise.deviation(image) ** 2 + (tuning.MODEL_ERROR * image) ** 2
+            loss = (target.weights_at(image) * square).sum() / 2
+            total += view.weight / weights * float(loss)
+        return total / (self.problem.power or 1.0)
+
+    def find_diagonals(
+        self, parameters: Sequence[Parameter], compared: Comparison
+    ) -> dict[str, Tensor]:
+        """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
+        point = self.point(compared)
+        return find_diagonals(point.scene, parameters, point.values, point.weights, self.memory)
+
+    def point(self, compared: Comparison) -> Point:
+        """Where the parameters stand, with how strongly the pixels `compared` count."""
+        values = {p.name: p.value.detach() for p in self.parameters}
+        views, unit = {view.name: view for view in compared.views}, self.problem.power or 1.0
+        weights = {
+            name: compared.targets[name].weights_at(image) * (compared.share(views[name]) / unit)
+            for name, image in compared.pictures.items()
+        }
+        return Point(self.level.train, values, weights, self.memory.last)
+
+    def add_row(
+        self, evaluation: Evaluation, weight: float, seconds: float, is_test_due: bool
+    ) -> Row:
+        """The log's row of an iteration, which took `seconds`; the prior counts by `weight`."""
+        solves = [(record.kind, record.iterations) for record in self.memory.records]
+        test_psnr, test_ssim, ssim = None, None, None
+        if is_test_due:
+            ssim = evaluation.compared.similarity()
+            if self.level.test.views:
+                test_psnr, test_ssim = render_quality(
+                    self.level.test, self.parameters, self.level.test_targets, self.memory
+                )
+        unit = self.problem.power or 1.0
+        row = Row(
+            iteration=self.total.iteration + 1,
+            seconds=self.total.seconds + seconds,
+            loss=evaluation.objective.total(weight) * unit,
+            data_loss=evaluation.objective.loss * unit,
+            penalty=evaluation.objective.prior * weight * unit,
+            psnr=evaluation.psnr,
+            test_psnr=test_psnr,
+            forward_iterations=sum(count for kind, count in solves if kind == "forward"),
+            adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
+            cells=self.level.train.volume.grid.cells,
+            ssim=ssim,
+            test_ssim=test_ssim,
+        )
+        # Sum: the solvers' iterations, and quality as last known.
+        unchanged = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
+        counts = "forward_iterations", "adjoint_iterations"
+        sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
+        self.total = replace(row, **unchanged, **sums)
+        return row
+
+    def current_scene(self) -> Scene:
+        """The scene at full resolution, with everything as reconstructed so far."""
+        grid = self.problem.scene.volume.grid
+        with torch.no_grad():
+            values = {parameter.name: parameter.value_on(grid) for parameter in self.parameters}
+            return with_values(self.problem.scene, values)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {
+            "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
+            "total": dict(vars(self.total)),
+            "solutions": dict(self.memory.last),
+            "misfit": self.misfit,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes up the parameters and the log of `state`."""
+        for parameter in self.parameters:
+            parameter.restore(state["parameters"][parameter.name])
+        self.total, self.misfit = Row(**state["total"]), state["misfit"]
+
+    def restore_solutions(self, state: Mapping[str, Any]) -> None:
+        """Takes up what solves begin from, at the resolution of `state`."""
+        for kind, solution in state["solutions"].items():
+            self.memory.last[kind] = solution.to(self.problem.scene.volume.density)
+
+    def _differentiate(self, values: Mapping[str, Tensor], compared: Comparison) -> Differentiated:
+        """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
+        self.memory.records.clear()
+        self.memory.tolerance_floor = solve_tolerances(self.misfit)
+        try:
+            return self.replays.differentiate(values, compared, self.memory)
+        except SolveError:
+            # The adjoint cannot be solved for a loss that is not finite.
+            compared.require_finite()
+            raise
+        finally:
+            self.memory.tolerance_floor = {}

@@ -1,0 +1,58 @@
+"""The metric of the search: how the objective bends, as far as that is cheap to know (E10.1).
+
+Of a field or map it is the diagonal of the Gauss-Newton matrix J^T W J of all pictures, found by
+random signs (Hutchinson; Bekas, Kokiopoulou and Saad 2007, doi:10.1016/j.apnum.2007.01.003), plus
+that of its total variation. Of single numbers it is the whole matrix between them (E10.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, avg_pool3d
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.scene import Scene, View
+
+
+def find_diagonals(
+    scene: Scene,
+    parameters: Sequence[Parameter],
+    values: Mapping[str, Tensor],
+    weights: Mapping[str, Tensor],
+    memory: SolveMemory,
+) -> dict[str, Tensor]:
+    """The diagonal of J^T W J by the `parameters` that are fields or maps, by name.
+
+    `weights` [3, h, w] are W of the views that this rank renders, by name. Neighbors share what
+    one of them is told. Where pictures say next to nothing the diagonal is held above a part of its
+    root mean square.
+    """
+    names = [view.name for view in scene.views]
+    generators = {n: torch.Generator().manual_seed(at) for at, n in enumerate(names)}
+
+    def along(view: View, image: Tensor) -> Tensor:
+        signs = torch.randint(0, 2, image.shape, generator=generators[view.name]) * 2 - 1
+        return (image * weights[view.name].sqrt() * signs.to(image)).sum()
+
+    squares = {p.name: torch.zeros_like(values[p.name]) for p in parameters}
+    for _ in range(tuning.PROBES):
+        leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+        gradients = differentiate(scene, names, leaves, along, memory).gradients
+        for name, total in squares.items():
+            total.add_(gradients[name].square(), alpha=1 / tuning.PROBES)
+    return {p.name: _smooth(squares[p.name], 3 if p.is_field else 2) for p in parameters}
+
+
+def _smooth(squares: Tensor, count: int) -> Tensor:
+    """`squares` averaged over neighbors along the last `count` axes, and not too small."""
+    pool = avg_pool3d if count == 3 else avg_pool2d
+    colors = squares.reshape(1, -1, *squares.shape[-count:])
+    mean = pool(colors, 3, 1, 1, count_include_pad=False).view_as(squares)
+    least = tuning.FLOOR * mean.double().square().mean().sqrt()
+    return mean.clamp(min=float(least) + torch.finfo(mean.dtype).tiny)

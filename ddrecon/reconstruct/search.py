@@ -1,0 +1,213 @@
+"""The search for a minimum within bounds: L-BFGS in the metric of a preconditioner (E10.1).
+
+Nocedal and Wright 2006, doi:10.1007/978-0-387-40065-5, section 7.2. Entries that stand at a bound
+and that the derivative drives beyond it stay there; the others move by the metric, and are brought
+back within their bounds (Bertsekas 1982, doi:10.1137/0320018). A candidate is one evaluation of the
+objective. It is accepted where the objective falls by a part of what its derivative promises,
+else the step is shortened.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.reconstruct import tuning
+
+Values = dict[str, Tensor]
+"""Tensors by the name of their parameter."""
+
+
+@dataclass(frozen=True)
+class Space:
+    """Where the search goes: what it asks about values by name.
+
+    `project` brings values back within bounds, `free` is 1 where an entry may move at values and
+    their derivative, and `precondition` is the inverse metric there, of what is free.
+    """
+
+    project: Callable[[Values], Values]
+    free: Callable[[Values, Values], Values]
+    precondition: Callable[[Values, Values, Values], Values]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The `loss` and the `prior` at some values, and their derivatives by name."""
+
+    loss: float
+    prior: float
+    gradients: Values
+    prior_gradients: Values
+
+    def total(self, weight: float) -> float:
+        """Both, the prior by its `weight`."""
+        return self.loss + weight * self.prior
+
+    def slopes(self, weight: float) -> Values:
+        """The derivatives of the total."""
+        return _combine(self.gradients, self.prior_gradients, weight)
+
+
+@dataclass
+class Search:
+    """The state of a search in `space`: plain numbers and tensors, which checkpoints keep.
+
+    `values` are the last candidate accepted, none at first, and `objective` what was found there.
+    The prior counts by `weight`. `pairs` are the last accepted moves and the changes of both
+    derivatives. The next candidate is `step`
+    times `direction` away, along which the loss falls by `slope`; `is_stuck` where no step helps.
+    `scale` is how long the metric is, as the last pair had it; 0 is not known. `gains` are what the
+    loss could still fall by, as part of it, at the last values.
+    """
+
+    space: Space
+    values: Values = field(default_factory=dict)
+    objective: Objective = Objective(math.inf, 0.0, {}, {})
+    weight: float = 1.0
+    pairs: list[tuple[Values, Values, Values]] = field(default_factory=list)
+    direction: Values = field(default_factory=dict)
+    slope: float = 0.0
+    step: float = 1.0
+    scale: float = 0.0
+    gains: list[float] = field(default_factory=list)
+    is_stuck: bool = False
+
+    @property
+    def gain(self) -> float:
+        """What the loss can still fall by, as the metric has it, as part of the loss.
+
+        It is the most of the last few values; nothing is known of it before.
+        """
+        return max(self.gains) if len(self.gains) == tuning.GAINS else math.inf
+
+    def candidate(self) -> Values:
+        """The next values to evaluate the objective at."""
+        moved = {
+            n: torch.add(v, self.direction[n], alpha=self.step) for n, v in self.values.items()
+        }
+        return self.space.project(moved)
+
+    @property
+    def loss(self) -> float:
+        """The objective at the values accepted last."""
+        return self.objective.total(self.weight)
+
+    def judge(self, values: Values, objective: Objective) -> bool:
+        """Takes in the `objective` at the candidate `values`; returns whether it is accepted.
+
+        A loss that is not finite is as if it were too large.
+        """
+        if self.values:
+            move = {name: value - self.values[name] for name, value in values.items()}
+            promise = float(_dot(move, self.objective.slopes(self.weight)))
+            loss = objective.total(self.weight)
+            if not loss <= self.loss + tuning.SUFFICIENT * promise:
+                self._shorten(loss, promise)
+                return False
+            old = self.objective
+            changes = (
+                _combine(objective.gradients, old.gradients, -1),
+                _combine(objective.prior_gradients, old.prior_gradients, -1),
+            )
+            self.pairs = [*self.pairs, (move, *changes)][-tuning.PAIRS :]
+        self.values, self.objective = values, objective
+        self.aim()
+        return True
+
+    def reweigh(self, weight: float) -> None:
+        """Has the prior count by `weight` from now on."""
+        self.weight, self.gains = weight, []
+        self.aim()
+
+    def aim(self) -> None:
+        """Sets out anew from the values accepted last."""
+        gradients = self.objective.slopes(self.weight)
+        self.direction = self._find_direction(gradients, self.space.free(self.values, gradients))
+        self.slope = min(float(_dot(self.direction, gradients)), 0.0)
+        self.is_stuck = self.slope == 0
+        # A loss of squares is never below 0, so the first step need not promise more than that.
+        self.step = 1.0 if self.scale or self.is_stuck else min(1.0, self.loss / -self.slope)
+        if self.pairs and self.loss > 0:
+            self.gains = [*self.gains, -self.slope / 2 / self.loss][-tuning.GAINS :]
+
+    def _shorten(self, loss: float, promise: float) -> None:
+        """Shortens the step to where the parabola through what is known is lowest."""
+        excess = loss - self.loss - promise
+        factor = -promise / (2 * excess) if excess > 0 and math.isfinite(excess) else 0.5
+        self.step *= min(max(factor, 0.1), 0.5)
+        if self.step < tuning.SHORTEST:
+            self.is_stuck = not self.pairs
+            self.pairs = []
+            if not self.is_stuck:
+                self.aim()
+
+    def _find_direction(self, gradients: Values, free: Values) -> Values:
+        """Minus the inverse Hessian, as pairs have it, times the `gradients` of what is free."""
+        residual = {name: bar * free[name] for name, bar in gradients.items()}
+        pairs = list[tuple[Values, Values, Tensor]]()
+        for move, of_loss, of_prior in self.pairs:
+            change = _combine(of_loss, of_prior, self.weight)
+            change = {name: bar * free[name] for name, bar in change.items()}
+            curvature = _dot(move, change)
+            pairs.append((move, change, torch.where(curvature > 0, 1 / curvature, 0.0)))
+        weights = list[Tensor]()
+        for move, change, inverse in reversed(pairs):
+            weights.append(inverse * _dot(move, residual))
+            residual = _add(residual, change, -weights[-1], free)
+        result = self.space.precondition(self.values, residual, free)
+        if pairs:
+            # The metric knows directions; how long it is, the last move tells.
+            move, change, _ = pairs[-1]
+            length = _dot(change, self.space.precondition(self.values, change, free))
+            ratio = float(_dot(move, change) / length)
+            self.scale = ratio if 0 < ratio < math.inf else self.scale
+        if self.scale:
+            result = {name: value * self.scale for name, value in result.items()}
+        for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
+            result = _add(result, move, weight - inverse * _dot(change, result), free)
+        return {name: -value for name, value in result.items()}
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        state = {name: value for name, value in vars(self).items() if name != "space"}
+        return state | {"objective": dict(vars(self.objective))}
+
+    def restore(self, state: Mapping[str, Any], like: Mapping[str, Tensor]) -> None:
+        """Takes up a `state`, on the device and in the precision of tensors `like` its values."""
+
+        def put(entry: Any) -> Any:
+            if isinstance(entry, dict):
+                return {name: put(value) for name, value in entry.items()}
+            if isinstance(entry, list | tuple):
+                return type(entry)(put(part) for part in entry)
+            return entry.to(first) if isinstance(entry, Tensor) else entry
+
+        first = next(iter(like.values()))
+        for name, entry in state.items():
+            setattr(self, name, put(entry))
+        self.objective = Objective(**put(state["objective"]))
+
+
+def _dot(first: Values, second: Values) -> Tensor:
+    """The sum of products of entries, in float64."""
+    products = [(bar * second[name]).sum(dtype=torch.float64) for name, bar in first.items()]
+    return torch.stack(products).sum()
+
+
+def _combine(first: Values, second: Values, weight: float) -> Values:
+    """The sum of `first` and `weight` times `second`, in which what is missing is 0."""
+    return {
+        name: torch.add(bar, second[name], alpha=weight) if name in second else bar
+        for name, bar in first.items()
+    }
+
+
+def _add(total: Values, addend: Values, weight: Tensor, free: Values) -> Values:
+    """The sum of `total` and `weight` times `addend`, of what is `free`."""
+    return {n: v + weight.to(v) * addend[n] * free[n] for n, v in total.items()}
