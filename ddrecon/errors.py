@@ -171,5 +171,10 @@ class Problems:
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them."""
+    return nearest(name, known) or f"; known: {', '.join(known)}"
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """`; did you mean 'x'?` with the nearest of the `known` names, empty where none is near."""
     near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST_NAME else []
-    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+    return f"; did you mean {near[0]!r}?" if near else ""
