@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -31,13 +31,15 @@ type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 class Limits(TypedDict, total=False):
     """Limits of each number of a field; `minimum` and `maximum` are legal, the others are not.
 
-    The manual has `expert` fields on a page of their own: no scene needs these.
+    Of a vector that `is_nonzero` one entry is not 0. The manual has `expert` fields on a page of
+    their own: no scene needs these.
     """
 
     minimum: float
     above: float
     maximum: float
     below: float
+    is_nonzero: bool
     expert: bool
 
 
@@ -49,6 +51,11 @@ def bounded(default: Any = MISSING, **limits: Unpack[Limits]) -> Any:
 def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
     """One of `choices`, `default` where the scene gives none."""
     return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
+
+
+def is_required(key: Field[Any]) -> bool:
+    """Whether `key` has no default."""
+    return key.default is key.default_factory is MISSING
 
 
 @cache

@@ -34,7 +34,7 @@ from ddrecon.scene_file.load import (
     read_scene,
     referenced_files,
 )
-from ddrecon.scene_file.schema import FramesSection
+from ddrecon.scene_file.view_schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
 FEWER = 6

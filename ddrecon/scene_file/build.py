@@ -40,11 +40,11 @@ from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, requ
 from ddrecon.scene_file.schema import (
     AmbientSection,
     BeamSection,
-    Color,
     DirectionalSection,
     LightSection,
     PointSection,
 )
+from ddrecon.scene_file.view_schema import Color
 from ddrecon.settings import DiffusionSettings, FieldFile, OptimizeSettings, ParameterSettings
 from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of

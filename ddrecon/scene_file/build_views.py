@@ -27,7 +27,7 @@ from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
+from ddrecon.scene_file.view_schema import CameraSection, Color, PerspectiveSection
 
 READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "image": read_image,

@@ -10,7 +10,7 @@ from ddrecon.errors import Problems
 from ddrecon.io.images.films import FILMS, frame_times, nearest_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.schema import FRAME, ViewSection
+from ddrecon.scene_file.view_schema import FRAME, ViewSection
 
 
 def at_frame(scene_file: SceneFile, number: int) -> SceneFile:

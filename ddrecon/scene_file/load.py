@@ -20,8 +20,9 @@ from ddrecon.io.files.reading import require_stored
 from ddrecon.records import Violation
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
 from ddrecon.scene_file.read import Rule, read_record
-from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
+from ddrecon.scene_file.schema import SceneTree
 from ddrecon.scene_file.transforms import node_of
+from ddrecon.scene_file.view_schema import ViewSection, ViewSource
 from ddrecon.scene_file.view_sources import name_listed, views_of
 from ddrecon.settings import AUTO, ParameterSettings
 from ddrecon.variables.kinds import (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -16,7 +16,7 @@ from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from ddrecon.errors import Problems, nearest, suggestion
-from ddrecon.records import WORDS, alternatives, find_excess, type_hints
+from ddrecon.records import WORDS, alternatives, find_excess, is_required, type_hints
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.settings import FieldFile
 
@@ -159,6 +159,8 @@ def _read_list(node: Node, rule: Rule) -> Any:
         is_open = arguments[-1] is Ellipsis and (entries or may_be_empty)
         if is_open or len(entries) == len(arguments):
             values = read_each(entries, rule._replace(hint=arguments[0]))
+            if rule.limits.get("is_nonzero") and not any(values):
+                raise node.refused("must not be zero")
             return _finish(node, (tuple, arguments[0]), values, rule)
     raise _refused(node, rule)
 
@@ -196,10 +198,17 @@ def _finish(node: Node, kind: Any, value: Any, rule: Rule) -> Any:
 
 
 def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
-    """That of `kinds` which the mapping `node` is, by its `type` or the first key of the record."""
+    """That of `kinds` which the mapping `node` is, by its `type` or first required key."""
     entries = node.entries()
     if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
-        return next((kind for kind in kinds if fields(kind)[0].name in entries), kinds[0])
+        return next(
+            (
+                kind
+                for kind in kinds
+                if any(is_required(key) and key.name in entries for key in fields(kind))
+            ),
+            kinds[0],
+        )
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}
@@ -244,11 +253,7 @@ def _absences(
     given = {name for name, entry in entries.items() if entry.value is not None}
     needed = [[name for name in group if declared[name].default is None] for group in groups]
     chosen = [names for group, names in zip(groups, needed, strict=True) if given & set(group)]
-    absent = [
-        name
-        for name, field in declared.items()
-        if field.default is field.default_factory is MISSING and name not in entries
-    ]
+    absent = [name for name, key in declared.items() if is_required(key) and name not in entries]
     if len(chosen) == 1:
         absent += [name for name in chosen[0] if name not in given]
     wrong = [f"missing key {name!r}" for name in absent]

@@ -24,7 +24,7 @@ from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.read import read_as
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,
     Matrix,

@@ -21,7 +21,8 @@ from ddrecon.grid import Triple
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.read import path_in
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera, read_transforms
+from ddrecon.scene_file.view_schema import (
     FRAME,
     PerspectiveSection,
     RingSection,
@@ -29,7 +30,6 @@ from ddrecon.scene_file.schema import (
     ViewSource,
     split_views,
 )
-from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera, read_transforms
 
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
