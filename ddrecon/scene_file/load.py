@@ -331,7 +331,10 @@ def _plain(value: Any) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that would be read as something else; PyYAML itself goes by YAML 1.1."""
+    """Quotes text that would be read as something else, as PyYAML goes by YAML 1.1; no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
 _Dumper.add_representer(
