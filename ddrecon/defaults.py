@@ -163,13 +163,13 @@ def _varies(field: Tensor, axis: int) -> bool:
 
 def _is_flat(media: Iterable[Volume]) -> bool:
     """Whether `media`, all together, go up to a face of the box."""
-    faces, whole = np.zeros(6), 0.0
+    faces, mean = np.zeros(6), 0.0
     for medium in media:
         size = float(medium.sigma_a.mean() + medium.sigma_s.mean())
         ends = (medium.density.select(axis, end) for axis in range(3) for end in (0, -1))
         faces += [size * float(face.mean()) for face in ends]
-        whole += size * float(medium.density.mean())
-    return bool(faces.max() > FLAT * whole)
+        mean += size * float(medium.density.mean())
+    return bool(faces.max() > FLAT * mean)
 
 
 def count_colors(volume: Volume, media: Iterable[Volume]) -> int:

@@ -191,10 +191,10 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
     unit = _explain_unit(cameras, grid)
     if all(_looks_at(camera, grid) for camera in blind):
         return f"it is in the picture, but smaller than a pixel: {unit or SAME_UNIT}"
-    for what, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
+    for convention, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
         turned = [replace(camera, pose=convert(camera.pose)) for camera in cameras]
         if all(_looks_at(camera, grid) for camera in turned):
-            return f"it would with matrices read otherwise; they seem to be {what}"
+            return f"it would with matrices read otherwise; they seem to be {convention}"
     if unit:
         return unit
     pose = blind[0].pose.double()

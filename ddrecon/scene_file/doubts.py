@@ -67,7 +67,7 @@ def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings
     finer = volume.grid.refine(settings.times, settings.refine_along)
     lost = medium.extinction.value
     lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
-    thickest, whole = (
+    thickest, depth = (
         max(
             float(field.select(axis - 3, end).max()) * size
             for axis, size in enumerate(finer.spacing)
@@ -82,7 +82,7 @@ def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings
     if g >= FORWARD:
         advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
     return [
-        f"volume: cells at the faces of the box are up to {whole:.3g} optical depths thick; images "
+        f"volume: cells at the faces of the box are up to {depth:.3g} optical depths thick; images "
         f"may be off by a fifth and more: {advice}"
     ]
 
@@ -100,9 +100,9 @@ def _doubt_cameras(scene: Scene) -> list[str]:
         if camera.is_perspective and bool(((low < place) & (place < high)).all()):
             doubted.setdefault("within the box, not outside of it:", []).append(view.name)
     return [
-        f"views: {what} camera {names[0]}"
+        f"views: {fault} camera {names[0]}"
         f"{f' and {len(names) - 1} more' if len(names) > 1 else ''}; {UNITS}"
-        for what, names in doubted.items()
+        for fault, names in doubted.items()
     ]
 
 
@@ -111,9 +111,10 @@ def _doubt_ground(scene: Scene) -> list[str]:
     if scene.ground is None:
         return []
     plane, up = scene.ground.plane, 2 - scene.ground.plane.axis
-    tilted = [view.name for view in scene.views if abs(float(view.camera.pose[up, 0])) > UPRIGHT]
     tilted = [
-        f"ground: volume.up is {'xyz'[up]}, and camera {it} lies on its side" for it in tilted
+        f"ground: volume.up is {'xyz'[up]}, and camera {view.name} lies on its side"
+        for view in scene.views
+        if abs(float(view.camera.pose[up, 0])) > UPRIGHT
     ]
     return tilted[:1] + [
         f"lights.{index}: shines from below the ground at {plane.height:g}, and is not seen"

@@ -1,7 +1,7 @@
 """Reading values by their types: records from mappings, tuples from lists, numbers and text.
 
 A type may have alternatives: the kind of a YAML node, a mapping, list, text or number, tells which
-of them it is. Records are told apart by their `type`, others by their first key.
+of them it is. Records are told apart by their `type`, others by their first required key.
 """
 
 from __future__ import annotations
@@ -187,9 +187,9 @@ def _read_mapping(node: Node, rule: Rule) -> Any:
         return _finish(node, kind, read_record(node, kind, rule), rule)
     for kind in kinds:
         if get_origin(kind) is Mapping:
-            each = get_args(kind)[1]
-            values = read_each(node.children(), rule._replace(hint=each))
-            return _finish(node, (Mapping, each), dict(zip(entries, values, strict=True)), rule)
+            hint = get_args(kind)[1]
+            values = read_each(node.children(), rule._replace(hint=hint))
+            return _finish(node, (Mapping, hint), dict(zip(entries, values, strict=True)), rule)
     raise _refused(node, rule)
 
 
@@ -221,8 +221,8 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
     declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
     problems, values = Problems(), {}
-    for what in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
-        problems.note(node.refused(what))
+    for fault in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
+        problems.note(node.refused(fault))
     for name, child in entries.items():
         with problems.collecting():
             if name not in known:
@@ -235,8 +235,8 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
             break
     problems.raise_any()
     record = kind(**values)
-    for name, what in getattr(record, "violations", tuple)():
-        problems.note(entries.get(name, node).refused(what))
+    for name, fault in getattr(record, "violations", tuple)():
+        problems.note(entries.get(name, node).refused(fault))
     problems.raise_any()
     return record
 
@@ -246,18 +246,18 @@ def _absences(
     groups: Sequence[tuple[str, ...]],
     entries: Mapping[str, Node],
 ) -> list[str]:
-    """What is wrong with the set of keys given: required ones and one of the alternative `groups`.
+    """What is wrong with the set of keys: required ones and one of the alternative `groups`.
 
     Of a group, what has no default is required with it.
     """
-    given = {name for name, entry in entries.items() if entry.value is not None}
+    present = {name for name, entry in entries.items() if entry.value is not None}
     needed = [[name for name in group if declared[name].default is None] for group in groups]
-    chosen = [names for group, names in zip(groups, needed, strict=True) if given & set(group)]
+    chosen = [names for group, names in zip(groups, needed, strict=True) if present & set(group)]
     absent = [name for name, key in declared.items() if is_required(key) and name not in entries]
     if len(chosen) == 1:
-        absent += [name for name in chosen[0] if name not in given]
-    wrong = [f"missing key {name!r}" for name in absent]
+        absent += [name for name in chosen[0] if name not in present]
+    faults = [f"missing key {name!r}" for name in absent]
     if groups and len(chosen) != 1:
         words = " or ".join(" and ".join(names) for names in needed)
-        wrong.append(f"{'give only one of' if chosen else 'missing'} {words}")
-    return wrong
+        faults.append(f"{'give only one of' if chosen else 'missing'} {words}")
+    return faults

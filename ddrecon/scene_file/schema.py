@@ -391,9 +391,8 @@ class SceneTree:
         """Whether the variable `name` is optimized, or follows from others that are."""
         medium, last = split_name(name)
         names = {name, medium + last.removeprefix(PHASE)}
-        others = [pair for pair in PAIRS if last not in pair]
-        if len(others) == 1:
-            names |= {medium + other for other in others[0]}
+        for pair, equivalent in (PAIRS, PAIRS[::-1]):
+            names |= {medium + sigma for sigma in equivalent} if last in pair else set()
         return not names.isdisjoint(self.optimize.parameters if self.optimize else ())
 
     def share_color(self, name: str, value: Any) -> Any:
@@ -407,8 +406,9 @@ class SceneTree:
     @property
     def glows(self) -> bool:
         """Whether the volume emits light, or may come to."""
-        given = (getattr(self.volume, name, None) for name in ("emission", "temperature"))
-        return any(one not in (None, 0, (0, 0, 0)) for one in given) or self.may_change("emission")
+        sources = (getattr(self.volume, name, None) for name in ("emission", "temperature"))
+        is_bright = any(source not in (None, 0, (0, 0, 0)) for source in sources)
+        return is_bright or self.may_change("emission")
 
     def violations(self) -> Iterator[Violation]:
         if not self.lights and not self.glows:
@@ -416,8 +416,8 @@ class SceneTree:
         for name in self.optimize.parameters if self.optimize else ():
             medium, last = split_name(name)
             section = self.media.get(medium.removeprefix("media.").strip("."))
-            has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
-            if last == "phase.g" and has_one:
+            has_g = section and isinstance(section.phase, HenyeyGreensteinSection | None)
+            if last == "phase.g" and has_g:
                 yield "optimize", f"parameters.{name} is called {medium}g here"
         named = [str(path) for view in self.views for path in (view.image, view.mask) if path]
         counted = [name for name in named if FRAME.search(name)]

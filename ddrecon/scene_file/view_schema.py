@@ -166,13 +166,10 @@ class ViewSection:
 
     def violations(self) -> Iterator[Violation]:
         if self.name and not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
-            yield (
-                "name",
-                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.',"
-                " the last not at its start",
-            )
-        if taken := TAKEN.fullmatch(self.name):
-            yield "name", f"{self.name!r} ends in .{taken[1]}, as files of other views do"
+            legal = "use letters, digits, '_', '-' and '.', the last not at its start"
+            yield "name", f"{self.name!r} is not a file name; {legal}"
+        if match := TAKEN.fullmatch(self.name):
+            yield "name", f"{self.name!r} ends in .{match[1]}, as files of other views do"
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
 

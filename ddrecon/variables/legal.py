@@ -42,8 +42,8 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     faults = faults_of(scene)
     if view is not None:
         faults = chain(faults_of(scene, keys=KEYS), faults_of(views[0], f"views.{view}"))
-    for key, what in faults:
-        raise UsageError(f"{key}: {what}")
+    for key, fault in faults:
+        raise UsageError(f"{key}: {fault}")
     cells, density = scene.volume.grid.shape, scene.volume.density
     if density.is_meta:
         raise UsageError("density: has no numbers on the device meta")
@@ -81,11 +81,11 @@ def _require_view(view: View) -> None:
     pose, half, size = camera.pose, torch.as_tensor(camera.half_width).detach(), camera.size
     require_shape(f"{owner}camera.pose", pose, (3, 4))
     if half.is_cpu and not 0 < float(half) < math.inf:
-        what = "half_width, 1 / (2 focal), must be above 0 and finite"
-        raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
+        rule = "half_width, 1 / (2 focal), must be above 0 and finite"
+        raise UsageError(f"{owner}camera: {rule}, found {float(half):g}")
     if pose.is_cpu and not _is_rigid(pose.detach()):
-        what = "the first three columns of its pose must be of unit length and perpendicular"
-        raise UsageError(f"{owner}camera: {what}, and not mirror")
+        rule = "the first three columns of its pose must be of unit length and perpendicular"
+        raise UsageError(f"{owner}camera: {rule}, and not mirror")
     if (lens is None) != (camera.distortion is None):
         raise UsageError(f"{owner}camera: give both lens and distortion, or neither")
     if lens is not None:

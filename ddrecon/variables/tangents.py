@@ -22,9 +22,7 @@ from ddrecon.variables.values import component_names, value_of, variable_names, 
 
 
 def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
-    """The variable that `name` belongs to, and its change by one unit of what `name` names.
-
-    The change has the shape of the variable's value.
+    """The variable of `name`, and its change, of its value's shape, by one unit of `name`.
 
     `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
     or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
@@ -33,8 +31,8 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
     if name in variable_names(scene):
         value = value_of(scene, name)
         if components := kind_of(name).components:
-            parts = ", ".join(f"{name}.{component}" for component in components)
-            raise UsageError(f"{name} changes by component: {parts}")
+            names = ", ".join(f"{name}.{component}" for component in components)
+            raise UsageError(f"{name} changes by component: {names}")
         return name, torch.ones_like(value)
     owner, _, component = name.rpartition(".")
     if owner in variable_names(scene):

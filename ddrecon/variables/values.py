@@ -220,8 +220,8 @@ def _stored_name(volume: Volume, name: str) -> str:
 def volume_value(volume: Volume, name: str) -> Tensor:
     """The value of the variable `name` of `volume`."""
     if volume.media is not None:
-        _, medium, rest = name.split(".", 2)
-        return volume_value(volume.media[medium], rest)
+        _, medium, variable = name.split(".", 2)
+        return volume_value(volume.media[medium], variable)
     if name.startswith(PHASE):
         return volume.phase.variables[name.removeprefix(PHASE)]
     if name not in EXTINCTION_AND_ALBEDO:
