@@ -22,8 +22,7 @@ from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, res
 from ddrecon.scene_file.read import Rule, read_record
 from ddrecon.scene_file.schema import SceneTree
 from ddrecon.scene_file.transforms import node_of
-from ddrecon.scene_file.view_schema import ViewSection, ViewSource
-from ddrecon.scene_file.view_sources import name_listed, views_of
+from ddrecon.scene_file.view_sources import views_of
 from ddrecon.settings import AUTO, ParameterSettings
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -109,7 +108,7 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
 
 def _scene_of(root: Node, path: Path) -> SceneFile:
-    finish = FINISH | {ViewSource: partial(views_of, up=_up_of(root))}
+    finish = {PARAMETERS: require_parameters, "views": partial(views_of, up=_up_of(root))}
     tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, finish))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
@@ -228,13 +227,6 @@ def _violations(
     if last in EXTINCTION_AND_ALBEDO and pair:
         pairs = "take sigma_a and sigma_s, or sigma_t and albedo"
         yield "", f"cannot be optimized beside {pair[0]}: {pairs}"
-
-
-FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
-    (Mapping, ParameterSettings): require_parameters,
-    (tuple, ViewSection): name_listed,
-}
-"""What is made of all records of a list or mapping, or of one that stands for others."""
 
 
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:

@@ -30,14 +30,13 @@ PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numb
 class Rule(NamedTuple):
     """What a value must be: of the type `hint`, within `limits`; relative paths start at `folder`.
 
-    `finish[kind](node, record, folder)` is what a record of that kind stands for, and
-    `finish[tuple, kind]` or `finish[Mapping, kind]` looks at all of a list or mapping together.
+    `finish[key](node, value, folder)` is what the value at `key` stands for.
     """
 
     hint: Any
     folder: Path
     limits: Mapping[str, Any]
-    finish: Mapping[Any, Callable[[Node, Any, Path], Any]]
+    finish: Mapping[str, Callable[[Node, Any, Path], Any]]
 
     @property
     def kinds(self) -> tuple[Any, ...]:
@@ -81,7 +80,13 @@ def _describe(kind: Any, kinds: Sequence[Any]) -> str:
 
 def read_value(node: Node, rule: Rule) -> Any:
     """The value of `node` by `rule`; raises SceneError with everything wrong in it."""
-    kinds, rule = rule.kinds, rule._replace(folder=node.folder or rule.folder)
+    rule = rule._replace(folder=node.folder or rule.folder)
+    value = _read_kind(node, rule)
+    return rule.finish[node.key](node, value, rule.folder) if node.key in rule.finish else value
+
+
+def _read_kind(node: Node, rule: Rule) -> Any:
+    kinds = rule.kinds
     match node.value:
         case None if NoneType in kinds:
             return None
@@ -158,14 +163,14 @@ def _read_list(node: Node, rule: Rule) -> Any:
         may_be_empty = arguments[0] is float or rule.limits.get("may_be_empty")
         is_open = arguments[-1] is Ellipsis and (entries or may_be_empty)
         if is_open or len(entries) == len(arguments):
-            values = read_each(entries, rule._replace(hint=arguments[0]))
+            values = _read_each(entries, rule._replace(hint=arguments[0]))
             if rule.limits.get("is_nonzero") and not any(values):
                 raise node.refused("must not be zero")
-            return _finish(node, (tuple, arguments[0]), values, rule)
+            return values
     raise _refused(node, rule)
 
 
-def read_each(nodes: Sequence[Node], rule: Rule) -> tuple[Any, ...]:
+def _read_each(nodes: Sequence[Node], rule: Rule) -> tuple[Any, ...]:
     """The value of each node by `rule`; raises SceneError with the problems of all."""
     problems, values = Problems(), []
     for node in nodes:
@@ -183,18 +188,12 @@ def _read_mapping(node: Node, rule: Rule) -> Any:
     if FieldFile in kinds and float in kinds and set(entries) == {"constant"}:
         return read_value(entries["constant"], rule._replace(hint=float))
     if records := [kind for kind in kinds if is_dataclass(kind)]:
-        kind = _pick(node, records, rule)
-        return _finish(node, kind, read_record(node, kind, rule), rule)
+        return read_record(node, _pick(node, records, rule), rule)
     for kind in kinds:
         if get_origin(kind) is Mapping:
-            hint = get_args(kind)[1]
-            values = read_each(node.children(), rule._replace(hint=hint))
-            return _finish(node, (Mapping, hint), dict(zip(entries, values, strict=True)), rule)
+            values = _read_each(node.children(), rule._replace(hint=get_args(kind)[1]))
+            return dict(zip(entries, values, strict=True))
     raise _refused(node, rule)
-
-
-def _finish(node: Node, kind: Any, value: Any, rule: Rule) -> Any:
-    return rule.finish[kind](node, value, rule.folder) if kind in rule.finish else value
 
 
 def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:

@@ -47,11 +47,15 @@ Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
-def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[ViewSection, ...]:
-    """The views that `source` stands for, which `node` of a scene in `folder` says.
+def views_of(
+    node: Node, source: ViewSource | tuple[ViewSection, ...], folder: Path, up: Triple
+) -> tuple[ViewSection, ...]:
+    """The named views that `source` lists or stands for, which `node` of a scene in `folder` says.
 
     `up` points up in the scene.
     """
+    if isinstance(source, tuple):
+        return name_listed(node, source)
     entries, every = node.entries(), source.test_every
     if "images" in entries:
         folder = entries["images"].folder or folder
@@ -96,9 +100,7 @@ def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]
     return [float(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
-def name_listed(
-    node: Node, views: tuple[ViewSection, ...], folder: Path
-) -> tuple[ViewSection, ...]:
+def name_listed(node: Node, views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     """The `views` of `node`, nameless ones called by their place; SceneError for equal names."""
     problems, first = Problems(), dict[str, int]()
     names = [view.name or f"view_{index:02d}" for index, view in enumerate(views)]
@@ -159,7 +161,7 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
     if not (path.is_file() and of_cameras.is_file()):
         raise node.refused(f"{folder} has no COLMAP model; expected cameras.txt and images.txt")
     with guard_reading(of_cameras):
-        cameras = dict(_read_cameras(of_cameras))
+        cameras = _read_cameras(of_cameras)
     with guard_reading(path):
         posed = sorted(_read_images(path), key=lambda image: in_order(image[0]))
     if not posed:
@@ -220,19 +222,19 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, line
 
 
-def _read_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+def _read_cameras(path: Path) -> dict[int, Lens]:
+    cameras = dict[int, Lens]()
     for number, line in _lines(path):
         if not line:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            lens = model, (int(width), int(height)), [float(word) for word in parameters]
-            index = int(camera)
+            cameras[int(camera)] = model, (int(width), int(height)), [*map(float, parameters)]
         except ValueError as error:
             raise FormatError(
                 path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
             ) from error
-        yield index, lens
+    return cameras
 
 
 def _read_images(path: Path) -> Iterator[Posed]:
