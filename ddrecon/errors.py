@@ -7,8 +7,11 @@ traceback.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
+
+T, R = TypeVar("T"), TypeVar("R")
 
 LONGEST = 1000
 """Lines of more characters are shortened in the middle."""
@@ -167,6 +170,18 @@ class Problems:
         if self.unusable:
             first = self.unusable[0]
             raise FormatError(first.path, first.reason, lines[1:])
+
+
+def gather(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """What `function` makes of each of `items`; raises the problems of all of them together."""
+    problems, results = Problems(), list[R]()
+    for item in items:
+        with problems.collecting():
+            results.append(function(item))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    return results
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

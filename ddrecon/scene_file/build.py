@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import choose_diffusion, count_colors
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, suggestion
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather, suggestion
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -96,7 +96,7 @@ def build_scene(
     combined, optimize = _combine(media), tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    parameters = optimize.parameters if optimize else ()
+    parameters = optimize.parameters if optimize else {}
     diffusion, _ = choose_diffusion(tree.diffusion, combined, [*media.values()], parameters)
     needs = needs_of_scene(media, views, diffusion, optimize)
     if too_much := refuse_excess(needs, torch.device(device)):
@@ -126,11 +126,8 @@ def build_scene(
     except UsageError as error:
         key, _, fault = str(error).partition(": ")
         raise scene_file.refused(key, fault) from None
-    problems = Problems()
-    for name, settings in optimize.parameters.items() if optimize else ():
-        with problems.collecting():
-            scene.starts[name] = _start(scene_file, scene, name, settings)
-    problems.raise_any()
+    starts = gather(lambda name: _start(scene_file, scene, name, parameters[name]), parameters)
+    scene.starts = dict(zip(parameters, starts, strict=True))
     return scene
 
 

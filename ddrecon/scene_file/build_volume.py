@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import DataWarning, FormatError, Problems, SceneError, UsageError
+from ddrecon.errors import DataWarning, FormatError, Problems, SceneError, UsageError, gather
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
@@ -62,18 +62,14 @@ def build_media(maker: Maker) -> dict[str, Volume]:
     A density that is the same everywhere takes no memory yet. Raises SceneError with all their
     problems, or FormatError.
     """
-    media, problems = dict[str, _Medium](), Problems()
-    for name, section in maker.tree.media.items():
-        media[name] = _Medium(maker, f"media.{name}." if name else "", section)
-        with problems.collecting():
-            media[name].read_fields()
-    problems.raise_any()
+    media = {
+        name: _Medium(maker, f"media.{name}." if name else "", section)
+        for name, section in maker.tree.media.items()
+    }
+    gather(_Medium.read_fields, media.values())
     fields = dict(entry for medium in media.values() for entry in medium.fields.values())
     grid = _agree_on_grid(maker.scene_file, fields)
-    for medium in media.values():
-        with problems.collecting():
-            medium.spread_profiles(grid)
-    problems.raise_any()
+    gather(lambda medium: medium.spread_profiles(grid), media.values())
     return {name: medium.build(grid) for name, medium in media.items()}
 
 
@@ -107,22 +103,24 @@ class _Medium:
 
     def read_fields(self) -> None:
         """Reads the quantities that files give cell by cell; raises SceneError or FormatError."""
-        problems, water = Problems(), self.section.sigma_t
-        for variable, (name, value) in self.quantities.items():
-            if not isinstance(value, FieldFile):
-                continue
-            called = value.name or variable.removeprefix(PHASE)
-            is_free = variable == "density" and not isinstance(water, Water)
-            unit = None if is_free else UNITS.get(variable)
-            read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
-            key = f"volume.{self.prefix}{name}.file"
-            with problems.collecting():
-                field = read_referenced(self.maker.scene_file, key, value.file, read)
-                self.fields[variable] = key, field
-                if isinstance(water, Water) and field.meters not in (None, water.meters):
-                    fault = f"but u of {value.file.name} has {field.meters:g} m"
-                    raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
-        problems.raise_any()
+        files = [
+            name for name, (_, value) in self.quantities.items() if isinstance(value, FieldFile)
+        ]
+        self.fields |= dict(zip(files, gather(self.read_field, files), strict=True))
+
+    def read_field(self, variable: str) -> tuple[str, Field]:
+        """The key at which the scene names the file of `variable`, and its content."""
+        water, (name, value) = self.section.sigma_t, self.quantities[variable]
+        called = value.name or variable.removeprefix(PHASE)
+        is_free = variable == "density" and not isinstance(water, Water)
+        unit = None if is_free else UNITS.get(variable)
+        read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
+        key = f"volume.{self.prefix}{name}.file"
+        field = read_referenced(self.maker.scene_file, key, value.file, read)
+        if isinstance(water, Water) and field.meters not in (None, water.meters):
+            fault = f"but u of {value.file.name} has {field.meters:g} m"
+            raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
+        return key, field
 
     def spread_profiles(self, grid: Grid) -> None:
         """Evaluates the quantities that are given by height at the centers of cells of `grid`."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, is_dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import or_
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
-from ddrecon.errors import Problems, nearest, suggestion
+from ddrecon.errors import Problems, gather, nearest, suggestion
 from ddrecon.records import WORDS, alternatives, find_excess, is_required, type_hints
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.settings import FieldFile
@@ -163,23 +163,11 @@ def _read_list(node: Node, rule: Rule) -> Any:
         may_be_empty = arguments[0] is float or rule.limits.get("may_be_empty")
         is_open = arguments[-1] is Ellipsis and (entries or may_be_empty)
         if is_open or len(entries) == len(arguments):
-            values = _read_each(entries, rule._replace(hint=arguments[0]))
+            values = gather(partial(read_value, rule=rule._replace(hint=arguments[0])), entries)
             if rule.limits.get("is_nonzero") and not any(values):
                 raise node.refused("must not be zero")
-            return values
+            return tuple(values)
     raise _refused(node, rule)
-
-
-def _read_each(nodes: Sequence[Node], rule: Rule) -> tuple[Any, ...]:
-    """The value of each node by `rule`; raises SceneError with the problems of all."""
-    problems, values = Problems(), []
-    for node in nodes:
-        with problems.collecting():
-            values.append(read_value(node, rule))
-        if problems.are_many:
-            break
-    problems.raise_any()
-    return tuple(values)
 
 
 def _read_mapping(node: Node, rule: Rule) -> Any:
@@ -191,7 +179,8 @@ def _read_mapping(node: Node, rule: Rule) -> Any:
         return read_record(node, _pick(node, records, rule), rule)
     for kind in kinds:
         if get_origin(kind) is Mapping:
-            values = _read_each(node.children(), rule._replace(hint=get_args(kind)[1]))
+            read = partial(read_value, rule=rule._replace(hint=get_args(kind)[1]))
+            values = gather(read, node.children())
             return dict(zip(entries, values, strict=True))
     raise _refused(node, rule)
 

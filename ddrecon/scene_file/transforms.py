@@ -15,10 +15,12 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ddrecon.errors import FormatError, Problems, SceneError
+from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
@@ -79,23 +81,22 @@ def read_transforms(
     A file that does not say which are test views has one in `test_every`. Raises SceneError or
     FormatError.
     """
-    problems, views = Problems(), list[ViewSection]()
-    for path in paths:
-        with problems.collecting():
-            if not path.is_file():
-                raise node.refused(f"{path} does not exist, or is not a file")
-            with guard_reading(path):
-                if path.stat().st_size > MAX_BYTES:
-                    most = f"{MAX_BYTES // 2**20} MiB"
-                    raise FormatError(path, f"is larger than {most}; it holds more than cameras")
-                try:
-                    document = node_of("", str(path), json.loads(path.read_bytes()))
-                except (ValueError, RecursionError) as error:
-                    raise FormatError(path, f"not JSON: {error}") from error
-            with in_file(path):
-                views += _file_views(document, path, test_every)
-    problems.raise_any()
-    return tuple(views)
+
+    def read(path: Path) -> list[ViewSection]:
+        if not path.is_file():
+            raise node.refused(f"{path} does not exist, or is not a file")
+        with guard_reading(path):
+            if path.stat().st_size > MAX_BYTES:
+                most = f"{MAX_BYTES // 2**20} MiB"
+                raise FormatError(path, f"is larger than {most}; it holds more than cameras")
+            try:
+                document = node_of("", str(path), json.loads(path.read_bytes()))
+            except (ValueError, RecursionError) as error:
+                raise FormatError(path, f"not JSON: {error}") from error
+        with in_file(path):
+            return _file_views(document, path, test_every)
+
+    return tuple(chain.from_iterable(gather(read, paths)))
 
 
 @contextmanager
@@ -127,13 +128,14 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
     if not isinstance(frames.value, list) or not frames.value:
         raise frames.refused("expected a list with at least one frame")
     splits = _listed_splits(root.value, frames.value)
-    problems, views = Problems(), []
-    for frame, split in zip(frames.value, splits or [""] * len(frames.value), strict=True):
-        if split is not None:
-            with problems.collecting():
-                view = _frame_view(frame, root.value, folder)
-                views.append(replace(view, split=split) if split else view)
-    problems.raise_any()
+    read = partial(_frame_view, shared=root.value, folder=folder)
+    if splits:
+        listed = [
+            (frame, split) for frame, split in zip(frames.value, splits, strict=True) if split
+        ]
+        views = gather(lambda entry: replace(read(entry[0]), split=entry[1]), listed)
+    else:
+        views = gather(read, frames.value)
     if not views:
         raise root.refused("its lists of files name no frame")
     if is_test := TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem):
