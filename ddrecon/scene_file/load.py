@@ -108,7 +108,7 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
 
 def _scene_of(root: Node, path: Path) -> SceneFile:
-    finish = {PARAMETERS: require_parameters, "views": partial(views_of, up=_up_of(root))}
+    finish: Any = {PARAMETERS: require_parameters, "views": partial(views_of, up=_up_of(root))}
     tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, finish))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
@@ -291,7 +291,7 @@ def dump_scene(described: dict[str, Any], path: Path) -> None:
 
 def scene_text(described: dict[str, Any]) -> str:
     """What `dump_scene` writes."""
-    layout = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
+    layout: Any = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
     text: str = yaml.dump(described, Dumper=_Dumper, width=10**6, **layout)
     return text
 

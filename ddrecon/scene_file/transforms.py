@@ -229,7 +229,7 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
     That is `resolution`, `principal_point` and `pixel_aspect`.
     """
     numbers: dict[str, float] = {
-        name: read_as(entries[name], float, **limits)
+        name: read_as(entries[name], float, Path(), **limits)
         for name, limits in NUMBERS.items()
         if name in entries
     }

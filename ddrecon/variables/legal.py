@@ -16,7 +16,7 @@ from ddrecon.scene import Scene, View
 from ddrecon.settings import LENSES
 from ddrecon.variables.forms import require_form, require_range, require_shape
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, RESPONSE, split_name
-from ddrecon.variables.values import volume_names, volume_value
+from ddrecon.variables.values import stored_value, variable_names
 
 RIGID = 0.01
 """How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
@@ -59,14 +59,10 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
 def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
     """All that can be varied of `scene` and its `views`, by name, as it is stored."""
     numbers: dict[str, object] = {
-        name: volume_value(scene.volume, name)
-        for name in volume_names(scene.volume)
-        if split_name(name)[1] not in EXTINCTION_AND_ALBEDO
+        name: stored_value(scene, name)
+        for name in variable_names(scene)
+        if not name.startswith("views.") and split_name(name)[1] not in EXTINCTION_AND_ALBEDO
     }
-    for index, light in enumerate(scene.lights):
-        numbers |= {f"lights.{index}.{key}": value for key, value in vars(light).items()}
-    if scene.ground is not None:
-        numbers["ground.albedo"] = scene.ground.albedo
     for view in views:
         camera, owner = view.camera, f"views.{view.name}."
         numbers |= {owner + key: getattr(view, key) for key in RESPONSE}

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -42,9 +42,10 @@ Settings = TypeVar("Settings")
 def variable_names(scene: Scene) -> list[str]:
     """The name of every variable of `scene`."""
     lights = [
-        f"lights.{index}.{name}"
+        f"lights.{index}.{key}"
         for index, light in enumerate(scene.lights)
-        for name in _tensors(light)
+        for key, value in vars(light).items()
+        if isinstance(value, Tensor)
     ]
     views = [f"views.{view.name}.{key}" for view in scene.views for key in _view_keys(view)]
     ground = [] if scene.ground is None else ["ground.albedo"]
@@ -74,10 +75,11 @@ def value_of(scene: Scene, name: str) -> Tensor:
     stored = _stored_name(scene.volume, name)
     if stored not in variable_names(scene):
         raise _unknown(scene, name)
-    return _stored_value(scene, stored)
+    return stored_value(scene, stored)
 
 
-def _stored_value(scene: Scene, name: str) -> Tensor:
+def stored_value(scene: Scene, name: str) -> Tensor:
+    """The value of `name`, one of `variable_names(scene)`."""
     section, _, path = name.partition(".")
     owner, _, key = path.rpartition(".")
     if section == "lights":
@@ -109,7 +111,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
         if last == "density" and isinstance(value, Tensor) and value.ndim == 0:
             value = value.expand(scene.volume.grid.shape)
         like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else stored
-        before = _stored_value(scene, like)
+        before = stored_value(scene, like)
         require_form(stored, value, before, scene.volume.density, scene.volume.grid.shape)
         named[stored] = value
     of_volume = {name: value for name, value in named.items() if is_of_volume(name)}
@@ -190,10 +192,6 @@ def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         value if value.ndim == axes else value.view(-1, 1, 1, 1) for value in (first, second)
     )
     return first, second
-
-
-def _tensors(light: Light) -> list[str]:
-    return [key.name for key in fields(light) if isinstance(getattr(light, key.name), Tensor)]
 
 
 def volume_names(volume: Volume) -> list[str]:
