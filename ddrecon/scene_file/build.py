@@ -298,10 +298,8 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
         value = _spread(scene_file, key, settings, value, scene.volume.grid.shape)
-    if not bool(((value >= kind.low) & (value <= kind.high)).all()):
-        raise scene_file.refused(
-            f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
-        )
+    if not kind.allows(value):
+        raise scene_file.refused(f"{key}.init", f"must be {kind.limits} everywhere")
     return value
 
 

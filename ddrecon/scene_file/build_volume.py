@@ -134,9 +134,8 @@ class _Medium:
             if not kind.is_color and max(map(len, colors)) > 1:
                 raise self.refused(key, "expected numbers: colors belong to the cross sections")
             known = np.stack(np.broadcast_arrays(*colors), 1)
-            if known.min() < kind.low or known.max() > kind.high:
-                limits = f"at least {kind.low:g} and at most {kind.high:g}"
-                raise self.refused(key, f"must be {limits}")
+            if not kind.allows(torch.from_numpy(known)):
+                raise self.refused(key, f"must be {kind.limits}")
             column = np.stack([np.interp(centers, value.heights, color) for color in known], -1)
             sides = [size for side, size in enumerate(grid.shape) if side != axis]
             cells = np.moveaxis(np.broadcast_to(column, (*sides, *column.shape)), 2, axis).copy()

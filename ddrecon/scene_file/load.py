@@ -218,8 +218,7 @@ def _violations(
         numbers = value if isinstance(value, tuple) else (value,)
         beyond = [x for x in numbers if isinstance(x, float) and not kind.low <= x <= kind.high]
         if beyond:
-            limits = f"at least {kind.low:g} and at most {kind.high:g}"
-            yield key, f"must be {limits}, found {beyond[0]:g}"
+            yield key, f"must be {kind.limits}, found {beyond[0]:g}"
     for key in ("field", "tv"):
         if getattr(settings, key) and not kind.is_cellwise:
             yield key, "it is not a field, so it has none"

@@ -164,6 +164,15 @@ class Kind:
     release: float = 0.0
     rise: float = 1.0
 
+    @property
+    def limits(self) -> str:
+        """Within what values are kept, in words."""
+        return f"at least {self.low:g} and at most {self.high:g}"
+
+    def allows(self, values: Tensor) -> bool:
+        """Whether all `values` are within the limits."""
+        return bool(((values >= self.low) & (values <= self.high)).all())
+
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
 _SHARE = Kind(fixed_rate(0.02), low=0, high=1, is_color=True)
