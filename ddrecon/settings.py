@@ -63,8 +63,7 @@ class DiffusionSettings:
         residual.
     degree: Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; of a
         single round 18 for 1, 26 for 3. Left out: by the medium.
-    refine: Light is computed and seen in cells so many times as narrow; the medium is the same.
-        Left out: by the medium.
+    refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
     refine_along: The axes along which cells are divided.
     """
 
@@ -150,13 +149,11 @@ class ParameterSettings:
     tv: Weight of its total variation, which smooths a field. 1 would weigh as much as the whole
         brightness of the pictures. Unless given, 0.003 for density and emission, of whose logarithm
         it is (E11.3), three times that for an emission that is the only field, and 0 for others.
-    field: Whether it differs from cell to cell; unless given, as its start does. Density always
-        does.
+    field: Whether it differs from cell to cell, as density always does; left out: as its start.
     support: For density: where it may be above 0. `masks`: nowhere that a view sees and its mask,
         or alpha, says is empty; `auto`: nor where it is as dark as it is away from smoke, within
         noise. Left out: anywhere.
-    support_margin: Pixels by which what a view shows is widened for that; 2 unless given. As many
-        as the cameras may be off.
+    support_margin: Pixels by which that is widened, as many as cameras may be off; 2 unless given.
     """
 
     init: Start | None = None
@@ -208,16 +205,13 @@ class OptimizeSettings:
     iterations: In all. With `auto` a run ends by itself: [when to stop](settings.md#when-to-stop).
     loss: What is made small, as a mean over pixels. Unless given, `display` where pictures are sRGB
         files, `l2` where they are linear. [Settings](settings.md) says more.
-    noise: How pictures err, for `loss: photon`, which estimates it unless given, and for `ddrecon
-        uncertainty`.
+    noise: How pictures err, for `loss: photon` and `ddrecon uncertainty`; estimated unless given.
     views_per_iteration: Training views drawn at random for each iteration; 0 for all.
-    derivatives: Which light passes derivatives on: all, only light scattered once, or only the
-        diffusion's.
+    derivatives: Light that passes derivatives on: all, only that scattered once, or the diffusion's.
     refine_at: Fractions of the run at which cells and pixels become half as large: coarse to fine.
     begin_at: The fraction of the run that counts as made: what is left begins at its resolution and
         learning rates, as a frame of a film that begins with another does.
-    keep_start: The part of what fields began with that is mixed into them in the end: of a frame of
-        a film, what is told by the frames before it.
+    keep_start: The share of the fields' start that is mixed into the result, as in frames of a film.
     final_rate: The part of their value to which learning rates fall over a run. 0.05 takes fewer
         iterations at full resolution where pictures agree well with each other.
     """

@@ -153,8 +153,7 @@ class MediumSection:
     """One of them, as a volume of one medium is. Give either `sigma_a` and `sigma_s`, or `sigma_t`
     and `albedo`.
 
-    density: What scatters and absorbs, per cell; everything else is multiplied by it. `{constant:
-        0.1}` is the same as `0.1`.
+    density: What scatters and absorbs, per cell: a factor of all else. `{constant: 1}` is `1`.
     sigma_a: Absorption coefficient per unit of density [1/u].
     sigma_s: Scattering coefficient per unit of density [1/u].
     sigma_t: Extinction coefficient per unit of density [1/u]: absorption and scattering together.
@@ -196,10 +195,8 @@ class BoxSection:
 
     bounds: The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's file
         where left out. `auto`: what fits the pictures.
-    resolution: Cells along x, y and z; those of the field's file where left out. `auto`: two pixels
-        wide.
-    up: The axis along which heights count, those of a `ground`, of `heights` and of rings, and that
-        `export --up` turns.
+    resolution: Cells along x, y and z; left out: those of the field's file; `auto`: two pixels wide.
+    up: The axis along which `heights`, a `ground` and rings count, and which `export --up` turns.
     periodic: The axes, one or two, along which the volume repeats without end, as `[x, z]`
         ([E2.15](theory.md#2-the-forward-model)). Lights are directional, ambient or maps; the
         diffusion is `p1` by the scheme `conservative`, or none.
@@ -311,8 +308,7 @@ class EnvironmentSection:
     file: An image of linear radiance: .exr, .hdr, .npy, .tif.
     scale: Factor on its pixels.
     rotation: About the pole, in degrees.
-    directions: Directions into which its light on the volume is gathered; more are slower and more
-        exact.
+    directions: Directions into which its light is gathered; more are slower and more exact.
     up: Where the pole is, the map's first row. With z, what the map holds at (x, y, z) is at (x,
         -z, y).
     """

@@ -104,8 +104,7 @@ class PerspectiveSection(PoseSection):
     """A pinhole camera. Give either `origin`, `target` and `up`, or `matrix`.
 
     fov: Horizontal field of view, in degrees.
-    principal_point: Where the axis meets the image, as parts of its width and height from the top
-        left.
+    principal_point: Where the axis meets the image, in parts of its size from the top left.
     distortion: Of its lens; see below. Left out, there is none.
     """
 
@@ -138,13 +137,11 @@ class ViewSection:
     image: The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg, .webp and films
         (.mp4, .mov, .mkv, .webm) are decoded from sRGB; alpha 0 is empty.
     mask: A picture of the same size, white where pixels count, else black.
-    frame: Of a film, which frame is taken, counted from 0. With `frames`, the one that the scene's
-        frame 0 is.
+    frame: Of a film, the frame that is taken, from 0; with `frames`, that of the scene's frame 0.
     time: Seconds after which a film begins here: `frame` counts from there.
     split: `test` views are never optimized on, and always reported.
     weight: How much a training view counts.
-    exposure: The picture is this times radiance. As a parameter, the mean over all training views
-        is held.
+    exposure: The picture is this times radiance. As a parameter, its mean over training views is held.
     offset: And this is added: a black level, or haze of the lens.
     background: What the picture shows where the volume is empty: a picture without it, or a color.
         Unless given, the lights behind it, or black.
@@ -214,8 +211,7 @@ class ViewSource:
     colmap: Folder of COLMAP's sparse model as text, such as `sparse/0`.
     images: For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted by the numbers
         in their names, belong to the cameras in turn. For COLMAP: the folder of its pictures.
-    test_every: One view in this many, the first of them, is a test view, where transforms do not
-        say which are.
+    test_every: The first of so many views is a test view, where transforms do not say which are.
     """
 
     ALTERNATIVES: ClassVar = (("ring",), ("transforms",), ("colmap",))
@@ -243,8 +239,7 @@ class FramesSection:
     first: Number of the first frame.
     last: Number of the last frame.
     step: From one frame to the next.
-    calibrate: Frames, spread along the film, that find together what does not change: all but
-        fields. 0: each finds its own.
+    calibrate: Frames, spread along the film, that find all but fields together. 0: each finds its own.
     """
 
     first: int = bounded(minimum=0)
