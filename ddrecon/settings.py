@@ -207,11 +207,11 @@ class OptimizeSettings:
         files, `l2` where they are linear. [Settings](settings.md) says more.
     noise: How pictures err, for `loss: photon` and `ddrecon uncertainty`; estimated unless given.
     views_per_iteration: Training views drawn at random for each iteration; 0 for all.
-    derivatives: Light that passes derivatives on: all, only that scattered once, or the diffusion's.
+    derivatives: Light that passes derivatives on: all, that scattered once, or the diffusion's.
     refine_at: Fractions of the run at which cells and pixels become half as large: coarse to fine.
     begin_at: The fraction of the run that counts as made: what is left begins at its resolution and
         learning rates, as a frame of a film that begins with another does.
-    keep_start: The share of the fields' start that is mixed into the result, as in frames of a film.
+    keep_start: The share of the fields' start that is mixed into the result, as in a film's frames.
     final_rate: The part of their value to which learning rates fall over a run. 0.05 takes fewer
         iterations at full resolution where pictures agree well with each other.
     """

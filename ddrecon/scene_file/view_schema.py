@@ -141,7 +141,7 @@ class ViewSection:
     time: Seconds after which a film begins here: `frame` counts from there.
     split: `test` views are never optimized on, and always reported.
     weight: How much a training view counts.
-    exposure: The picture is this times radiance. As a parameter, its mean over training views is held.
+    exposure: The picture is this times radiance. As a parameter, its mean over views is held.
     offset: And this is added: a black level, or haze of the lens.
     background: What the picture shows where the volume is empty: a picture without it, or a color.
         Unless given, the lights behind it, or black.
@@ -239,7 +239,7 @@ class FramesSection:
     first: Number of the first frame.
     last: Number of the last frame.
     step: From one frame to the next.
-    calibrate: Frames, spread along the film, that find all but fields together. 0: each finds its own.
+    calibrate: Frames, spread along the film, that find all but fields together. 0: none.
     """
 
     first: int = bounded(minimum=0)
