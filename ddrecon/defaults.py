@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase import PhaseFunction
 from ddrecon.settings import DiffusionSettings
 
 MOST_ROUNDS = 16
@@ -107,14 +106,15 @@ def _choose_rounds(
     volume: Volume, optimized: Collection[str], left: float, depth: float, is_flat: bool
 ) -> tuple[int, int, list[str]]:
     """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
-    reasons = list[str]()
+    reasons, glows = list[str](), [volume.emission, volume.black_body]
+    turns_back = float(volume.phase.backward_tail(3, 1).max()) > BACKWARD
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    if is_flat or _turns_back(volume.phase):
+    if is_flat or turns_back:
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
         rounds, degree = rounds + 1 + (depth > THICK), 5
     elif depth > SOFT:
         rounds = 1
-    elif _glows(volume) or "emission" in optimized:
+    elif "emission" in optimized or any(bool(x.any()) for x in glows if x is not None):
         # Around a small bright core diffusion is far too bright, and a single round too dark.
         reasons.append("emission")
         rounds = max(rounds, 2)
@@ -127,15 +127,6 @@ def _choose_rounds(
         reasons.append("faces that reflect light")
         rounds = max(rounds, 4)
     return rounds, degree, reasons
-
-
-def _glows(volume: Volume) -> bool:
-    glows = volume.emission, volume.black_body
-    return any(field is not None and bool(field.any()) for field in glows)
-
-
-def _turns_back(phase: PhaseFunction) -> bool:
-    return float(phase.backward_tail(3, 1).max()) > BACKWARD
 
 
 def _axes_that_vary(media: Iterable[Volume]) -> str:
