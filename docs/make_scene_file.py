@@ -104,7 +104,7 @@ def explain(record: type) -> tuple[str, dict[str, str]]:
     introduction, sentences = "", dict[str, str]()
     for base in reversed(record.__mro__[:-1]):
         introduction, *entries = re.split(
-            r"\n(?=[a-z_0-9, ]+: )", inspect.cleandoc(base.__doc__ or "")
+            r"\n(?=[a-z_0-9]+(?:, [a-z_0-9]+)*: )", inspect.cleandoc(base.__doc__ or "")
         )
         for names, sentence in (entry.split(": ", 1) for entry in entries):
             sentences |= dict.fromkeys(names.split(", "), " ".join(sentence.split()))

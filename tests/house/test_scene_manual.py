@@ -42,7 +42,7 @@ def test_every_record_has_its_section_and_every_key_its_sentence(manual: ModuleT
     assert {record for _, record in manual.SECTIONS} == records - WITHOUT_SECTION
     for record in records:
         introduction, sentences = manual.explain(record)
-        assert introduction and all(sentences.values())
+        assert introduction and all(text.endswith(".") for text in sentences.values())
 
 
 def test_numbers_in_sentences_are_those_of_the_program(manual: ModuleType) -> None:
