@@ -24,7 +24,7 @@ THICK = 4.0
 """Degree 5 adds a round, or two where a cell has more optical depths: theta of E7.2 is below 1
 then. Measured on half-spaces and slabs (docs/accuracy.md)."""
 FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
-"""Cells of light become 3, then 9 times narrower while a cell is thicker than `FINER` optical depths
+"""Cells of light become 3, then 9 times narrower where a cell has more than `FINER` optical depths
 (`FINER_FLAT` in a flat medium), unless that makes more than `MOST_CELLS` cells. Measured on blocks,
 half-spaces and merged balls (docs/accuracy.md). If it does, axes stay undivided along which nothing
 varies and the box is `LONG` times as long as along another, up to three numbers for each cell."""

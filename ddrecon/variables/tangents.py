@@ -1,9 +1,7 @@
-"""Derivative images: how every pixel changes with one number of the scene.
+"""Derivative images: how every pixel changes with one number of the scene (docs/theory.md E3.1).
 
-They solve the differential diffusion equation (docs/theory.md E3.1).
-
-One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
-in every cell.
+One forward-mode pass renders image and derivative together; a field changes by one unit in every
+cell.
 """
 
 from __future__ import annotations
@@ -47,10 +45,8 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
 
 @contextmanager
 def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
-    """`scene` with `name`, as for `variation`, as a dual number, while the block lasts.
-
-    What is rendered of it has its derivative as a tangent. With None, `scene` itself. Raises
-    UsageError.
+    """`scene` with `name`, as for `variation`, as a dual number, while the block lasts; with None as
+    it is. What is rendered of it has its derivative as a tangent. Raises UsageError.
     """
     if name is None:
         yield scene
