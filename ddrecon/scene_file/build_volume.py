@@ -223,7 +223,7 @@ class _Medium:
 
 
 def _kind_name(variable: str) -> str:
-    """That of its kind: of others than variables that of density, a number a cell, none below 0."""
+    """The variable whose kind `variable` is: density's, one number a cell, where it is none."""
     return variable if variable in FIELDS else "density"
 
 

@@ -45,8 +45,9 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
 
 @contextmanager
 def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
-    """`scene` with `name`, as for `variation`, as a dual number, while the block lasts; with None as
-    it is. What is rendered of it has its derivative as a tangent. Raises UsageError.
+    """`scene` in which `name`, as for `variation`, is a dual number while the block lasts, if any.
+
+    Images of it have their derivative as a tangent. Raises UsageError.
     """
     if name is None:
         yield scene
