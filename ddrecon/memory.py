@@ -12,12 +12,13 @@ from pathlib import Path
 
 import torch
 
+from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.settings import DiffusionSettings
+
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Where Linux has its control groups, and says in which this process is."""
 LIMITS = {"memory.max": "anon", "memory.limit_in_bytes": "total_rss"}
-"""The file of a group's limit, by either version, and what its memory.stat calls the memory in use.
-
-Files that the system keeps in memory count as free.
+"""The limit of a group, by either version, and the memory in use in its memory.stat, caches apart.
 """
 OVERHEAD = 1.5
 """How many times as much as is alive the process holds."""
@@ -54,7 +55,7 @@ class Needs:
             yield "--dtype float32"
         pixels = replace(self, resolution=(0, 0, 0)).total
         cells = self.total - pixels
-        share = ((limit - pixels) / cells) ** (1 / 3) if limit > pixels else 0.0
+        share = (max(0, limit - pixels) / cells) ** (1 / 3)
         if (coarser := [int(share * n) for n in self.resolution]) and min(coarser) > 0:
             yield f"volume.resolution: {coarser}"
         if pixels and cells < limit:
@@ -62,23 +63,22 @@ class Needs:
             yield f"images of {math.floor(100 * share)}% the width and height"
 
 
-def numbers_in_cell(colors: int, varied: int, moments: int, is_limited: bool) -> float:
-    """How many numbers are alive in each cell at the peak, of which so many are `varied`.
+def numbers_in_cell(
+    colors: int, varied: int, is_directed: bool, settings: DiffusionSettings
+) -> float:
+    """How many numbers are alive in each cell of light at the peak, of which so many are `varied`.
 
-    `moments`: of light that transport rounds keep, 0 without rounds; `is_limited`: by flux-limited
-    diffusion. Fitted to arrays that `benchmarks/memory.py --count` finds alive.
+    `is_directed`: whether light scatters unevenly. The coefficients are fitted to what
+    `benchmarks/memory.py --count` finds alive.
     """
-    often = 12 * is_limited + (10 + moments) * (moments > 0)
-    if not varied:
-        return 16 + colors * (8 + often)
-    return 24 + colors * (12 + 2.5 * often) + 10 * varied
+    moments = count_harmonics(settings.angles) if is_directed else 1
+    further = 6 * (settings.rounds > 0) + 12 * (settings.model == "flux_limited")
+    rendered = colors * (18.4 + 1.6 * moments + further)
+    return 1.7 * rendered + 13 * varied if varied else rendered
 
 
 def refuse_excess(needs: Needs, device: torch.device) -> str | None:
-    """What to say of a scene that does not fit into the free memory of `device`; None if it does.
-
-    The scene's `needs` are remembered for `explain_shortage`.
-    """
+    """What to say of a scene whose `needs` exceed the free memory of `device`; None if it fits."""
     _latest[:] = [needs]
     free = free_memory(device)
     if free is None or needs.total <= free:
@@ -103,16 +103,13 @@ def explain_shortage(error: BaseException) -> str | None:
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Bytes that this process can still take on `device`, by the system and by the limits of
-    control groups; None if unknown.
-    """
+    """Bytes free on `device`, by the system and by limits of control groups; None if unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device))
     amounts = []
     with suppress(OSError, ValueError):
-        text = Path("/proc/meminfo").read_text()
-        [kibibytes] = re.findall(r"MemAvailable: *(\d+)", text)
+        [kibibytes] = re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())
         amounts.append(1024 * int(kibibytes))
     for limit, used in LIMITS.items():
         for allowed, text in _group_files(limit, "memory.stat"):
