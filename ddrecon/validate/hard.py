@@ -20,11 +20,11 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.operator import AXES, boundary_loss, face_fluxes
+from ddrecon.diffusion.operator import boundary_loss
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.light.moments import cut, flux_along_axes, mean_and_first
+from ddrecon.light.moments import cut
 from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -319,29 +319,14 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     operator, right = problem.system
     if not right.any():
         return Balance()
-    # What Q1 takes out of one cell it brings to the next, so it is no part of what is injected.
     escape = boundary_loss(problem.diffusion, grid)
     injected = medium.remaining_scattering * problem.source[0] + escape * problem.outside
-    total = injected.double().sum()
-    absorbed = (medium.absorption.value.double() * solution.double()).sum()
-    energy = float((total - (absorbed + _leak(problem, solution))).abs() / total)
+    # b sums to what is injected less what Q1 drives out of the box; between cells Q1 only moves.
+    lost = (medium.absorption.value.double() + escape.double()) * solution.double()
+    energy = float((right.double() - lost).sum().abs() / injected.double().sum())
     scale = operator.diagonal.rsqrt()
     size = (scale * right).norm()
     residual = float((scale * (right - operator.apply(solution))).norm() / size)
     # What rounding every entry of the solution by one unit in the last adds to it.
     rounding = torch.finfo(solution.dtype).eps * (scale * operator.diagonal * solution).norm()
     return Balance(residual, float(rounding / size), energy)
-
-
-def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
-    """What flows out through the faces of the box (E2.6), as for dark surroundings."""
-    grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
-    leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
-    _, first = mean_and_first(problem.source)
-    fluxes = [None] * 3 if first is None else flux_along_axes(first)
-    for axis, flux in zip(AXES, fluxes, strict=True):
-        scattered = None if flux is None else scattering * flux
-        faces = face_fluxes(solution, scattered, problem.diffusion, grid, axis).double()
-        outflow = (faces.select(axis, -1) - faces.select(axis, 0)).sum()
-        leaked = leaked + outflow / grid.spacing[axis - 1]
-    return leaked
