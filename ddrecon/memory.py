@@ -72,9 +72,12 @@ def numbers_in_cell(
     `benchmarks/memory.py --count` finds alive.
     """
     moments = count_harmonics(settings.angles) if is_directed else 1
-    further = 6 * (settings.rounds > 0) + 12 * (settings.model == "flux_limited")
-    rendered = colors * (18.4 + 1.6 * moments + further)
-    return 1.7 * rendered + 13 * varied if varied else rendered
+    rendered = 18 + 1.5 * moments
+    if settings.model == "flux_limited":
+        rendered += 12
+    elif settings.rounds:
+        rendered += 13 + 1.2 * moments
+    return colors * rendered * (2 if varied else 1) + 13 * varied
 
 
 def refuse_excess(needs: Needs, device: torch.device) -> str | None:
