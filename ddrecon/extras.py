@@ -1,7 +1,4 @@
-"""Optional packages: imported where they are needed.
-
-Where one is absent, the user is told the extra of ddrecon that brings it.
-"""
+"""Optional packages, imported where they are needed; of an absent one the extra is named."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ def is_there(package: str) -> bool:
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package` for a `purpose`; raises MissingExtraError if it is not installed."""
+    """The module `package` for a `purpose`; raises MissingExtraError without it."""
     try:
         return import_module(package)
     except ImportError as error:
@@ -43,7 +40,7 @@ def load_extra(package: str, purpose: str) -> ModuleType:
 
 
 def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package`, for the file at `path`; raises FormatError if it is not installed."""
+    """The module `package` for the file at `path`; raises FormatError without it."""
     try:
         return import_module(package)
     except ImportError as error:
