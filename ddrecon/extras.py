@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from types import ModuleType
 
 from ddrecon.errors import FormatError, MissingExtraError
@@ -24,11 +23,6 @@ EXTRAS = {
 def advice(package: str) -> str:
     """How to get `package`, in words that follow what it is for."""
     return f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
-
-
-def is_there(package: str) -> bool:
-    """Whether `package` is installed."""
-    return find_spec(package) is not None
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:

@@ -72,8 +72,8 @@ def _tell_from_noise(view: View) -> Tensor:
     """Where the picture of `view` shows more than noise: bool [h, w].
 
     A first guess of its noise (E9.2), which bright smoke may mislead, tells what is surely smoke;
-    what lies away from that is black, and says how far black goes. Noise that is not normal, such
-    as compression leaves, goes beyond; but its pixels stand alone.
+    what lies away from that is black, and says how far black goes. Artifacts of compression go
+    beyond, but their pixels stand alone.
     """
     image, behind = view.image, view.background
     assert image is not None
@@ -116,9 +116,8 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    `shown` [h, w] is whether a pixel shows something; a cell may hold medium where a pixel does
-    within `margin` pixels of those that the cell covers. Outside the image the nearest pixel
-    counts.
+    A cell may where a pixel is `shown` [h, w] within `margin` pixels of those that the cell covers,
+    or of the nearest to a cell that is outside the image.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
@@ -143,8 +142,7 @@ def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[T
 def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
     """Where any pixel of `shown` [h, w] within `reach` rows and columns is true.
 
-    Also so far beyond its edges, [h + 2 reach, w + 2 reach], where it goes on as it ends; unless it
-    `is_cut` there.
+    The result goes as far beyond the edges, [h + 2 reach, w + 2 reach], unless it `is_cut` there.
     """
     pixels, side = shown.float()[None, None], 2 * reach + 1
     beside = reach if is_cut else 0
@@ -157,9 +155,8 @@ def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
     """The corners [2, 3] (x, y, z) [u] of the box around all that the views of `frames` may show.
 
-    Each view shows the pixels [h, w], single ones left out, widened by `margin`. A frame of
-    which a view shows nothing has no smoke yet. Raises HullError where the views leave no place,
-    or any.
+    Views show the pixels [h, w], without single ones, widened by `margin`. A frame of which a view
+    shows nothing has no smoke yet. Raises HullError where the views leave no place, or any.
     """
     boxes = []
     for views, pixels in frames:

@@ -2,11 +2,6 @@
 
 Everything runs in float64 with solves to nearly its precision, for every parameter alone and for
 all of them at once.
-
-Where the scene's density is the same everywhere, and above all where it is empty, the check is made
-at a random density, half of whose cells are empty: an empty volume would hide all but density from
-the camera. What moves rays or beams is moved a little at random: along the axes of the lattice they
-meet centers of cells, where interpolation has a slope to each side, and differences a mean of both.
 """
 
 from __future__ import annotations
@@ -64,9 +59,9 @@ Loss = Callable[[Values], Tensor]
 class EntryCheck:
     """The derivative by one entry of a parameter, or along a random direction in it.
 
-    `adjoint` is the derivative by reverse mode, `difference` that by central differences with
-    `step`, and `error` their relative difference. Of several steps it is the one that agrees best:
-    larger ones suffer from truncation, smaller ones from rounding.
+    `adjoint`: by reverse mode; `difference`: by central differences with the `step` that agrees
+    best (larger ones suffer from truncation, smaller ones from rounding); `error`: their relative
+    difference.
     """
 
     entry: str
@@ -248,9 +243,10 @@ def starting_point(
 ) -> dict[str, Tensor]:
     """The value of each optimized parameter, of each of `names`, and of density.
 
-    What moves rays or beams is changed by a random part of the variable's rate.
     Density is the scene's own; where that is the same everywhere, what it starts from; where that
-    is, too, random numbers of which half are empty.
+    is, too, random numbers of which half are empty: a volume without any hides all else. What moves
+    rays or beams is moved by a random share of the variable's rate: along the lattice rays meet
+    centers of cells, where interpolation has a slope to each side, and differences a mean of both.
     """
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
@@ -273,10 +269,9 @@ def starting_point(
 
 
 def loss_at(scene: Scene, point: Values, generator: torch.Generator) -> Loss:
-    """The image loss of `scene` (float64), that it asks for or `l2`, as a function of parameters.
+    """The image loss of `scene` (float64), its own or `l2`, by parameters; others as in `point`.
 
-    The others are as in `point`. Targets are the images of the views that have them, else random
-    ones.
+    Targets are the images of the views that have them, else random ones.
     """
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
@@ -315,10 +310,7 @@ def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Genera
 
 
 def entry_name(name: str, value: Tensor, index: int) -> str:
-    """What a user calls the entry at flat `index`, with its color.
-
-    It is a component, a cell (x, y, z) or a pixel (x, y).
-    """
+    """What a user calls the entry at flat `index`: a component, cell (x, y, z) or pixel (x, y)."""
     # The last axis of a tensor is x, and its first, if there is such, is that of colors.
     place = [int(n) for n in reversed(torch.unravel_index(torch.tensor(index), value.shape))]
     components = component_names(name, value)
