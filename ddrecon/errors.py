@@ -33,6 +33,10 @@ class DdreconError(Exception):
 
     exit_code = 2
 
+    def advise(self, advice: str) -> None:
+        """Has the error end with more `advice`."""
+        self.args = (f"{self}; {advice}",)
+
 
 class _ProblemsError(DdreconError):
     """An error with one line for each of its `problems`."""
@@ -92,24 +96,14 @@ class DivergenceError(SolveError):
     """
 
     def __init__(self, iteration: int, reason: str, residual: float, advice: str):
-        self.reason, self.iterations = reason, iteration
-        self.residual, self.advice = residual, advice
+        self.iterations, self.residual, self.advice = iteration, residual, advice
         DdreconError.__init__(self, f"iteration {iteration}: {reason}; {advice}")
-
-    def with_advice(self, more: str) -> DivergenceError:
-        """The same error, its advice followed by `more`."""
-        advice = f"{self.advice}; {more}"
-        return DivergenceError(self.iterations, self.reason, self.residual, advice)
 
 
 class RanksError(DdreconError):
     """Processes that share a run and lost, or never found, one another."""
 
     exit_code = 5
-
-    def with_advice(self, more: str) -> RanksError:
-        """The same error, followed by `more`."""
-        return RanksError(f"{self}; {more}")
 
 
 class DataWarning(UserWarning):
