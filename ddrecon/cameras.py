@@ -213,6 +213,17 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
     Of a perspective camera in the plane one unit in front of it, of an orthographic one in its
     image plane, in world units. `offset` is as for `cast_rays`.
     """
+    return _pair(*_place_lines(camera, offset))
+
+
+def edge_places(camera: Camera) -> Tensor:
+    """Those of `image_places` that lie along the edges of the image, in any order."""
+    columns, rows = _place_lines(camera, (0.5, 0.5))
+    return torch.cat([_pair(columns, rows[[0, -1]]), _pair(columns[[0, -1]], rows)])
+
+
+def _place_lines(camera: Camera, offset: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """How far to the right columns lie, and how far down rows."""
     (height, width), like, middle = camera.size, camera.pose, camera.principal_point
     row, column = (
         torch.arange(count, dtype=like.dtype, device=like.device) + shift
@@ -220,14 +231,11 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
     )
     step = camera.half_width * 2 / width
     down = (row - middle[1] * height) * (step * camera.pixel_aspect)
-    right = (column - middle[0] * width) * step
-    return torch.stack(torch.meshgrid(right, down, indexing="xy"), -1).view(-1, 2)
+    return (column - middle[0] * width) * step, down
 
 
-def edge_places(camera: Camera) -> Tensor:
-    """Those of `image_places` that lie along the edges of the image."""
-    places = image_places(camera).view(*camera.size, 2)
-    return torch.cat([places[0], places[-1], places[:, 0], places[:, -1]])
+def _pair(columns: Tensor, rows: Tensor) -> Tensor:
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
