@@ -20,7 +20,7 @@ from ddrecon.records import bounded, one_of
 from ddrecon.settings import LENSES
 
 NEWTON_STEPS = 12
-"""By which a view ray through a pane is found to rounding."""
+"""Steps of Newton's method that find a view ray through a pane to rounding."""
 
 
 @dataclass(eq=False)
@@ -210,8 +210,8 @@ def _look_through(camera: Camera, places: Tensor) -> Tensor:
 def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Tensor:
     """Where pixels lie, `[R, 2]` (to the right and down), row by row.
 
-    Of a perspective camera in the plane one unit in front of it, of an orthographic one in its
-    image plane, in world units. `offset` is as for `cast_rays`.
+    Places are in the plane one unit in front of a perspective camera, or in the image plane of an
+    orthographic one, in world units. `offset` is as for `cast_rays`.
     """
     return _pair(*_place_lines(camera, offset))
 
@@ -241,8 +241,8 @@ def _pair(columns: Tensor, rows: Tensor) -> Tensor:
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Where `points` [N, 3] (x, y, z) [u] are seen, `[N, 2]`, and how far away, `[N]`.
 
-    In columns and rows from the image's top left corner; NaN behind a perspective camera, and
-    beyond the corners of its image, where distortion may have folded over.
+    Places are columns and rows from the image's top left corner; NaN behind a perspective camera,
+    and beyond the corners of its image, where distortion may have folded over.
     """
     right, up, backward, origin = camera.pose.detach().unbind(1)
     away = points - origin

@@ -31,8 +31,8 @@ TOGETHER = 0.3
 MOST_PIXELS = 256
 """Pixels a side of the reduced pictures in which neighbors are counted and boxes found."""
 BOX_CELLS, SHRINKS = 48, 0.97
-"""Cells along each side of a box, which is cut to those that are left, until no side shrinks below
-this part of itself."""
+"""Cells along each side of a box, which is cut to those that may hold smoke, again and again, until
+no side shrinks below this share of itself."""
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
 """A box is far too large if less than FILLED of it may hold smoke; it is elsewhere or far too small
 if it holds less than HELD of the smoke, cuts off smoke that reaches beyond it by CUT of a side, and
@@ -49,9 +49,9 @@ class HullError(SceneError):
 def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
-    That is by the mask, or without one where a pixel is not black, as alpha 0 is. With `auto` it is
-    where a pixel is brighter than black, or differs from the background, by more than noise, or is
-    masked out. Raises HullError where most of the edges show something.
+    The mask tells, or without one a pixel that is not black, as alpha 0 is. With `auto` a pixel
+    shows something that is brighter than black, or differs from the background, by more than noise,
+    or is masked out. Raises HullError where most of the edges show something.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
@@ -116,8 +116,8 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    A cell may where a pixel is `shown` [h, w] within `margin` pixels of those that the cell covers,
-    or of the nearest to a cell that is outside the image.
+    A cell may hold medium where `shown` [h, w] has a pixel within `margin` pixels of those that the
+    cell covers; outside the image the nearest pixel counts.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))

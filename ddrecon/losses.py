@@ -54,9 +54,8 @@ def relative_l2(error: Tensor, target: Target) -> Tensor:
 def display(error: Tensor, target: Target) -> Tensor:
     """The square of `error` in displayed values, by the slope of sRGB at the target (E9.3).
 
-    So it is quadratic however far off an image is: the curve itself would be steep where an image
-    is still black, and flat where it is too bright. What is brighter than a target that is white
-    does not err.
+    It is quadratic however far off an image is: the curve itself would be steep where an image is
+    still black, and flat where it is too bright. Pixels brighter than a white target do not err.
     """
     return l2(torch.where(target.image >= WHITE, error.clamp(max=0), error), target)
 
@@ -75,10 +74,10 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
 class Target:
     """What images are compared with, `image` [3, h, w] (linear radiance), and how: by a `loss`.
 
-    `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
-    numbers that do; `scale`: the root of their mean square. Quality is told on the scale `on`:
-    `compared` is the image on it, `slope` its derivative there, and `peak` the largest value that
-    counts.
+    `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: how
+    many numbers count; `scale`: the root of their mean square. Quality is measured on the scale
+    `on`: `compared` is the image on it, `slope` its derivative there, and `peak` the largest value
+    that counts.
     """
 
     loss: str

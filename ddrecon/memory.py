@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -16,10 +17,12 @@ from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.settings import DiffusionSettings
 
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-"""Where Linux has its control groups, and says in which this process is."""
+"""The control groups of Linux, and the file that names those of this process."""
 LIMITS = {"memory.max": "anon", "memory.limit_in_bytes": "total_rss"}
 """The limit of a group, by either version, and the memory in use in its memory.stat, caches apart.
 """
+QUOTAS = (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"])
+"""The files of a group's quota and period of processor time, by either version."""
 OVERHEAD = 1.5
 """How many times as much as is alive the process holds."""
 IN_PIXEL = 18
@@ -27,7 +30,7 @@ IN_PIXEL = 18
 SHORTAGE = "(out of|not enough) memory|(can.t|failed to) allocate|bad.?alloc|alloc_(cpu|failed)"
 """What torch and Warp say, in one place or another, where they get no memory."""
 _latest: list[Needs] = []
-"""Those of the scene that was built last: a shortage may come anywhere later."""
+"""The needs of the scene that was built last: a shortage may come anywhere later."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,8 @@ class Needs:
         pixels = replace(self, resolution=(0, 0, 0)).total
         cells = self.total - pixels
         share = (max(0, limit - pixels) / cells) ** (1 / 3)
-        if (coarser := [int(share * n) for n in self.resolution]) and min(coarser) > 0:
+        coarser = [int(share * cells_along) for cells_along in self.resolution]
+        if min(coarser) > 0:
             yield f"volume.resolution: {coarser}"
         if pixels and cells < limit:
             share = math.sqrt((limit - cells) / pixels)
@@ -114,11 +118,11 @@ def free_memory(device: torch.device) -> int | None:
     with suppress(OSError, ValueError):
         [kibibytes] = re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())
         amounts.append(1024 * int(kibibytes))
-    for limit, used in LIMITS.items():
-        for allowed, text in _group_files(limit, "memory.stat"):
-            with suppress(ValueError, TypeError):  # "max" is no number; `used` may be missing
-                in_use = re.search(rf"^{used} (\d+)$", text, re.MULTILINE)
-                amounts.append(int(allowed) - int(in_use[1]))  # type: ignore[index]
+    for folder, (limit, used) in product(_control_groups(), LIMITS.items()):
+        with suppress(OSError, ValueError):  # "max" is no number
+            statistics = (folder / "memory.stat").read_text()
+            [in_use] = re.findall(rf"^{used} (\d+)$", statistics, re.MULTILINE)
+            amounts.append(int((folder / limit).read_text()) - int(in_use))
     return min(amounts, default=None)
 
 
@@ -126,24 +130,20 @@ def usable_cores() -> int:
     """How many cores this process may use, by its affinity and the quotas of its control groups."""
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = [len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1]
-    for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
-        for texts in _group_files(*names):
-            with suppress(ValueError):  # "max" is no number
-                quota, period = map(int, " ".join(texts).split())
-                cores += [math.ceil(quota / period)] * (quota > 0)
+    for folder, names in product(_control_groups(), QUOTAS):
+        with suppress(OSError, ValueError):  # "max" is no number
+            quota, period = map(int, " ".join((folder / n).read_text() for n in names).split())
+            cores += [math.ceil(quota / period)] * (quota > 0)
     return min(cores)
 
 
-def _group_files(*names: str) -> Iterator[list[str]]:
-    """The contents of the files `names` in each control group that holds this process."""
+def _control_groups() -> Iterator[Path]:
+    """The folders of all control groups that hold this process."""
     lines = OWN_GROUPS.read_text().splitlines() if OWN_GROUPS.exists() else []
     for _, kinds, path in (line.split(":", 2) for line in lines):
         top = GROUPS / kinds  # version 2 has no kinds: all its groups are in one tree
         inner = top / path.lstrip("/")
-        for folder in (inner, *inner.parents):
-            if folder.is_relative_to(top):
-                with suppress(OSError):
-                    yield [(folder / name).read_text() for name in names]
+        yield from (folder for folder in (inner, *inner.parents) if folder.is_relative_to(top))
 
 
 def gibibytes(amount: int) -> str:

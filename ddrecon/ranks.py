@@ -1,8 +1,7 @@
 """Ranks: the processes that share the work of one run, as torchrun starts them.
 
 Each computes a share, and the shares are summed. Without torchrun, or with a single process of it,
-there is one rank: nothing is imported, nothing is exchanged. What is drawn or decided alike on all
-ranks needs no exchange either.
+there is one rank: nothing is imported, nothing is exchanged.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MEET_SECONDS = 120.0
-"""So long ranks wait for each other at the start, unless `MEET_VARIABLE` says otherwise."""
+"""Seconds that ranks wait for each other at the start, unless `MEET_VARIABLE` says otherwise."""
 MEET_VARIABLE = "DDRECON_MEET_SECONDS"
 EXCHANGE_SECONDS = 1800.0
-"""So long they wait in an exchange. A rank that has ended is noticed at once."""
+"""Seconds that ranks wait in an exchange; a rank that has ended is noticed at once."""
 
 T = TypeVar("T")
 

@@ -79,7 +79,7 @@ def _color_term(scene: Scene) -> str:
         "the medium": [volume.sigma_a, volume.sigma_s],
         "what glows": [volume.emission, volume.black_body],
         "lights": [v for light in scene.lights for k, v in vars(light).items() if k in BRIGHTNESS],
-        "the ground": [ground and ground.albedo],
+        "the ground": [] if ground is None else [ground.albedo],
         "views": [v for view in scene.views for v in (view.exposure, view.offset, view.background)],
     }
     colored = ["the phase function"] * (volume.phase.colors > 1)

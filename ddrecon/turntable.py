@@ -15,7 +15,7 @@ from ddrecon.scene import Scene, View
 def upright_axis(scene: Scene) -> int:
     """Which of x, y, z (0, 1, 2) points up in `scene`.
 
-    Where it does not say, it is the one nearest to the sum of its cameras' up vectors.
+    A scene that does not say has the one nearest to the sum of its cameras' up vectors.
     """
     if scene.up is not None:
         return scene.up

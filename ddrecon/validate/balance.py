@@ -45,9 +45,9 @@ from ddrecon.transport.rounds import face_mirror
 from ddrecon.transport.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
-"""Of the box, in array order."""
+"""The faces of the box, in array order."""
 SWEEPS = 12
-"""So often light is swept where faces reflect it inside."""
+"""Sweeps of light that faces reflect inside."""
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
@@ -135,7 +135,7 @@ class _Box:
 
     @property
     def areas(self) -> list[float]:
-        """Those of the faces across each axis, 0 where there are none: what repeats has no end."""
+        """Areas of the faces across each axis; 0 along a period, which has none."""
         grid = self.media[0].grid
         sides = enumerate(grid.extent)
         return [(axis not in grid.periodic) * math.prod(grid.extent) / side for axis, side in sides]

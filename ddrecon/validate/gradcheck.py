@@ -39,13 +39,13 @@ TOLERANCE = 1e-13
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
 CLOSE = 1e-8
-"""Where differences agree so closely, no shorter step is tried."""
+"""The error of a difference below which no shorter step is tried."""
 NEGLIGIBLE = 1e-6
 """Errors are relative to the derivative they are of, or to this part of the parameter's largest
 where that is more. What the last digits of the loss can make is no error.
 """
 SHORTER, MORE = 0.1, 3
-"""Where no step agrees, so many more are tried, each shorter than the last by this factor."""
+"""Factor from step to step, and how many more are tried where no step agrees."""
 TOGETHER = "all at once"
 """What the check of all parameters together is called."""
 
@@ -178,7 +178,7 @@ def _check(
     adjoint = float(sum((bar * direction[name]).sum() for name, (_, bar) in parameters.items()))
 
     def at(along: Values, step: float) -> float:
-        moved = {name: values[name] + step * way for name, way in along.items()}
+        moved = {name: values[name] + step * change for name, change in along.items()}
         with torch.no_grad():
             return float(loss(moved))
 

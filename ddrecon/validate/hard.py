@@ -234,12 +234,10 @@ def run_case(name: str, case: HardCase, device: torch.device) -> HardResult:
     return HardResult(
         name,
         iterations=iterations,
-        residual=balance.residual,
-        attainable=balance.attainable,
+        **asdict(balance),
         image_error=relative_error(image, exact),
         gradient_error=relative_error(gradient, exact_gradient),
         lowest=float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
-        energy=balance.energy,
         energy_double=exact_balance.energy,
         depth=case.depth * max(case.shape),
     )
