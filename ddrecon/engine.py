@@ -84,16 +84,16 @@ def _place_kernels(name: str, asked: str) -> str:
     usual = os.environ.get(CACHE) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     if os.name != "posix" or _is_writable(Path(usual)):
         return "warp"
-    lost, mend = f"kernels cannot be kept in {usual}", f"set {CACHE} to a folder to write to"
+    problem, remedy = f"kernels cannot be kept in {usual}", f"set {CACHE} to a folder to write to"
     if name == "warp":
-        raise UsageError(f"{asked}: {lost}; {mend}")
+        raise UsageError(f"{asked}: {problem}; {remedy}")
     folder = Path(os.environ.get("TMPDIR") or "/tmp", f"ddrecon-{os.getuid()}")
     # What others put there would be run as kernels.
     if _is_writable(folder) and folder.lstat().st_uid == os.getuid():
-        os.environ[CACHE], engine, lost = str(folder), "warp", f"{lost}, but in {folder}"
+        os.environ[CACHE], engine, problem = str(folder), "warp", f"{problem}, but in {folder}"
     else:
         engine = "torch"
-    logging.getLogger(LOG).info(f"engine {engine}: {lost}; {mend}")
+    logging.getLogger(LOG).info(f"engine {engine}: {problem}; {remedy}")
     return engine
 
 

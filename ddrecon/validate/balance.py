@@ -315,13 +315,13 @@ def lines(report: dict[str, Any]) -> list[str]:
         return ", ".join(format(number, form) for number in torch.tensor(value).view(-1).tolist())
 
     shares = report["fractions"]
-    told = [f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()]
+    texts = [f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()]
     if "reflected" in shares:
-        told.append(f"reflected from outside: {text(shares['reflected'], '.2%')}")
-    told.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(shares['absorbed'], '.2%')})")
+        texts.append(f"reflected from outside: {text(shares['reflected'], '.2%')}")
+    texts.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(shares['absorbed'], '.2%')})")
     for face, leaving in shares["leaves"].items():
         straight, scattered = (text(leaving[key], ".2%") for key in ("unscattered", "scattered"))
-        told.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
+        texts.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
     if "into_ground" in shares:
-        told.append(f"into the ground: {text(shares['into_ground'], '.2%')}")
-    return [*told, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]
+        texts.append(f"into the ground: {text(shares['into_ground'], '.2%')}")
+    return [*texts, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]
