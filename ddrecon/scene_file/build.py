@@ -31,7 +31,6 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
-from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
@@ -245,10 +244,8 @@ def needs_of_scene(
     combined, parameters = _combine(media), optimize.parameters if optimize else {}
     colors = count_colors(combined, media.values())
     is_directed = "g" in parameters or bool((combined.phase.moments(3)[:, 1:] != 0).any())
-    moments = count_harmonics(diffusion.angles) if is_directed else 1
     varied = sum(_varied(name, chosen, media, colors) for name, chosen in parameters.items())
-    is_limited = diffusion.model == "flux_limited"
-    numbers = numbers_in_cell(colors, varied, moments * (diffusion.rounds > 0), is_limited)
+    numbers = numbers_in_cell(colors, varied, is_directed, diffusion)
     return Needs(
         resolution=combined.grid.shape[::-1],
         # Light is computed in cells so many times as narrow along these axes.
