@@ -21,7 +21,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.shear import cross_grid
-from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import NEARLY, Slicing, across
@@ -104,41 +103,27 @@ class Characteristic:
 
 
 def radiance_along(
-    medium: Medium,
-    scatters: Tensor,
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
     gradient: Tensor,
-    inflow: Tensor | None,
     direction: Direction,
     ends: Ends | None = None,
 ) -> tuple[Tensor, Ends]:
     """I along `direction` (E2.9): its mean in each cell [C, z, y, x], and what leaves the box.
 
-    `ends` is what enters it besides `inflow`.
-
-    `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
-    `medium` adds (1 - f) kappa_s a unit length; `gradient` [3, C, z, y, x]: by how much q rises
-    from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
-    which what leaves is counted.
+    `direction`: the unit vector of travel (array order); `extinction` [C or 1, z, y, x]: kappa_t;
+    `emitted` [C, z, y, x]: E, what cells add to radiance in a unit of length; `gradient`
+    [3, C, z, y, x]: by how much it rises from cell to cell; `ends`: what enters the box.
     """
-    course = Characteristic.of(medium.grid, direction)
-    depth, strength = (
-        course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
-    )
-    # what the cell emits along the ray, and by how much more at its end than at its beginning
+    course = Characteristic.of(grid, direction)
     rise = torch.tensordot(constant(course.moved, gradient), gradient, 1)
-    e, r = strength * course.lay(scatters), strength * course.lay(rise)
+    depth, e, r = (course.lay(field * course.step) for field in (extinction, emitted, rise))
     phi, psi, eta = decay_terms(depth)
     passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
-    if inflow is not None:
-        # Light from outside is there without a medium. The rest, I - inflow, is zero where rays
-        # enter and loses inflow * lost on every way: a white furnace stays exact.
-        outside = inflow.view(1, -1, 1, 1)
-        source = source - outside * -torch.expm1(-depth)
-        own = own - outside * (1 - phi)
     passed, source, own, phi = torch.broadcast_tensors(passed, source, own, phi)
     arriving, gone = follow(passed, source, course, ends)
-    mean = course.lift(torch.addcmul(own, arriving, phi))
-    return mean if inflow is None else mean + inflow, gone
+    return course.lift(torch.addcmul(own, arriving, phi)), gone
 
 
 def follow(

@@ -51,49 +51,49 @@ def sweep(
     of the first, as of `steep_gradient`; `inflow`: light from outside, as of `radiance_along`;
     `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
     """
-    grid, (count, colors) = medium.grid, source.shape[:2]
+    extinction, scattering = medium.extinction.value, medium.remaining.value
+    emitted, gradient = scattering * source, scattering * gradient
+    if inflow is not None:
+        # Light from outside is there without a medium. What is swept is the rest, I - inflow, which
+        # loses kappa_t inflow: so a white furnace is exact.
+        mean, *higher = emitted.split([1, len(emitted) - 1])
+        emitted = torch.cat([mean - extinction * inflow, *higher])
+    fields = extinction.expand(emitted.shape[1:]), emitted, gradient.expand(3, *emitted.shape[1:])
+    swept = _sweep_emitted(medium.grid, *fields, directions, mirror)
+    return swept if inflow is None else add(swept, inflow[None])
+
+
+def _sweep_emitted(
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
+    gradient: Tensor,
+    directions: int,
+    mirror: Mirror | None,
+) -> Tensor:
+    """The moments [K, C, z, y, x] of the radiance of what cells have `emitted` (E2.9, E2.8)."""
     if is_fused():
-        return _sweep_fused(medium, source, gradient, inflow, directions, mirror)
-    courses, weights, values = sweep_rule(directions, count)
-    values = values.to(source)
-    moments = source.new_zeros(count, colors * grid.cells)
+        from ddrecon.transport.fused.faces import sweep_fused
+
+        return sweep_fused(grid, extinction, emitted, gradient, directions, mirror)
+    (count, colors), (courses, weights, values) = emitted.shape[:2], sweep_rule(directions, len(emitted))
+    values = values.to(emitted)
+    moments = emitted.new_zeros(count, colors * grid.cells)
     for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
         row, ends = values[number], None if mirror is None else mirror.entering(number)
 
         def follow(
             row: Tensor = row, direction: Direction = direction, ends: Ends | None = ends
         ) -> tuple[Tensor, Ends]:
-            # I (E2.9), of the sum over moments of this direction's harmonics
-            scatters = torch.tensordot(row, source, 1)
-            return radiance_along(medium, scatters, gradient, inflow, direction, ends)
+            # E, of the sum over moments of this direction's harmonics
+            along = torch.tensordot(row, emitted, 1)
+            return radiance_along(grid, extinction, along, gradient, direction, ends)
 
         radiance, gone = recompute(follow)
         if mirror is not None:
             mirror.left.append(gone)
         moments.addr_(weight * row, radiance.flatten())
     return moments.view(count, colors, *grid.shape)
-
-
-def _sweep_fused(
-    medium: Medium,
-    source: Tensor,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    directions: int,
-    mirror: Mirror | None,
-) -> Tensor:
-    """The same by fused kernels."""
-    from ddrecon.transport.fused.faces import sweep_faces
-    from ddrecon.transport.fused.sweep import sweep_fused
-
-    given = medium, source, gradient, inflow, directions
-    if mirror is None:
-        if not medium.grid.periodic:
-            return sweep_fused(*given)
-        return sweep_faces(*given, None)[0]
-    moments, gone = sweep_faces(*given, [mirror.entering(n) for n in range(directions)])
-    mirror.left.extend(gone)
-    return moments
 
 
 def sweep_change(

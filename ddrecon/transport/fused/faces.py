@@ -12,53 +12,55 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.transport.characteristics import Characteristic, Ends, enter_again
 from ddrecon.transport.fused.ordinates import ordinate_tables
-from ddrecon.transport.fused.sweep import sweep_chunk
+from ddrecon.transport.fused.sweep import sweep_ordinates
+from ddrecon.transport.mirror import Mirror
 from ddrecon.transport.sweep import sweep_rule
 
+Fields = tuple[Tensor, Tensor, Tensor]
+"""Extinction, what is emitted, and its gradient."""
 
-def sweep_faces(
-    medium: Medium,
-    source: Tensor,
+
+def sweep_fused(
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
     gradient: Tensor,
-    inflow: Tensor | None,
     directions: int,
-    ends: Sequence[Ends] | None,
-) -> tuple[Tensor, list[Ends]]:
-    """As `sweep` of `transport/sweep.py`, and what leaves the box along each direction.
-
-    `ends`: what enters along each besides `inflow`, None for nothing.
-    """
-    tables = ordinate_tables(medium.grid, directions, source, len(source))
+    mirror: Mirror | None,
+) -> Tensor:
+    """As `_sweep_emitted` of `transport/sweep.py`."""
+    fields = extinction, emitted, gradient
+    if not (emitted.is_cuda or grid.periodic or mirror):
+        return sweep_ordinates((grid, directions, None), *fields)[0]
+    tables = ordinate_tables(grid, directions, emitted, len(emitted))
     points, *_ = sweep_rule(directions, 1)
-    moments, gone = torch.zeros_like(source), dict[int, Ends]()
+    moments, gone = torch.zeros_like(emitted), dict[int, Ends]()
     for number, chunk in enumerate(tables.chunks):
         numbers = tables.numbers[chunk.ordinates]
-        courses = [Characteristic.of(medium.grid, points[n]) for n in numbers]
-        entering = None if ends is None else [ends[n] for n in numbers]
-        light, place = (source, gradient, inflow), (directions, number)
-        part, left = recompute(_sweep_chunk, medium, light, place, courses, entering)
+        courses = [Characteristic.of(grid, points[n]) for n in numbers]
+        ends = None if mirror is None else [mirror.entering(n) for n in numbers]
+        part, left = recompute(_sweep_chunk, (grid, directions, number), fields, courses, ends)
         moments = moments + part
-        gone |= zip(numbers, left, strict=True)
-    return moments, [gone[n] for n in range(directions)]
+        gone |= zip(numbers, left, strict=bool(left))
+    if mirror is not None:
+        mirror.left.extend(gone[n] for n in range(directions))
+    return moments
 
 
 def _sweep_chunk(
-    medium: Medium,
-    emitted: tuple[Tensor, Tensor, Tensor | None],
-    place: tuple[int, int],
+    of: tuple[Grid, int, int],
+    fields: Fields,
     courses: list[Characteristic],
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
-    """The moments of the ordinates of a chunk, and what leaves along each.
-
-    `emitted`: source, gradient and inflow; `place`: how many directions there are, and the chunk.
-    """
-    source, gradient, _ = emitted
-    nothing = [_nothing(course, source) for course in courses]
+    """The moments of the ordinates of a chunk, and what leaves along each if any enters."""
+    if ends is None and not any(course.wraps[0] for course in courses):
+        return sweep_ordinates(of, *fields)[0], []
+    grid, (extinction, emitted, gradient) = of[0], fields
+    nothing = [_nothing(course, emitted) for course in courses]
     ends = nothing if ends is None else ends
 
     def follow(across: Sequence[Tensor], is_dark: bool = False) -> tuple[Tensor, list[Ends]]:
@@ -67,12 +69,12 @@ def _sweep_chunk(
             (first, *end[1:])
             for first, end in zip(across, nothing if is_dark else ends, strict=True)
         ]
-        rings = [_place(medium.grid, *one) for one in zip(courses, entering, strict=True)]
-        dark = torch.zeros_like(source), torch.zeros_like(gradient), None
-        light = dark if is_dark else emitted
-        moments, ring = sweep_chunk(medium, *light, *place, torch.stack(rings))
+        rings = [_place(grid, *pair) for pair in zip(courses, entering, strict=True)]
+        dark = torch.zeros_like(emitted), torch.zeros_like(gradient)
+        light = dark if is_dark else (emitted, gradient)
+        moments, ring = sweep_ordinates(of, extinction, *light, torch.stack(rings))
         return moments, [
-            _leave(medium.grid, *one) for one in zip(courses, ring, entering, strict=True)
+            _leave(grid, *triple) for triple in zip(courses, ring, entering, strict=True)
         ]
 
     def leave(across: Sequence[Tensor], is_dark: bool = False) -> list[Tensor]:

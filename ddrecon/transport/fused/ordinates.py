@@ -47,8 +47,8 @@ class Tables:
 
     `chunks` are swept one after another. `arrays`: `teams` [T, 4] and `ordinates` [N, 13] have the
     structs `Team` and `Ordinate` of `ordinates.h`, `paths` [N, 8] the struct `Path`; `values` and
-    `weighted` [N, K] are harmonics, and harmonics times quadrature weights;
-    `moved` [N, 3] is a part of `paths`; `ones` [N, 1].
+    `weighted` [N, K] are harmonics times the path through a cell, and times quadrature weights;
+    `moved` [N, 3] is a part of `paths`.
     """
 
     numbers: list[int]
@@ -114,7 +114,7 @@ class Ordinate:
     def numbers(self) -> list[float]:
         """The struct `Path`."""
         lacking = [0.0] * (POINTS - len(self.weights))
-        return [self.step, *self.moved, *self.weights, *lacking]
+        return [self.step, *(self.step * m for m in self.moved), *self.weights, *lacking]
 
 
 def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[list[list[list[Ordinate]]]]:
@@ -180,12 +180,12 @@ def _make_tables(
         chunks.append(Chunk(first, len(order) - first, team, len(teams) - team))
     numbers = [o.number for o in order]
     values = harmonics[numbers]
+    paths = torch.tensor([o.numbers() for o in order], dtype=torch.float64)
     of_numbers = {
-        "paths": torch.tensor([o.numbers() for o in order], dtype=torch.float64),
-        "moved": torch.tensor([o.moved for o in order], dtype=torch.float64),
-        "values": values,
-        "weighted": values * values.new_tensor(weights)[numbers, None],
-        "ones": values.new_ones(len(order), 1),
+        "paths": paths,
+        "moved": paths[:, 1:4],
+        "values": paths[:, :1] * values,
+        "weighted": values.new_tensor(weights)[numbers, None] * values,
     }
     integers = {"teams": teams, "ordinates": [o.integers(grid.shape[2]) for o in order]}
     arrays = {
