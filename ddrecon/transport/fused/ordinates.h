@@ -339,10 +339,13 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         if constexpr (PASS == BACK) sum_moments(MEAN_BAR, of.bars, of.weighted, row, begin, end);
     }
     template <Pass PASS> INLINE void run_ordinate(const Row& row, int j) const {
-        const bool is_along = !BY_CELLS && ordinate(j).axis == 2, is_single = ordinate(j).count == 1;
+        const bool is_along = !BY_CELLS && ordinate(j).axis == 2,
+                   is_single = ordinate(j).count == 1;
         if constexpr (PASS == BACK) {
-            if (is_along) return_along(row, j), return_row<false, 4>(row, j);
-            else is_single ? return_row<true, 1>(row, j) : return_row<true, 4>(row, j);
+            if (is_along)
+                return_along(row, j), return_row<false, 4>(row, j);
+            else
+                is_single ? return_row<true, 1>(row, j) : return_row<true, 4>(row, j);
         } else {
             constexpr Result RESULT = PASS == LIGHT ? AFTER : BOTH;
             if (!is_along)

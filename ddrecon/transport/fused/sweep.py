@@ -157,9 +157,7 @@ class _ByRows(_Launches):
                 "light": light, "returning": self.ring(chunk, colors, 2), "bars": bars,
                 "extinction_bar": extinction, "gradient_bar": gradient, "sums": source,
             }  # fmt: skip
-            follow, go_back = (
-                self.bind(run, chunk, colors, **arrays) for run in ("LIGHT", "BACK")
-            )
+            follow, go_back = (self.bind(run, chunk, colors, **arrays) for run in ("LIGHT", "BACK"))
             for number, stage in reversed(stages):
                 light[:, :, (stage.start - 1) % planes] = saved[number, chunk.ordinates, colors]
                 follow(stage)
@@ -251,7 +249,11 @@ def _kernel(run: str, is_dual: bool, by_rows: bool, bits: int) -> TextKernel:
 
 
 def sweep_ordinates(
-    of: Ordinates, extinction: Tensor, source: Tensor, gradient: Tensor, entering: Tensor | None = None
+    of: Ordinates,
+    extinction: Tensor,
+    source: Tensor,
+    gradient: Tensor,
+    entering: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The moments [K, C, z, y, x] of radiance along ordinates `of` a quadrature set.
 
