@@ -156,25 +156,42 @@ def _follow_once(
 ) -> tuple[list[Tensor], Ends]:
     """I_in by slice, for what is `arriving` at the first; and what leaves the box."""
     entered, gone = list[Tensor](), (list[Tensor](), list[Tensor]())
-    ways = list(zip((1, 2), sides, gone, course.drift, course.wraps[1:], strict=True))
     # All slices at once: the adjoint of one by its number is an array of zeros as large as all.
     sources, shares = source.unbind(), passed.unbind()
     for k in range(len(source))[:: course.forward]:
         entered.append(arriving)
-        arriving = torch.addcmul(sources[k], shares[k], arriving)
-        # Part of each row goes on to the next, and of the last leaves the box; so of columns.
-        for dim, side, beyond, drift, is_around in ways:
-            if drift:
-                way, size = 1 if drift > 0 else -1, arriving.shape[dim]
-                last = arriving.select(dim, size - 1 if drift > 0 else 0)
-                beyond.append(last)
-                kept = arriving.narrow(dim, int(drift < 0), size - 1)
-                edge = last if is_around else torch.zeros_like(last) if side is None else side[k]
-                behind = torch.cat([edge.unsqueeze(dim), kept][::way], dim)
-                arriving = torch.lerp(arriving, behind, abs(drift))
-    nothing = torch.zeros_like(source[0])
-    rows, columns = (torch.stack(one[:: course.forward]) if one else nothing for one in gone)
+        light = torch.addcmul(sources[k], shares[k], arriving)
+        arriving, *beyond = drift(
+            light, [None if side is None else side[k] for side in sides], course
+        )
+        for layers, layer in zip(gone, beyond, strict=True):
+            layers.append(layer)
+    rows, columns = (torch.stack(layers[:: course.forward]) for layers in gone)
     return entered, (arriving, rows, columns)
+
+
+def drift(
+    light: Tensor, sides: Sequence[Tensor | None], course: Characteristic
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`light` [..., rows, columns] that leaves the cells of a slice, as it comes to the next.
+
+    A part of each row goes on to the next row, and so do parts of columns. `sides` [..., columns]
+    and [..., rows] are what enters the first, None for nothing. With what leaves the last ones.
+    """
+    gone = list[Tensor]()
+    for dim, side, moved, is_around in zip(
+        (-2, -1), sides, course.drift, course.wraps[1:], strict=True
+    ):
+        size = light.shape[dim]
+        last = light.select(dim, size - 1 if moved > 0 else 0)
+        gone.append(last if moved else torch.zeros_like(last))
+        if moved:
+            remaining = light.narrow(dim, int(moved < 0), size - 1)
+            edge = last if is_around else torch.zeros_like(last) if side is None else side
+            sense = 1 if moved > 0 else -1
+            behind = torch.cat([edge.unsqueeze(dim), remaining][::sense], dim)
+            light = torch.lerp(light, behind, abs(moved))
+    return light, gone[0], gone[1]
 
 
 def enter_again(

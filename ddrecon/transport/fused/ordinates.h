@@ -44,8 +44,8 @@ template <class F> struct Path {
 // What cells emit has moments `source` [count] and rises by `gradient` [3]. `values` and `weighted`
 // [ordinates, count] are harmonics times the path through a cell, and times quadrature weights.
 // `light` is I where it leaves cells, and `returning` are cotangents of I where it enters them: for
-// each ordinate and color a ring of `planes` or `back_planes` planes, numbered from where the team
-// begins, with a rim of zeros. So is `entering`, what enters cells from outside, null for nothing.
+// each ordinate and color a ring of `planes` or `back_planes` planes with a rim of zeros. So is
+// `entering`, what enters cells from outside, null for nothing.
 // `outputs` are what ordinates give in each cell, to be summed; by rows `sums` and cotangents are.
 // A launch has ordinates from `first` on, teams from `team` on, `together` colors from `color` on,
 // and `lanes` items for a team and color. It does planes `begin` to `end`, or the slice `begin`.
@@ -109,11 +109,9 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     // of its rise. By cells a third output is the cotangent of extinction.
     enum { EMITTED, CHANGE, MEAN_BAR = 1, MEAN = 0, SUM_BAR = 0, RISE_BAR, EXTINCTION_BAR };
     static constexpr int CELL = ROWS + 2;
-    // A row of cells, or one cell: the place of its first cell along z, counted from where the team
-    // begins, y and x, among cells, and among numbers in rings: in its plane and in that upwind, or
-    // downwind.
+    // Where a row of cells, or a cell, begins: among cells, and among numbers in rings, in its
+    // plane and in that upwind, or downwind.
     struct Row {
-        int place[3];
         long long at, light[2], returning[2];
     };
 
@@ -143,15 +141,22 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     INLINE F* ordinate_row(int kind, int j) const {
         return rows + (2 * (j - team.begin) + kind) * pitch;
     }
-    INLINE Row row(int z, int y, int x) const {
+    // The row `y` of plane `z`, counted from where the team begins. Rings hold the last planes.
+    INLINE Row row(int z, int y) const {
         const long long plane = team.sense > 0 ? z : of.depth - 1 - z;
-        const long long at = (y + 1) * row_size + x + 1, size = KINDS * plane_size;
+        const long long at = (y + 1) * row_size + 1, size = KINDS * plane_size;
         const int before = z > 0 ? (z - 1) % of.planes : of.planes - 1;
         return {
-            {z, y, x},
-            (plane * of.height + y) * of.width + x,
+            (plane * of.height + y) * of.width,
             {z % of.planes * size + at, before * size + at},
             {z % of.back_planes * size + at, (z + 1) % of.back_planes * size + at}};
+    }
+    // The cell at a `place`. Rings hold all planes, and one beyond either end.
+    INLINE Row cell(const int* place, int sense) const {
+        const long long size = KINDS * plane_size, step = sense * size;
+        const long long at = (place[0] + 1) * size + (place[1] + 1) * row_size + place[2] + 1;
+        const long long row = (long long)place[0] * of.height + place[1];
+        return {row * of.width + place[2], {at, at - step}, {at, at + step}};
     }
     // The place of an ordinate and this color in arrays of a launch.
     INLINE long long place(int j) const {
@@ -206,23 +211,21 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
 
     // Copies a number in a ring to beyond the opposite faces along which the grid is periodic, but
     // for those across which slices lie.
-    INLINE void repeat(F* ring, int planes, int j, const Row& row) const {
-        const int sizes[3] = {of.depth, of.height, of.width};
-        int places[3][3], counts[3];
+    INLINE void repeat(F* ring, int axis, const int* place, const Row& row) const {
+        const long long sizes[3] = {of.depth, of.height, of.width};
+        int first[3], last[3];
         for (int a = 0; a < 3; ++a) {
-            const int place = row.place[a], last = sizes[a] - 1;
-            const bool is_around = of.periodic >> a & 1 && a != ordinate(j).axis;
-            counts[a] = 1, places[a][0] = place;
-            if (is_around && place == 0) places[a][counts[a]++] = sizes[a];
-            if (is_around && place == last) places[a][counts[a]++] = -1;
+            const bool is_around = of.periodic >> a & 1 && a != axis;
+            first[a] = is_around && place[a] == sizes[a] - 1 ? -1 : 0;
+            last[a] = is_around && place[a] == 0 ? 1 : 0;
         }
         const F* const from = ring + row.light[0];
-        for (int z = 0; z < counts[0]; ++z)
-            for (int y = 0; y < counts[1]; ++y)
-                for (int x = 0; x < counts[2]; ++x) {
-                    const int plane = (places[0][z] + planes) % planes;
-                    F* const to = ring + plane * KINDS * plane_size +
-                                  (places[1][y] + 1) * row_size + places[2][x] + 1;
+        for (int z = first[0]; z <= last[0]; ++z)
+            for (int y = first[1]; y <= last[1]; ++y)
+                for (int x = first[2]; x <= last[2]; ++x) {
+                    const long long planes = KINDS * z * sizes[0] * plane_size;
+                    F* const to =
+                        ring + row.light[0] + planes + y * sizes[1] * row_size + x * sizes[2];
                     for (int k = 0; k < KINDS; ++k) to[k * plane_size] = from[k * plane_size];
                 }
     }
@@ -290,7 +293,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                     if (begin < end)
                         run_row<PASS>(
                             row(is_back ? of.end - 1 - (s - of.begin) : s,
-                                goes_up != is_back ? y : of.height - 1 - y, 0),
+                                goes_up != is_back ? y : of.height - 1 - y),
                             begin, end);
                 }
     }
@@ -310,28 +313,27 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         }
     }
     template <Pass PASS> INLINE void run_cell(int j) const {
-        const int axis = ordinate(j).axis, sizes[3] = {of.depth, of.height, of.width};
-        const int columns = sizes[axis == 2 ? 1 : 2], s = of.begin;
-        const int r = lane / columns, c = lane % columns;
-        if (s >= sizes[axis] + (of.entering != nullptr) || r >= sizes[axis == 0]) return;
+        const Ordinate& ordinate = this->ordinate(j);
+        const int axis = ordinate.axis, sizes[3] = {of.depth, of.height, of.width};
+        const int columns = sizes[axis == 2 ? 1 : 2], r = lane / columns, c = lane % columns;
+        const int s = of.begin, end = sizes[axis];
+        if (s >= end + (of.entering != nullptr) || r >= sizes[axis == 0]) return;
         int place[3] = {r, axis == 2 ? c : r, c};
-        place[axis] = axis && ordinate(j).senses[axis] < 0 ? sizes[axis] - 1 - s : s;
-        const Row row = this->row(place[0], place[1], place[2]);
-        if (s < sizes[axis]) {
+        place[axis] = ordinate.senses[axis] < 0 ? end - 1 - s : s;
+        const Row row = cell(place, ordinate.senses[0]);
+        F* const light = ring(of.light, of.planes, j);
+        if (s < end) {
             sum_sources<PASS>(row, j, j + 1);
             find_decays(row, path(j).step);
             run_ordinate<PASS>(row, j);
-        } else if constexpr (PASS != BACK) {
+            if (PASS != BACK) repeat(light, axis, place, row);
+        } else if (PASS != BACK) {
             // Light that leaves the last slice lies in the place of cells behind it.
-            F* const light = ring(of.light, of.planes, j);
             const N arriving = neighbors<4>(light, row.light, -1, j)(0) + entering(row, j);
             light[row.light[0]] = value_of(arriving);
             if constexpr (IS_DUAL<N>) light[row.light[0] + plane_size] = change_of(arriving);
         }
-        if constexpr (PASS == BACK)
-            repeat(ring(of.returning, of.planes, j), of.planes, j, row);
-        else if (s < sizes[axis])
-            repeat(ring(of.light, of.planes, j), of.planes, j, row);
+        if (PASS == BACK) repeat(ring(of.returning, of.planes, j), axis, place, row);
     }
     template <Pass PASS> INLINE void sum_sources(const Row& row, int begin, int end) const {
         sum_moments(EMITTED, of.source, of.values, row, begin, end);
@@ -341,26 +343,27 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     template <Pass PASS> INLINE void run_ordinate(const Row& row, int j) const {
         const bool is_along = !BY_CELLS && ordinate(j).axis == 2,
                    is_single = ordinate(j).count == 1;
+        constexpr bool HAS_MEAN = PASS == MOMENTS;
         if constexpr (PASS == BACK) {
             if (is_along)
                 return_along(row, j), return_row<false, 4>(row, j);
             else
                 is_single ? return_row<true, 1>(row, j) : return_row<true, 4>(row, j);
-        } else {
-            constexpr Result RESULT = PASS == LIGHT ? AFTER : BOTH;
-            if (!is_along)
-                return is_single ? follow_row<RESULT, 1>(row, j) : follow_row<RESULT, 4>(row, j);
-            follow_row<ALONG, 4>(row, j);
+        } else if (is_along) {
+            follow_row<HAS_MEAN, true, 4>(row, j);
             F* const to = ring(of.light, of.planes, j) + row.light[0];
             carry_on<N>(to, to + plane_size, ordinate(j).senses[2]);
-            if constexpr (PASS == MOMENTS) follow_row<WITHIN, 4>(row, j);
+            if constexpr (HAS_MEAN) add_along(row, j);
+        } else {
+            is_single ? follow_row<HAS_MEAN, false, 1>(row, j)
+                      : follow_row<HAS_MEAN, false, 4>(row, j);
         }
     }
 
-    // The result for a row: I where it leaves cells and its mean, or one of them. ALONG: I where
-    // it leaves cells, but for what comes from cells of the same row, and which part of that does.
-    enum Result { BOTH, AFTER, WITHIN, ALONG };
-    template <Result RESULT, int POINTS> APART void follow_row(const Row& row, int j) const {
+    // I where light leaves the cells of a row, and its mean if it HAS_MEAN. If it IS_ALONG, without
+    // what comes from cells of the same row; and which part of that goes on.
+    template <bool HAS_MEAN, bool IS_ALONG, int POINTS>
+    APART void follow_row(const Row& row, int j) const {
         const Path<F> path = this->path(j);
         const auto source = readable<N>(ordinate_row(EMITTED, j), ordinate_row(CHANGE, j));
         const auto e = field(of.extinction, of.d_extinction, row);
@@ -368,7 +371,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F* const light = ring(of.light, of.planes, j);
         auto upwind = neighbors<POINTS>(light, row.light, -1, j);
         const F along = upwind.weights[0];
-        if constexpr (RESULT == ALONG) upwind.weights[0] = F(0);
+        if constexpr (IS_ALONG) upwind.weights[0] = F(0);
         F *const to = light + row.light[0], *const d_to = to + plane_size;
         F *const mean = output(MEAN, j, row), *const decays = scratch;
         F *const carried = scratch + CARRIED * pitch, *const d_carried = carried + pitch;
@@ -382,17 +385,29 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                            path.moved[2] * rises[2 * all + c];
             const Emitted<N> emitted = {source[c], rise};
             const Attenuation<N> by = attenuate<F, N>(decay_at(decays, pitch, c), path.step * e[c]);
-            if constexpr (RESULT != WITHIN) {
-                const N after = light_after(arriving, emitted, by);
-                to[c] = value_of(after);
-                if constexpr (IS_DUAL<N>) d_to[c] = change_of(after);
-            }
-            if constexpr (RESULT == ALONG) {
+            const N after = light_after(arriving, emitted, by);
+            to[c] = value_of(after);
+            if constexpr (IS_DUAL<N>) d_to[c] = change_of(after);
+            if constexpr (HAS_MEAN) mean[c] = change_of(light_within(arriving, emitted, by));
+            if constexpr (IS_ALONG) {
                 carried[c] = along * value_of(by.passed);
                 if constexpr (IS_DUAL<N>) d_carried[c] = along * change_of(by.passed);
             }
-            if constexpr (RESULT == BOTH || RESULT == WITHIN)
-                mean[c] = change_of(light_within(arriving, emitted, by));
+        }
+    }
+    // Adds to the mean what comes from cells of the same row.
+    APART void add_along(const Row& row, int j) const {
+        const auto e = field(of.extinction, of.d_extinction, row);
+        const F* const from = ring(of.light, of.planes, j) + row.light[0] - ordinate(j).senses[2];
+        const auto arriving = readable<N>(from, from + plane_size);
+        const F along = path(j).weights[0], step = path(j).step, *const decays = scratch;
+        F* const mean = output(MEAN, j, row);
+        const long long pitch = this->pitch;
+        const int width = this->width;
+        INDEPENDENT
+        for (int c = 0; c < width; ++c) {
+            const N phi = attenuate<F, N>(decay_at(decays, pitch, c), step * e[c]).phi;
+            mean[c] += change_of(along * arriving[c] * phi);
         }
     }
     // What comes along a row itself is carried on from cell to cell.

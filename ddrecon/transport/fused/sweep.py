@@ -33,7 +33,6 @@ GIVEN = (
 MADE = "light returning scratch outputs sums gradient_bar extinction_bar"
 """What of that kernels write."""
 TABLES = "teams", "ordinates", "paths", "values", "weighted"
-FIELDS = "extinction", "source", "gradient"
 VECTOR = 16
 """Rows of numbers begin at multiples of so many."""
 ROWS = 7
@@ -43,11 +42,11 @@ SLAB = 4
 Ordinates = tuple[Grid, int, int | None]
 """A grid, how many directions cross it, and which chunk of them, by cells; None: all, by rows."""
 Fields = tuple[Tensor, Tensor, Tensor]
-"""What a sweep depends on: `extinction` [C, z, y, x], what cells emit as moments `source`
-[K, C, z, y, x], and its `gradient` [3, C, z, y, x] from cell to cell.
+"""What a sweep depends on: extinction [C, z, y, x], the moments [K, C, z, y, x] of what cells emit,
+and its gradient [3, C, z, y, x] from cell to cell.
 """
-Launch = Callable[[range], None]
-"""Does some planes, or a slice."""
+FIELDS = "extinction", "source", "gradient"
+"""Their names in kernels."""
 
 
 class _Launches:
@@ -69,6 +68,8 @@ class _Launches:
             self.lanes = second * largest
         pieces = self.pieces if self.by_rows else None
         self.tables = ordinate_tables(self.grid, directions, self.like, self.count, pieces)
+        # Rows and columns of a plane with its rim.
+        self.plane = self.grid.shape[1] + 2, self.grid.shape[2] + 2
 
     def ring(self, chunk: Chunk, colors: slice, planes: int) -> Tensor:
         """Planes of numbers, [ordinates, colors, planes, plane]; of changes, with these behind."""
@@ -76,40 +77,36 @@ class _Launches:
         together = colors.stop - colors.start
         return self.like.new_zeros(chunk.count, together, planes, *kinds, *self.plane)
 
-    @property
-    def plane(self) -> tuple[int, int]:
-        """Rows and columns of a plane with its rim."""
-        return self.grid.shape[1] + 2, self.grid.shape[2] + 2
+    def kernel(self, run: str) -> TextKernel:
+        """The kernel of a `run` of `Ordinates`."""
+        return _kernel(run, self.d_fields is not None, self.by_rows, 8 * self.like.itemsize)
 
-    def bind(self, run: str, chunk: Chunk, colors: slice, **arrays: Tensor | None) -> Launch:
-        """The kernel that does a `run` of `ordinates.h`, with these `arrays`."""
-        tables, together = self.tables, colors.stop - colors.start
+    def bind(
+        self, run: str, chunk: Chunk, colors: slice, **arrays: Tensor | None
+    ) -> Callable[[range], None]:
+        """The kernel of a `run`, given these `arrays`, as a function of planes, or of a slice."""
+        kernel, tables, together = self.kernel(run), self.tables, colors.stop - colors.start
         depth, height, width = self.grid.shape
         pitch, room = math.ceil(width / VECTOR) * VECTOR, ROWS + self.count + 2 * tables.most
-        items, returning = chunk.teams * together * self.lanes, arrays.get("returning")
+        items = chunk.teams * together * self.lanes
         if self.by_rows:
             arrays["scratch"] = self.like.new_empty(items * room * pitch)
-        bits, d_fields = 8 * self.like.itemsize, self.d_fields or (None,) * len(FIELDS)
-        kernel = _kernel(run, self.d_fields is not None, self.by_rows, bits)
-        light = arrays["light"]
-        assert light is not None
-        given = (
-            dict.fromkeys(kernel.arrays)
-            | dict(zip(FIELDS, self.fields, strict=True))
-            | {f"d_{name}": change for name, change in zip(FIELDS, d_fields, strict=True)}
-            | {name: tables.arrays[name] for name in TABLES}
-            | arrays
-            | {
-                "depth": depth, "height": height, "width": width, "count": self.count,
-                "periodic": sum(2**axis for axis in self.grid.periodic), "colors": self.colors,
-                "planes": light.shape[2], "back_planes": 1 if returning is None else returning.shape[2],
-                "pitch": pitch, "room": room, "first": chunk.first, "team": chunk.team,
-                "launched": chunk.count * together, "color": colors.start, "together": together,
-                "lanes": self.lanes, "begin": 0, "end": 0,
-            }
-        )  # fmt: skip
+        planes, back_planes = (
+            1 if ring is None else ring.shape[2] for ring in map(arrays.get, ("light", "returning"))
+        )
+        changes = self.d_fields or (None,) * len(FIELDS)
+        given = dict.fromkeys(kernel.arrays) | dict(zip(FIELDS, self.fields, strict=True))
+        given |= {f"d_{name}": change for name, change in zip(FIELDS, changes, strict=True)}
+        given |= {name: tables.arrays[name] for name in TABLES} | arrays
         made = {name: given.pop(name) for name in kernel.made}
-        bound = kernel.bind(given, made)
+        numbers = {
+            "depth": depth, "height": height, "width": width, "planes": planes,
+            "back_planes": back_planes, "periodic": sum(2**axis for axis in self.grid.periodic),
+            "count": self.count, "colors": self.colors, "pitch": pitch, "room": room,
+            "first": chunk.first, "launched": chunk.count * together, "team": chunk.team,
+            "color": colors.start, "together": together, "lanes": self.lanes, "begin": 0, "end": 0,
+        }  # fmt: skip
+        bound = kernel.bind(given | numbers, made)
 
         def launch(stage: range) -> None:
             threads = None
@@ -135,8 +132,7 @@ class _ByRows(_Launches):
             shape = len(stages), len(self.tables.numbers), self.colors, *self.plane
             saved = self.like.new_empty(shape)
             for run in ("LIGHT", "BACK"):
-                kernel = _kernel(run, False, True, 8 * self.like.itemsize)
-                launch_later(kernel.kernel, self.like)
+                launch_later(self.kernel(run).kernel, self.like)
         for chunk, colors in self._parts():
             light = self.ring(chunk, colors, 2)
             follow = self.bind("MOMENTS", chunk, colors, light=light, sums=moments)
@@ -249,27 +245,15 @@ def _kernel(run: str, is_dual: bool, by_rows: bool, bits: int) -> TextKernel:
 
 
 def sweep_ordinates(
-    of: Ordinates,
-    extinction: Tensor,
-    source: Tensor,
-    gradient: Tensor,
-    entering: Tensor | None = None,
+    of: Ordinates, fields: Fields, entering: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """The moments [K, C, z, y, x] of radiance along ordinates `of` a quadrature set.
 
-    The fields are as of `Fields`. Of a chunk the second result is light where it leaves cells, a
-    ring [ordinates, C, planes, y + 2, x + 2] (`ordinates.h`), and so is what is `entering` them.
+    Of a chunk the second result is light where it leaves cells, a ring
+    [ordinates, C, z + 2, y + 2, x + 2] (`ordinates.h`), and so is what is `entering` them.
     """
-    fields = extinction, source, gradient
-    return _Sweep.apply(of, torch.is_grad_enabled(), *fields, entering)  # type: ignore[no-any-return]
-
-
-def _launches(of: Ordinates, *fields: Any) -> Any:
-    return (_ByRows if of[2] is None else _ByCells)(of, *fields)
-
-
-def _contiguous(tensors: Any) -> Any:
-    return [tensor.contiguous() for tensor in tensors]
+    tensors = *(field.contiguous() for field in fields), entering
+    return _Sweep.apply(of, torch.is_grad_enabled(), *tensors)  # type: ignore[no-any-return]
 
 
 class _Sweep(torch.autograd.Function):
@@ -279,7 +263,7 @@ class _Sweep(torch.autograd.Function):
     def forward(of: Ordinates, may_save: bool, *tensors: Any) -> tuple[Tensor, Tensor | None]:
         *fields, entering = tensors
         saves = may_save and any(field.requires_grad for field in fields)
-        return _launches(of, _contiguous(fields)).follow(entering, saves)
+        return _launches(of, fields).follow(entering, saves)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
@@ -293,23 +277,26 @@ class _Sweep(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, bars: Tensor | None, light_bar: Tensor | None) -> tuple[Any, ...]:
         *fields, entering, light = ctx.saved_tensors
-        fields = _contiguous(fields)
         bars = torch.zeros_like(fields[1]) if bars is None else bars.contiguous()
         return None, None, *_launches(ctx.of, fields).go_back(bars, light, entering, light_bar)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, Tensor | None]:
         def change(*tensors: Any) -> Any:
-            *values, entering, _ = tensors[:5]
-            *d_values, d_entering = (
+            values, d_values = tensors[:4], tensors[4:]
+            *d_fields, d_entering = (
                 value if value is None else torch.zeros_like(value) if d is None else d
-                for value, d in zip(tensors[:4], tensors[5:], strict=True)
+                for value, d in zip(values, d_values, strict=True)
             )
+            *fields, entering = values
             if entering is not None:
                 entering = torch.stack([entering, d_entering], 3)
-            launches = _launches(ctx.of, _contiguous(values), _contiguous(d_values))
-            moments, light = launches.follow(entering)
+            moments, light = _launches(ctx.of, fields, d_fields).follow(entering)
             return moments if light is None else (moments, light[:, :, :, 1].contiguous())
 
-        d_results = run_plainly(change, *ctx.saved_tensors, *changes[2:])
+        d_results = run_plainly(change, *ctx.saved_tensors[:4], *changes[2:])
         return d_results if isinstance(d_results, tuple) else (d_results, None)
+
+
+def _launches(of: Ordinates, *fields: Any) -> Any:
+    return (_ByRows if of[2] is None else _ByCells)(of, *fields)
