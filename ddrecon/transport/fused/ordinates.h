@@ -343,27 +343,26 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     template <Pass PASS> INLINE void run_ordinate(const Row& row, int j) const {
         const bool is_along = !BY_CELLS && ordinate(j).axis == 2,
                    is_single = ordinate(j).count == 1;
-        constexpr bool HAS_MEAN = PASS == MOMENTS;
         if constexpr (PASS == BACK) {
             if (is_along)
                 return_along(row, j), return_row<false, 4>(row, j);
             else
                 is_single ? return_row<true, 1>(row, j) : return_row<true, 4>(row, j);
-        } else if (is_along) {
-            follow_row<HAS_MEAN, true, 4>(row, j);
+        } else {
+            constexpr Result RESULT = PASS == LIGHT ? AFTER : BOTH;
+            if (!is_along)
+                return is_single ? follow_row<RESULT, 1>(row, j) : follow_row<RESULT, 4>(row, j);
+            follow_row<ALONG, 4>(row, j);
             F* const to = ring(of.light, of.planes, j) + row.light[0];
             carry_on<N>(to, to + plane_size, ordinate(j).senses[2]);
-            if constexpr (HAS_MEAN) add_along(row, j);
-        } else {
-            is_single ? follow_row<HAS_MEAN, false, 1>(row, j)
-                      : follow_row<HAS_MEAN, false, 4>(row, j);
+            if constexpr (PASS == MOMENTS) follow_row<WITHIN, 4>(row, j);
         }
     }
 
-    // I where light leaves the cells of a row, and its mean if it HAS_MEAN. If it IS_ALONG, without
-    // what comes from cells of the same row; and which part of that goes on.
-    template <bool HAS_MEAN, bool IS_ALONG, int POINTS>
-    APART void follow_row(const Row& row, int j) const {
+    // The result for a row: I where it leaves cells and its mean, or one of them. ALONG: I where
+    // it leaves cells, but for what comes from cells of the same row, and which part of that does.
+    enum Result { BOTH, AFTER, WITHIN, ALONG };
+    template <Result RESULT, int POINTS> APART void follow_row(const Row& row, int j) const {
         const Path<F> path = this->path(j);
         const auto source = readable<N>(ordinate_row(EMITTED, j), ordinate_row(CHANGE, j));
         const auto e = field(of.extinction, of.d_extinction, row);
@@ -371,7 +370,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F* const light = ring(of.light, of.planes, j);
         auto upwind = neighbors<POINTS>(light, row.light, -1, j);
         const F along = upwind.weights[0];
-        if constexpr (IS_ALONG) upwind.weights[0] = F(0);
+        if constexpr (RESULT == ALONG) upwind.weights[0] = F(0);
         F *const to = light + row.light[0], *const d_to = to + plane_size;
         F *const mean = output(MEAN, j, row), *const decays = scratch;
         F *const carried = scratch + CARRIED * pitch, *const d_carried = carried + pitch;
@@ -385,29 +384,17 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                            path.moved[2] * rises[2 * all + c];
             const Emitted<N> emitted = {source[c], rise};
             const Attenuation<N> by = attenuate<F, N>(decay_at(decays, pitch, c), path.step * e[c]);
-            const N after = light_after(arriving, emitted, by);
-            to[c] = value_of(after);
-            if constexpr (IS_DUAL<N>) d_to[c] = change_of(after);
-            if constexpr (HAS_MEAN) mean[c] = change_of(light_within(arriving, emitted, by));
-            if constexpr (IS_ALONG) {
+            if constexpr (RESULT != WITHIN) {
+                const N after = light_after(arriving, emitted, by);
+                to[c] = value_of(after);
+                if constexpr (IS_DUAL<N>) d_to[c] = change_of(after);
+            }
+            if constexpr (RESULT == ALONG) {
                 carried[c] = along * value_of(by.passed);
                 if constexpr (IS_DUAL<N>) d_carried[c] = along * change_of(by.passed);
             }
-        }
-    }
-    // Adds to the mean what comes from cells of the same row.
-    APART void add_along(const Row& row, int j) const {
-        const auto e = field(of.extinction, of.d_extinction, row);
-        const F* const from = ring(of.light, of.planes, j) + row.light[0] - ordinate(j).senses[2];
-        const auto arriving = readable<N>(from, from + plane_size);
-        const F along = path(j).weights[0], step = path(j).step, *const decays = scratch;
-        F* const mean = output(MEAN, j, row);
-        const long long pitch = this->pitch;
-        const int width = this->width;
-        INDEPENDENT
-        for (int c = 0; c < width; ++c) {
-            const N phi = attenuate<F, N>(decay_at(decays, pitch, c), step * e[c]).phi;
-            mean[c] += change_of(along * arriving[c] * phi);
+            if constexpr (RESULT == BOTH || RESULT == WITHIN)
+                mean[c] = change_of(light_within(arriving, emitted, by));
         }
     }
     // What comes along a row itself is carried on from cell to cell.
