@@ -65,7 +65,7 @@ class Characteristic:
         ]
         slicing = Slicing.of(speed, grid.periodic)
         fastest = abs(speed[slicing.axis])
-        drifts = (speed[other] / fastest for other in across(slicing.axis))
+        drifts = (speed[axis] / fastest for axis in across(slicing.axis))
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
         slices, rows, columns = (
             slicing.order[dim] - 1 in grid.periodic for dim in (SLICES, ROWS, COLUMNS)
@@ -120,10 +120,10 @@ def radiance_along(
     rise = torch.tensordot(constant(course.moved, gradient), gradient, 1)
     depth, e, r = (course.lay(field * course.step) for field in (extinction, emitted, rise))
     phi, psi, eta = decay_terms(depth)
-    passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
-    passed, source, own, phi = torch.broadcast_tensors(passed, source, own, phi)
+    passed, source, within = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
+    passed, source, within, phi = torch.broadcast_tensors(passed, source, within, phi)
     arriving, gone = follow(passed, source, course, ends)
-    return course.lift(torch.addcmul(own, arriving, phi)), gone
+    return course.lift(torch.addcmul(within, arriving, phi)), gone
 
 
 def follow(
@@ -211,19 +211,20 @@ def enter_again(
             break
         before, after = entering, leave(entering)
         entering = [
-            old if rest else new for old, new, rest in zip(before, after, rests, strict=True)
+            old if is_steady else new
+            for old, new, is_steady in zip(before, after, rests, strict=True)
         ]
         rests = [
-            rest or _is_at_rest(old, new)
-            for rest, old, new in zip(rests, before, after, strict=True)
+            is_steady or _is_at_rest(old, new)
+            for is_steady, old, new in zip(rests, before, after, strict=True)
         ]
     if not any(is_whole):
         return entering
     # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
-    shares = leave([torch.ones_like(one) for one in nothing], is_dark=True)
+    shares = leave([torch.ones_like(dark) for dark in nothing], is_dark=True)
     return [
-        _double(one, share, course) if is_so else slanted
-        for one, share, course, is_so, slanted in zip(
+        _double(light, share, course) if is_parallel else slanted
+        for light, share, course, is_parallel, slanted in zip(
             first, shares, courses, is_whole, entering, strict=True
         )
     ]

@@ -79,8 +79,8 @@ def run_rounds(
 def _residual(new: Tensor, old: Tensor) -> Tensor:
     """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
     squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
-    changed, whole = squares
-    return (changed / whole.clamp(min=1e-300)).amax().sqrt()
+    change, size = squares
+    return (change / size.clamp(min=1e-300)).amax().sqrt()
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:

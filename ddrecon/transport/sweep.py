@@ -114,14 +114,14 @@ def sweep_change(
 def _scatter(light: Cut, source: Cut, factors: Tensor) -> Cut:
     """p_l phi_k + Q_k (E2.8); moments that one of them lacks are zero there."""
     scatters = list[Tensor]()
-    by_part = cut(by_harmonic(factors, len(factors) - 1))
-    for phi, q, factor in zip(light, source, by_part, strict=True):
+    factors_cut = cut(by_harmonic(factors, len(factors) - 1))
+    for phi, q, p in zip(light, source, factors_cut, strict=True):
         few = min(len(phi), len(q))
-        both = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, factor, phi))
-        parts = [torch.addcmul(*both)] if few else []
-        parts += [q[few:]] if len(q) > few else []
-        parts += [factor[few : len(phi)] * phi[few:]] if len(phi) > few else []
-        scatters.append(torch.cat(parts) if len(parts) > 1 else (*parts, phi[:0])[0])
+        known = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, p, phi))
+        pieces = [torch.addcmul(*known)] if few else []
+        pieces += [q[few:]] if len(q) > few else []
+        pieces += [p[few : len(phi)] * phi[few:]] if len(phi) > few else []
+        scatters.append(torch.cat(pieces) if len(pieces) > 1 else (*pieces, phi[:0])[0])
     return scatters[0], scatters[1]
 
 
@@ -132,12 +132,12 @@ def emitted_light(medium: Medium, scatters: Cut, inflow: Tensor | None = None) -
     there without a medium, and what is swept is the rest, I - inflow. So a white furnace is exact.
     """
     scattering, (low, high) = medium.remaining.value, scatters
-    parts = [scattering * low]
+    moments = [scattering * low]
     if inflow is not None:
         mean, first = low.split([1, len(low) - 1])
-        parts = [scattering * mean - medium.extinction.value * inflow, scattering * first]
-    parts = [part for part in (*parts, scattering * high) if len(part)]
-    return torch.cat(parts) if len(parts) > 1 else parts[0]
+        moments = [scattering * mean - medium.extinction.value * inflow, scattering * first]
+    moments = [field for field in (*moments, scattering * high) if len(field)]
+    return torch.cat(moments) if len(moments) > 1 else moments[0]
 
 
 def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
@@ -180,8 +180,8 @@ def _spread(grid: Grid, directions: int) -> tuple[list[float], list[float]]:
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     speed = (points / points.new_tensor(grid.spacing)).abs()
     step = 1 / speed.amax(1)
-    part = step[:, None] * speed
-    over = weights / step @ (part * (1 - part) * points.new_tensor(grid.spacing) ** 2)
+    moved = step[:, None] * speed
+    over = weights / step @ (moved * (1 - moved) * points.new_tensor(grid.spacing) ** 2)
     first, second = (weights * power @ points**2 for power in (step, step**2))
     share = 0.5 * over / first
     return torch.where(share > NEARLY, share, 0.0).tolist(), (second / first).tolist()

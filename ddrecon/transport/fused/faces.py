@@ -40,8 +40,10 @@ def sweep_fused(
         numbers = tables.numbers[chunk.ordinates]
         courses = [Characteristic.of(grid, points[n]) for n in numbers]
         ends = None if mirror is None else [mirror.entering(n) for n in numbers]
-        part, left = recompute(_sweep_chunk, (grid, directions, number), fields, courses, ends)
-        moments = moments + part
+        chunk_moments, left = recompute(
+            _sweep_chunk, (grid, directions, number), fields, courses, ends
+        )
+        moments = moments + chunk_moments
         gone |= zip(numbers, left, strict=bool(left))
     if mirror is not None:
         mirror.left.extend(gone[n] for n in range(directions))
@@ -68,11 +70,10 @@ def _sweep_chunk(
             for first, end in zip(across, nothing if is_dark else ends, strict=True)
         ]
         rings = [_ring_of_ends(*pair) for pair in zip(courses, entering, strict=True)]
-        sources = [torch.zeros_like(field) if is_dark else field for field in (emitted, gradient)]
-        swept = extinction, *sources
-        moments, rings_left = sweep_ordinates(of, swept, torch.stack(rings))
+        dark = extinction, torch.zeros_like(emitted), torch.zeros_like(gradient)
+        moments, light = sweep_ordinates(of, dark if is_dark else fields, torch.stack(rings))
         return moments, [
-            _ends_of_ring(*triple) for triple in zip(courses, rings_left, entering, strict=True)
+            _ends_of_ring(*triple) for triple in zip(courses, light, entering, strict=True)
         ]
 
     def leave(across: Sequence[Tensor], is_dark: bool = False) -> list[Tensor]:

@@ -104,9 +104,9 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     // Rows of scratch: decay terms in a row, and what is carried on along it. Behind these are
     // copies of moments, and two rows for each ordinate.
     enum { PHI, PSI, ETA, ETA_SLOPE, PASSED, CARRIED, D_CARRIED, ROWS };
-    // Rows of an ordinate: what it is emitted along it, and the change of that or the cotangent of
-    // the mean. In their place come what it gives: the mean, or cotangents of what is emitted and
-    // of its rise. By cells a third output is the cotangent of extinction.
+    // Rows of an ordinate: what cells emit along it, and the change of that or the cotangent of the
+    // mean. Its outputs replace them: the mean, or cotangents of what is emitted and of its rise.
+    // By cells a third output is the cotangent of extinction.
     enum { EMITTED, CHANGE, MEAN_BAR = 1, MEAN = 0, SUM_BAR = 0, RISE_BAR, EXTINCTION_BAR };
     static constexpr int CELL = ROWS + 2;
     // Where a row of cells, or a cell, begins: among cells, and among numbers in rings, in its
@@ -260,7 +260,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
             count, end - begin, width);
     }
     // Decay terms in a row, by the path through a cell: ordinates with the same one share them.
-    APART void find_decays(const Row& row, F step) const {
+    template <bool HAS_SLOPES> APART void find_decays(const Row& row, F step) const {
         const F* const e = of.extinction + color * cells + row.at;
         F* const decays = scratch;
         const long long pitch = this->pitch;
@@ -270,7 +270,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
             const Decay<F> by = decay_along(step * e[c]);
             decays[PHI * pitch + c] = by.phi, decays[PSI * pitch + c] = by.psi;
             decays[ETA * pitch + c] = by.eta, decays[PASSED * pitch + c] = by.passed;
-            decays[ETA_SLOPE * pitch + c] = by.eta_slope;
+            if constexpr (HAS_SLOPES) decays[ETA_SLOPE * pitch + c] = by.eta_slope;
         }
     }
     static INLINE Decay<F> decay_at(const F* decays, long long pitch, int c) {
@@ -281,6 +281,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
 
     // Follows light through the cells, for its moments or for itself alone; or returns cotangents.
     enum Pass { MOMENTS, LIGHT, BACK };
+    template <Pass PASS> static constexpr bool HAS_SLOPES = PASS == BACK || IS_DUAL<N>;
     template <Pass PASS> INLINE void run() const {
         if constexpr (BY_CELLS)
             run_cell<PASS>(team.begin);
@@ -301,7 +302,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         sum_sources<PASS>(row, begin, end);
         F step = F(0);
         for (int j = begin; j < end; ++j) {
-            if (path(j).step != step) find_decays(row, step = path(j).step);
+            if (path(j).step != step) find_decays<HAS_SLOPES<PASS>>(row, step = path(j).step);
             run_ordinate<PASS>(row, j);
         }
         if constexpr (PASS == MOMENTS)
@@ -324,7 +325,7 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
         F* const light = ring(of.light, of.planes, j);
         if (s < end) {
             sum_sources<PASS>(row, j, j + 1);
-            find_decays(row, path(j).step);
+            find_decays<HAS_SLOPES<PASS>>(row, path(j).step);
             run_ordinate<PASS>(row, j);
             if (PASS != BACK) repeat(light, axis, place, row);
         } else if (PASS != BACK) {

@@ -79,7 +79,7 @@ class Ordinate:
         course = Characteristic.of(grid, direction)
         axis, moved = course.order[0] - 1, course.moved
         points, weights = list[tuple[int, ...]](), list[float]()
-        for point in product(*((1,) if other == axis else (0, 1) for other in range(3))):
+        for point in product(*((1,) if a == axis else (0, 1) for a in range(3))):
             weight = math.prod(
                 abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True)
             )

@@ -95,10 +95,10 @@ class _Launches:
             1 if ring is None else ring.shape[2] for ring in map(arrays.get, ("light", "returning"))
         )
         changes = self.d_fields or (None,) * len(FIELDS)
-        given = dict.fromkeys(kernel.arrays) | dict(zip(FIELDS, self.fields, strict=True))
-        given |= {f"d_{name}": change for name, change in zip(FIELDS, changes, strict=True)}
-        given |= {name: tables.arrays[name] for name in TABLES} | arrays
-        made = {name: given.pop(name) for name in kernel.made}
+        inputs = dict.fromkeys(kernel.arrays) | dict(zip(FIELDS, self.fields, strict=True))
+        inputs |= {f"d_{name}": change for name, change in zip(FIELDS, changes, strict=True)}
+        inputs |= {name: tables.arrays[name] for name in TABLES} | arrays
+        outputs = {name: inputs.pop(name) for name in kernel.made}
         numbers = {
             "depth": depth, "height": height, "width": width, "planes": planes,
             "back_planes": back_planes, "periodic": sum(2**axis for axis in self.grid.periodic),
@@ -106,7 +106,7 @@ class _Launches:
             "first": chunk.first, "launched": chunk.count * together, "team": chunk.team,
             "color": colors.start, "together": together, "lanes": self.lanes, "begin": 0, "end": 0,
         }  # fmt: skip
-        bound = kernel.bind(given | numbers, made)
+        bound = kernel.bind(inputs | numbers, outputs)
 
         def launch(stage: range) -> None:
             threads = None
@@ -133,7 +133,7 @@ class _ByRows(_Launches):
             saved = self.like.new_empty(shape)
             for run in ("LIGHT", "BACK"):
                 launch_later(self.kernel(run).kernel, self.like)
-        for chunk, colors in self._parts():
+        for chunk, colors in self._shares():
             light = self.ring(chunk, colors, 2)
             follow = self.bind("MOMENTS", chunk, colors, light=light, sums=moments)
             for number, stage in enumerate(stages):
@@ -142,12 +142,12 @@ class _ByRows(_Launches):
                 follow(stage)
         return _total(moments), saved
 
-    def go_back(self, bars: Tensor, saved: Tensor, *_: None) -> tuple[Tensor, ...]:
+    def go_back(self, bars: Tensor, saved: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         """Cotangents of `fields`, of those of moments, `bars`, and what `follow` has saved."""
         counts = 1, self.count, 3
         totals = extinction, source, gradient = (*map(self._sums, counts),)
         planes, stages = SLAB + 1, list(enumerate(self._stages()))
-        for chunk, colors in self._parts():
+        for chunk, colors in self._shares():
             light = self.ring(chunk, colors, planes)
             arrays = {
                 "light": light, "returning": self.ring(chunk, colors, 2), "bars": bars,
@@ -158,10 +158,10 @@ class _ByRows(_Launches):
                 light[:, :, (stage.start - 1) % planes] = saved[number, chunk.ordinates, colors]
                 follow(stage)
                 go_back(stage)
-        extinction_bar, *others = map(_total, totals)
-        return extinction_bar[0], *others, None
+        extinction_bar, *fields_bar = map(_total, totals)
+        return extinction_bar[0], *fields_bar, None
 
-    def _parts(self) -> Iterator[tuple[Chunk, slice]]:
+    def _shares(self) -> Iterator[tuple[Chunk, slice]]:
         """Ordinates and colors swept side by side."""
         for chunk in self.tables.chunks:
             for color in range(0, self.colors, self.together):
@@ -201,7 +201,7 @@ class _ByCells(_Launches):
 
     def go_back(
         self, bars: Tensor, light: Tensor, entering: Tensor | None, light_bar: Tensor | None
-    ) -> tuple[Tensor, ...]:
+    ) -> tuple[Tensor | None, ...]:
         """Cotangents of `fields` and of what is `entering`, of those of moments and `light`."""
         chunk, colors = self._all()
         # The cotangent of what enters takes the place of that of light.
@@ -253,7 +253,8 @@ def sweep_ordinates(
     [ordinates, C, z + 2, y + 2, x + 2] (`ordinates.h`), and so is what is `entering` them.
     """
     tensors = *(field.contiguous() for field in fields), entering
-    return _Sweep.apply(of, torch.is_grad_enabled(), *tensors)  # type: ignore[no-any-return]
+    swept: tuple[Tensor, Tensor] = _Sweep.apply(of, torch.is_grad_enabled(), *tensors)
+    return swept
 
 
 class _Sweep(torch.autograd.Function):
@@ -289,7 +290,7 @@ class _Sweep(torch.autograd.Function):
                 for value, d in zip(values, d_values, strict=True)
             )
             *fields, entering = values
-            if entering is not None:
+            if entering is not None and d_entering is not None:
                 entering = torch.stack([entering, d_entering], 3)
             moments, light = _launches(ctx.of, fields, d_fields).follow(entering)
             return moments if light is None else (moments, light[:, :, :, 1].contiguous())
