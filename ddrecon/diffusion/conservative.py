@@ -83,7 +83,8 @@ class DiffusionProblem:
         return self._operator(z, y, x, loss), self._with_emission(right)
 
     def _operator(self, z: Tensor, y: Tensor, x: Tensor, loss: Tensor) -> Operator:
-        return Operator((z, y, x), loss, self.medium.grid.periodic)
+        grid = self.medium.grid
+        return Operator((z, y, x), loss, grid.periodic, grid.spacing)
 
     def _with_emission(self, right: Tensor) -> Tensor:
         return right if self.medium.emission is None else right + self.medium.emission

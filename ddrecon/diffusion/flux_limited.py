@@ -74,7 +74,7 @@ class LimitedOperator(AutodiffOperator):
         diffusion = limit_diffusion(u, extinction, self.grid)
         escape = boundary_loss(diffusion, self.grid)
         z, y, x = (conductance(diffusion, self.grid, axis) for axis in AXES)
-        operator = Operator((z, y, x), absorption + escape)
+        operator = Operator((z, y, x), absorption + escape, spacing=self.grid.spacing)
         product = operator.apply(u) - escape * outside
         for axis, component in zip(AXES, flux, strict=bool(flux)):
             faces = face_fluxes(None, component, diffusion, self.grid, axis)

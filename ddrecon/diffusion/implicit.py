@@ -237,5 +237,5 @@ def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor)
     solvers prepare about the operator serves all its solves.
     """
     tensors = source, operator.loss, *operator.conductances
-    assemble = partial(Operator.of, operator.periodic)
+    assemble = partial(Operator.of, operator.periodic, operator.spacing)
     return ImplicitSolve.apply(solve, assemble, operator.prepared, *tensors)

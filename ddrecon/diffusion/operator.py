@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
+from ddrecon.grid import Grid, Triple
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -35,13 +35,15 @@ class Operator:
     `conductances`: c [1/u] on the faces above cells along z, y, x, `[C, z, y, x]`; zero on the box
     and along axes of a single cell. `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0.
     Conductances that all colors share may be given once. `periodic`: the axes, 0 to 2, along which
-    the last face may conduct: kernels do not look past the ends of others. `prepared`: what solvers
-    have computed from these numbers; to be handed on with them only.
+    the last face may conduct: kernels do not look past the ends of others. `spacing`: that of cells
+    along z, y, x, up to a factor. `prepared`: what solvers have computed from these numbers; to be
+    handed on with them only.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
     loss: Tensor
     periodic: tuple[int, ...] = ()
+    spacing: Triple = (1.0, 1.0, 1.0)
     prepared: dict[Callable[[Operator], Any], Any] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -49,13 +51,14 @@ class Operator:
     @staticmethod
     def of(
         periodic: tuple[int, ...],
+        spacing: Triple,
         prepared: dict[Callable[[Operator], Any], Any],
         loss: Tensor,
         *conductances: Tensor,
     ) -> Operator:
         """The operator of `loss` and three conductances, in the order of its derivatives."""
         z, y, x = conductances
-        return Operator((z, y, x), loss, periodic, prepared)
+        return Operator((z, y, x), loss, periodic, spacing, prepared)
 
     @property
     def along_axes(self) -> Iterator[tuple[int, Tensor]]:
