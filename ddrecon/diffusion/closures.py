@@ -38,13 +38,8 @@ GAP = 1.0
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
     """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
-    least = least_extinction(grid, floor)
+    least = floor / min(grid.extent)
     return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
-
-
-def least_extinction(grid: Grid, floor: float) -> float:
-    """kappa_tr [1/u] that `smooth` gives empty space."""
-    return floor / min(grid.extent)
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:

@@ -19,8 +19,8 @@ from ddrecon.diffusion.operator import (
     AXES,
     Operator,
     boundary_loss,
-    cell_average,
     conductance,
+    face_average,
     face_fluxes,
 )
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
@@ -53,10 +53,10 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        if is_fused() and isinstance(self.closure, Closure):
+        if is_fused() and isinstance(self.closure, Closure) and self.closure.name == "geometric":
             from ddrecon.diffusion.fused.closure import close_medium
 
-            return close_medium(self.medium, self.closure)
+            return close_medium(self.medium)
         return recompute(lambda: self.closure(self.medium.transport_extinction))
 
     @property
@@ -170,4 +170,4 @@ def axis_flux(
     """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
     given = diffusion, medium.grid, axis, outside, face_resistance(medium.index)
-    return 3 * cell_average(face_fluxes(mean, source, *given), axis)
+    return 3 * face_average(face_fluxes(mean, source, *given), axis)

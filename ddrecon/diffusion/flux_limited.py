@@ -21,8 +21,8 @@ from ddrecon.diffusion.operator import (
     AXES,
     Operator,
     boundary_loss,
-    cell_average,
     conductance,
+    face_average,
     face_fluxes,
 )
 from ddrecon.diffusion.solve import Solution, solve_by_multigrid
@@ -53,7 +53,7 @@ def limit_diffusion(u: Tensor, extinction: Tensor, grid: Grid) -> Tensor:
         if u.shape[axis] > 1:
             slopes = u.diff(dim=axis) / step
             ends = slopes.narrow(axis, 0, 1), slopes.narrow(axis, slopes.shape[axis] - 1, 1)
-            slopes = cell_average(torch.cat([ends[0], slopes, ends[1]], axis), axis)
+            slopes = face_average(torch.cat([ends[0], slopes, ends[1]], axis), axis)
             square = square + 4 * slopes**2 / light
     return 1 / square.sqrt()
 
@@ -118,7 +118,7 @@ def solve_flux_limited(
     diffusion = limit_diffusion(mean, extinction, grid)
     moments = moments_of_flux(
         [
-            3 * cell_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
+            3 * face_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
             for axis, component in zip(AXES, flux or (None, None, None), strict=True)
         ]
     )
