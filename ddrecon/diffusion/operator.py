@@ -154,11 +154,9 @@ def boundary_loss(diffusion: Tensor, grid: Grid, resistance: float = 2.0) -> Ten
     """
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        if axis - 1 not in grid.periodic:
-            for loss_at, diffusion_at in zip(
-                _ends(loss, axis), _ends(diffusion, axis), strict=True
-            ):
-                loss_at.add_(escape(diffusion_at, step, resistance) / step)
+        for end in (0, 1) if axis - 1 not in grid.periodic else ():
+            lost = escape(_ends(diffusion, axis)[end], step, resistance) / step
+            _ends(loss, axis)[end].add_(lost)
     return loss
 
 
@@ -205,7 +203,7 @@ def add_ghosts(u: Tensor, axis: int, is_periodic: bool, outside: Tensor | None =
 
 
 def face_average(u: Tensor, axis: int) -> Tensor:
-    """The mean of neighbors along `axis`, one entry less: on faces of cells, or in cells of faces."""
+    """The mean of neighbors along `axis`, one entry less: of cells on faces, or the reverse."""
     lower, upper = _neighbors(u, axis)
     return 0.5 * (lower + upper)
 
