@@ -103,14 +103,12 @@ class Operator:
         )
         return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
 
-    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
-        """dA u = dloss u + G^T (dc G u), term by term (E3.1)."""
-        d_loss, *d_conductances = d_tensors
-        if d_loss is not None:
-            yield d_loss * u
-        for axis, d_conductance in zip(AXES, d_conductances, strict=True):
-            if d_conductance is not None:
-                yield accumulate(d_conductance * difference(u, axis), axis)
+    def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
+        """dA u = dloss u + G^T (dc G u) of each axis (E3.1)."""
+        tensors = self.loss, *self.conductances
+        pairs = zip(tensors, d_tensors, strict=True)
+        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs)
+        return Operator.of(self.periodic, self.spacing, {}, *changes).apply(u)
 
 
 def difference(u: Tensor, axis: int) -> Tensor:
