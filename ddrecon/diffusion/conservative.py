@@ -98,7 +98,9 @@ class DiffusionProblem:
         along_axes = [None] * 3 if first is None else flux_along_axes(first)
         moments = moments_of_flux(
             [
-                recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
+                recompute(
+                    _average_flux, self.medium, self.diffusion, flux, self.outside, mean, axis
+                )
                 for axis, flux in zip(AXES, along_axes, strict=True)
             ]
         )
@@ -153,13 +155,11 @@ def _loss_and_source(
 
 def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
     """The part along `axis` of div(D kappa_s Q1)."""
-    scattered = medium.remaining_scattering * source_flux
-    resistance = face_resistance(medium.index)
-    faces = face_fluxes(None, scattered, diffusion, medium.grid, axis, resistance=resistance)
+    faces = _find_flow(medium, diffusion, source_flux, None, None, axis)
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
-def axis_flux(
+def _average_flux(
     medium: Medium,
     diffusion: Tensor,
     source_flux: Tensor | None,
@@ -168,6 +168,19 @@ def axis_flux(
     axis: int,
 ) -> Tensor:
     """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
-    source = None if source_flux is None else medium.remaining_scattering * source_flux
-    given = diffusion, medium.grid, axis, outside, face_resistance(medium.index)
-    return 3 * face_average(face_fluxes(mean, source, *given), axis)
+    faces = _find_flow(medium, diffusion, source_flux, outside, mean, axis)
+    return 3 * face_average(faces, axis)
+
+
+def _find_flow(
+    medium: Medium,
+    diffusion: Tensor,
+    source_flux: Tensor | None,
+    outside: Tensor | None,
+    mean: Tensor | None,
+    axis: int,
+) -> Tensor:
+    """F along `axis` on all faces, for Q1 = `source_flux` and L0 = `mean`."""
+    scattered = None if source_flux is None else medium.remaining_scattering * source_flux
+    resistance = face_resistance(medium.index)
+    return face_fluxes(mean, scattered, diffusion, medium.grid, axis, outside, resistance)

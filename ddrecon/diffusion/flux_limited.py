@@ -139,7 +139,7 @@ def iterate_picard(
         matrix, product = operator.with_matrix(u)
         step = DAMPING * solve_by_multigrid(matrix, source - product, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
-        size, length = (torch.linalg.vector_norm(each, dim=(1, 2, 3)) for each in (u, step))
+        size, length = (torch.linalg.vector_norm(field, dim=(1, 2, 3)) for field in (u, step))
         change = float((length / size.clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
         message = "flux-limited diffusion did not reach its tolerance"

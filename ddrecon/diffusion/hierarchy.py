@@ -69,7 +69,7 @@ class Coarsening:
 class Level:
     """A grid that is relaxed on, and the `coarsenings` to the next one, axis by axis.
 
-    `inverse` [u]: 1 / diagonal. `kept`: the part of the diagonal that a cell exchanges with its
+    `inverse` [u]: 1 / diagonal. `coupling`: the part of the diagonal that a cell exchanges with its
     neighbors. Corrections from the coarser grid are multiplied by it: by 1 where nothing is lost,
     by nearly nothing where light is absorbed before it gets to the next cell. Else they would carry
     errors of bright cells into dark ones, where light then falls below zero.
@@ -77,7 +77,7 @@ class Level:
 
     operator: Operator
     inverse: Tensor
-    kept: Tensor
+    coupling: Tensor
     coarsenings: tuple[Coarsening, ...]
 
 
@@ -85,7 +85,7 @@ class Passes:
     """What multigrid computes, each a pass over the cells of a grid, by torch's operations."""
 
     def scale(self, operator: Operator) -> tuple[Tensor, Tensor]:
-        """`inverse` and `kept` of a `Level`."""
+        """`inverse` and `coupling` of a `Level`."""
         inverse = 1 / operator.diagonal
         return inverse, operator.exchanged * inverse
 
@@ -119,8 +119,8 @@ class Passes:
         return u + step * level.inverse * (source - level.operator.apply(u))
 
     def residual(self, level: Level, u: Any, source: Any) -> Any:
-        """`source` - A u, times what is `kept`."""
-        return level.kept * (source - level.operator.apply(u))
+        """`coupling` times (`source` - A u)."""
+        return level.coupling * (source - level.operator.apply(u))
 
     def restrict(self, level: Level, residual: Any) -> Any:
         """The residual of the coarser grid's cells, by the transpose of `prolong`."""
@@ -133,10 +133,10 @@ class Passes:
         return (inverse @ source.flatten(1).unsqueeze(-1)).view_as(source)
 
     def correct(self, level: Level, u: Any, coarse: Any) -> Any:
-        """u plus what is `kept` of the `coarse` grid's solution, interpolated."""
+        """u plus `coupling` times the `coarse` grid's solution, interpolated."""
         for coarsening in reversed(level.coarsenings):
             coarse = prolong(coarsening, coarse)
-        return u + level.kept * coarse
+        return u + level.coupling * coarse
 
 
 def restrict(coarsening: Coarsening, residual: Tensor) -> Tensor:

@@ -11,8 +11,8 @@ from ddrecon.kernels.cell_function import RowFunction, Tensors
 from ddrecon.medium.coefficients import Medium
 
 HEADER = "diffusion/fused/faces.h"
-PLACE = "Mesh<F>(row, nz, ny, nx, periodic, hz, hy, hx), own, "
-GIVEN = "int nz, ny, nx, periodic, own; F hz, hy, hx"
+PLACE = "Mesh<F>(row, nz, ny, nx, periodic, hz, hy, hx), matrix_colors, "
+GIVEN = "int nz, ny, nx, periodic, matrix_colors; F hz, hy, hx"
 
 
 def assemble_system(
@@ -75,7 +75,7 @@ def _find(
     shapes = (*moments, colors, *grid.shape), *shapes
     z, y, x = grid.shape
     place = {"nz": z, "ny": y, "nx": x, **dict(zip(("hz", "hy", "hx"), grid.spacing, strict=True))}
-    place |= {"periodic": sum(1 << axis for axis in grid.periodic), "own": len(diffusion)}
+    place |= {"periodic": sum(1 << axis for axis in grid.periodic), "matrix_colors": len(diffusion)}
     function = RowFunction(HEADER, f"Flow<{flow}>", shapes, x, PLACE, GIVEN, place, added)
-    each = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
-    return function.apply(each, *fields)
+    stacked = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
+    return function.apply(stacked, *fields)

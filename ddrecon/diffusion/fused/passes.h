@@ -23,7 +23,7 @@ enum Kind {
 template <class F> struct Pass {
     Size kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
     Size u, source, out, factor, sums;
-    const F *c[3], *loss, *inverse, *kept, *below, *above;
+    const F *c[3], *loss, *inverse, *coupling, *below, *above;
     F* results[6];
 };
 
@@ -113,26 +113,26 @@ template <class F> struct Cells {
 template <class F> INLINE void scale(const Pass<F>& p, Size item) {
     const Cells<F> cells(p, item);
     const F* const loss = p.loss + cells.at(cells.cell_color);
-    F *const inverse = p.results[0] + cells.at(cells.color), *const kept = p.results[1] +
-                                                                           cells.at(cells.color);
+    F* const inverse = p.results[0] + cells.at(cells.color);
+    F* const coupling = p.results[1] + cells.at(cells.color);
     cells.visit([&](int i, const Offsets& to) HERE {
         const F exchanged = cells.sent(i, to, [](Size) HERE { return F(1); });
         inverse[i] = 1 / (exchanged + loss[i]);
-        kept[i] = exchanged * inverse[i];
+        coupling[i] = exchanged * inverse[i];
     });
 }
-// b - A u times what is kept; or relaxations of it by the steps `first` and `second`.
+// The coupling times b - A u; or relaxations by the steps `first` and `second`.
 template <class F> INLINE void relax(const Pass<F>& p, F* work, F first, F second, Size item) {
     const Cells<F> cells(p, item);
-    const F *const b = work + p.source + cells.at(cells.color), *const u = work + p.u +
-                                                                           cells.at(cells.color);
+    const F* const b = work + p.source + cells.at(cells.color);
+    const F* const u = work + p.u + cells.at(cells.color);
     const F* const loss = p.loss + cells.at(cells.cell_color);
     const F* const inverse = p.inverse + cells.at(cells.cell_color);
-    const F* const kept = p.kept + cells.at(cells.cell_color);
+    const F* const coupling = p.coupling + cells.at(cells.cell_color);
     F* const out = work + p.out + cells.at(cells.color);
     if (p.kind == RESIDUAL)
         cells.visit([&](int i, const Offsets& to) HERE {
-            out[i] = kept[i] * (b[i] - (loss[i] * u[i] + cells.exchanged(i, to, u)));
+            out[i] = coupling[i] * (b[i] - (loss[i] * u[i] + cells.exchanged(i, to, u)));
         });
     if (p.kind == SMOOTH) {
         // The first step makes u = first b / diagonal; the second relaxes that.
@@ -159,10 +159,10 @@ template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, S
     const Cells<F> cells(p, item);
     const F* const loss = p.loss + cells.at(cells.cell_color);
     const F* const inverse = p.inverse + cells.at(cells.cell_color);
-    const F *const in = work + p.source + cells.at(cells.color),
-                   step = work[p.factor + cells.color];
-    F *const d = work + p.u + cells.at(cells.color), *const out =
-                                                         work + p.out + cells.at(cells.color);
+    const F* const in = work + p.source + cells.at(cells.color);
+    const F step = work[p.factor + cells.color];
+    F* const d = work + p.u + cells.at(cells.color);
+    F* const out = work + p.out + cells.at(cells.color);
     F* const u = solution + cells.at(cells.color);
     F sum = 0;
     if (p.kind == TURN) {
@@ -328,7 +328,7 @@ template <bool ALONG_X, class F> INLINE void restrict(const Pass<F>& p, F* work,
                   below[under] * second(before, inner) + above[at] * first(behind);
     });
 }
-// Cells between their pair's value and that of the pair beside them; or what is kept of that,
+// Cells between their pair's value and that of the pair beside them; or the coupling times that,
 // added.
 template <bool ALONG_X, bool ADDS, class F>
 INLINE void correct(const Pass<F>& p, F* work, Size item) {
@@ -337,9 +337,9 @@ INLINE void correct(const Pass<F>& p, F* work, Size item) {
     const F* const below = p.below + pairs.coarse(pairs.face_color);
     const F* const above = p.above + pairs.coarse(pairs.face_color);
     F* const out = work + p.out + pairs.fine(pairs.color);
-    const F* const kept = ADDS ? p.kept + pairs.fine(pairs.cell_color) : out;
+    const F* const coupling = ADDS ? p.coupling + pairs.fine(pairs.cell_color) : out;
     const auto put = [&](Size at, F value) HERE {
-        out[at] = ADDS ? out[at] + kept[at] * value : value;
+        out[at] = ADDS ? out[at] + coupling[at] * value : value;
     };
     pairs.visit([&](int k, int line, bool inner) HERE {
         const Size at = k * pairs.step + line;
@@ -353,7 +353,7 @@ INLINE void correct(const Pass<F>& p, F* work, Size item) {
 }
 template <bool ALONG_X, class F> INLINE void transfer(const Pass<F>& p, F* work, Size item) {
     if (p.kind == RESTRICT) return restrict<ALONG_X>(p, work, item);
-    p.kept ? correct<ALONG_X, true>(p, work, item) : correct<ALONG_X, false>(p, work, item);
+    p.coupling ? correct<ALONG_X, true>(p, work, item) : correct<ALONG_X, false>(p, work, item);
 }
 
 // An item of a pass that prepares a hierarchy, or of one of an iteration.

@@ -33,7 +33,7 @@ Kind = IntEnum(
 PASS = """
 long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
 long u, source, out, factor, sums;
-F *c[3], *loss, *inverse, *kept, *below, *above, *results[6]
+F *c[3], *loss, *inverse, *coupling, *below, *above, *results[6]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
@@ -72,9 +72,9 @@ class KernelPasses(Passes):
 
     def scale(self, operator: Operator) -> tuple[Tensor, Tensor]:
         shape = operator.loss.shape
-        inverse, kept = (self.like.new_empty(shape) for _ in range(2))
-        self.add("SCALE", shape, operator, results=[inverse, kept])
-        return inverse, kept
+        inverse, coupling = (self.like.new_empty(shape) for _ in range(2))
+        self.add("SCALE", shape, operator, results=[inverse, coupling])
+        return inverse, coupling
 
     def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
         cells, (_, *shape) = operator.loss.shape[axis], operator.loss.shape
@@ -109,7 +109,7 @@ class KernelPasses(Passes):
         return self._relax("RESIDUAL", level, Vector(u.twin, u.shape), u=u, source=source)
 
     def _relax(self, kind: str, level: Level, out: Vector, **values: Any) -> Vector:
-        values |= {"inverse": level.inverse, "kept": level.kept, "out": out}
+        values |= {"inverse": level.inverse, "coupling": level.coupling, "out": out}
         self.add(kind, (self.colors, *out.shape), level.operator, **values)
         return out
 
@@ -130,9 +130,9 @@ class KernelPasses(Passes):
         for number, coarsening in reversed([*enumerate(level.coarsenings)]):
             shape = [*coarse.shape]
             shape[coarsening.axis - 1] = coarsening.cells
-            # The last one, to the grid of u, adds to that what is kept.
-            kept, out = (level.kept, u) if number == 0 else (None, self.new_vector(shape))
-            values = {"source": coarse, "out": out, "kept": kept}
+            # The last one, to the grid of u, is added to that.
+            coupling, out = (level.coupling, u) if number == 0 else (None, self.new_vector(shape))
+            values = {"source": coarse, "out": out, "coupling": coupling}
             self._add_pairs("CORRECT", coarsening, level.operator, self.colors, **values)
             coarse = out
         return u
@@ -209,12 +209,12 @@ def table_kernel() -> TextKernel:
 
 
 class Program:
-    """A table of passes where kernels see it, and the launches of its parts.
+    """A table of passes where kernels see it, and the launches of its steps.
 
-    `parts`: the pass with which each begins. `size`: how many numbers vectors take.
+    `steps`: the pass with which each begins. `size`: how many numbers vectors take.
     """
 
-    def __init__(self, passes: KernelPasses, name: str, parts: Sequence[int] = (0,)):
+    def __init__(self, passes: KernelPasses, name: str, steps: Sequence[int] = (0,)):
         like, self.size, rows = passes.like, passes.size, passes.rows
         self.kernel, self.tensors = passes_kernel(name, 8 * like.itemsize), passes.tensors
         names = [*entries_of(PASS)]
@@ -223,40 +223,40 @@ class Program:
         most = -1 if like.is_cuda else SMALL
         if not like.is_cuda and thread_count(like) <= passes.colors:
             most = sys.maxsize
-        bounds = zip(parts, [*parts[1:], len(rows)], strict=True)
-        self.launches = [_cut(rows, first, last, passes.colors, most) for first, last in bounds]
+        ends = zip(steps, [*steps[1:], len(rows)], strict=True)
+        self.launches = [_list_launches(rows, *end, passes.colors, most) for end in ends]
 
     def bind(self, work: Tensor, solution: Tensor) -> Bound:
         """The kernel, for vectors in `work` and a `solution`."""
         return self.kernel.bind({"table": self.table}, {"work": work, "solution": solution})
 
-    def run(self, bound: Bound, part: int) -> None:
-        """Does the passes of a part."""
-        for arguments in self.launches[part]:
+    def run(self, bound: Bound, step: int) -> None:
+        """Does the passes of a step."""
+        for arguments in self.launches[step]:
             bound.launch(**arguments)
 
 
-def _cut(
+def _list_launches(
     rows: Sequence[Mapping[str, int]], first: int, last: int, colors: int, most: int
 ) -> list[dict[str, int]]:
-    """Launches of passes from `first` to `last`: each all of one, or of several a color an item.
+    """Launches of the passes from `first` to `last`.
 
-    Passes over `most` cells are the largest that share a launch.
+    A pass over more than `most` cells is one. Others share it, an item does a color of them all.
     """
     launches = list[dict[str, int]]()
     for number, row in enumerate(rows[first:last], first):
-        is_shared = row["items"] * row["width"] > most
-        if launches and launches[-1]["parts"] and not is_shared:
+        is_large = row["items"] * row["width"] > most
+        if launches and launches[-1]["shares"] and not is_large:
             launches[-1]["end"] = number + 1
             continue
-        count, parts = (row["items"], 0) if is_shared else (colors, colors)
-        launches.append({"count": count, "begin": number, "end": number + 1, "parts": parts})
+        count, shares = (row["items"], 0) if is_large else (colors, colors)
+        launches.append({"count": count, "begin": number, "end": number + 1, "shares": shares})
     return launches
 
 
 @functools.cache
 def passes_kernel(name: str, bits: int) -> TextKernel:
-    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`.
+    """The passes of a table from `begin` to `end`: an item of each, or one of so many `shares`.
 
     `name`: those that `prepare` a hierarchy, or those that `iterate`.
     """
@@ -264,12 +264,12 @@ def passes_kernel(name: str, bits: int) -> TextKernel:
     text = f"""
     for (int k = begin; k < end; ++k) {{
         const Pass<F>& pass = ((const Pass<F>*)table)[k];
-        const Size from = parts ? pass.items * item / parts : item;
-        const Size to = parts ? pass.items * (item + 1) / parts : item + 1;
+        const Size from = shares ? pass.items * item / shares : item;
+        const Size to = shares ? pass.items * (item + 1) / shares : item + 1;
         for (Size i = from; i < to; ++i) {name}(pass, work, solution, {steps}, i);
     }}
     """
-    declared = "long *table; int begin, end, parts; F *work, *solution"
+    declared = "long *table; int begin, end, shares; F *work, *solution"
     header = "diffusion/fused/passes.h"
     return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", header)
 
@@ -348,6 +348,6 @@ class KernelSteps:
         self._factor.copy_(factor)
         return self._run(2)
 
-    def _run(self, part: int) -> Tensor:
-        self._program.run(self._bound, part)
+    def _run(self, step: int) -> Tensor:
+        self._program.run(self._bound, step)
         return self._sums.flatten(1).sum(1).view(-1, 1, 1, 1)
