@@ -139,7 +139,8 @@ def _round(
     if round_index > 1:
         mean, first = mean_and_first(light[0])
         flux = problem.flux(mean)
-        off = _imbalance(operator, right, mean), None if flux is None else first - flux
+        off_first = None if first is None or flux is None else first - flux
+        off = _imbalance(operator, right, mean), off_first
     gain, source, turned = _gain(medium, low, off, directions, cosine)
     solve_round = replace(rounds.solve, round_index=round_index, start=start)
     u = problem.solved(solve_round, problem.right_side(source, turned))

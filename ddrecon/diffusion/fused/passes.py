@@ -122,8 +122,8 @@ class KernelPasses(Passes):
 
     def solve(self, inverse: Tensor, source: Vector) -> Vector:
         out = self.new_vector(source.shape, has_twin=True)
-        values = {"inverse": inverse, "cell_colors": len(inverse), "source": source, "out": out}
-        self.add("SOLVE", (self.colors, *out.shape), width=1, **values)
+        values: dict[str, Any] = {"inverse": inverse, "cell_colors": len(inverse)}
+        self.add("SOLVE", (self.colors, *out.shape), width=1, **values, source=source, out=out)
         return out
 
     def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
@@ -305,12 +305,11 @@ class KernelGrids:
             product = Vector(preconditioned.twin, grid)
             turn = len(passes.rows)
             passes.rows[-1]["sums"] = sums.place
-            values = {"u": direction, "factor": factor, "inverse": self.hierarchy.inverse_diagonal}
-            shape = colors, *grid
+            values: dict[str, Any] = {"u": direction, "factor": factor, "sums": sums}
+            values["inverse"], shape = self.hierarchy.inverse_diagonal, (colors, *grid)
             passes.add("TURN", shape, operator, **values, source=preconditioned)
-            passes.add("PRODUCT", shape, operator, **values, out=product, sums=sums)
-            values |= {"source": product, "out": residual, "sums": sums}
-            passes.add("ADVANCE", shape, operator, **values)
+            passes.add("PRODUCT", shape, operator, **values, out=product)
+            passes.add("ADVANCE", shape, operator, **values, source=product, out=residual)
             vectors = [direction, residual, preconditioned, product, factor, sums]
             self.programs[colors] = Program(passes, "iterate", (0, turn, turn + 2)), vectors
         return self.programs[colors]
