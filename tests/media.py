@@ -109,7 +109,8 @@ def march_rays(
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid), grid.periodic)
+    loss = absorption + boundary_loss(diffusion, grid)
+    return Operator((z, y, x), loss, grid.periodic, grid.spacing)
 
 
 def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:

@@ -43,8 +43,7 @@ class RowFunction:
 
     `find_values` and its like are given the row, then what stands in `place`: made of `more`,
     which C++ has as it is `declared`. The last fields, as many as are `added`, are but added to
-    what is found, one after another. As many before them as are `alike` have the same cotangents as
-    those before these.
+    what is found, one after another.
     """
 
     header: str
@@ -55,7 +54,6 @@ class RowFunction:
     declared: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
-    alike: int = 0
 
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
         """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
@@ -79,9 +77,7 @@ class RowFunction:
         made: dict[str, Any]
         found: list[Tensor]
         if kind == "cotangents":
-            count = len(fields) - self.alike
-            found = [like.new_empty(*each.shape[:-4], colors, *shape) for each in fields[:count]]
-            found += found[count - self.alike :]
+            found = [like.new_empty(*each.shape[:-4], colors, *shape) for each in fields]
             made = {"made": _one_by_one(found), "sums": like.new_empty(len(numbers), items)}
         else:
             found = [like.new_empty(each) for each in self.shapes]
