@@ -53,8 +53,8 @@ class Ground:
     """What reflects the part `albedo` [C], from 0 to 1, of the light that falls on a `plane`.
 
     It does so evenly into all directions. The plane lies at the box's bottom or below. A map of
-    albedo [C, rows, columns] covers what is straight under the box, along both axes from low to
-    high; beyond it is the map's mean.
+    albedo [C, rows, columns] lies under the box, along both axes from low to high; beyond that is
+    its mean.
     """
 
     albedo: Tensor
@@ -160,13 +160,8 @@ def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     share, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))
     cosine = share**power
     sine = (1 - cosine**2).sqrt()
-    along = {
-        axis: cosine,
-        (axis + 1) % 3: sine * azimuth.cos(),
-        (axis + 2) % 3: sine * azimuth.sin(),
-    }
-    directions = torch.stack([along[k] for k in range(3)], -1)
-    return directions, 2 * math.pi / count * power * share ** (power - 1)
+    directions = torch.stack([cosine, sine * azimuth.cos(), sine * azimuth.sin()], -1)
+    return directions.roll(axis, -1), 2 * math.pi / count * power * share ** (power - 1)
 
 
 def light_from_below(
@@ -174,8 +169,8 @@ def light_from_below(
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """phi of what a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
 
-    It is given the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much more
-    that is. What it returns is less the light that is `ambient` [C] from everywhere.
+    Its arguments are the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much
+    more that is. It returns phi less that of light that is `ambient` [C] from everywhere.
     """
     directions, angles = (field.to(ambient) for field in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])

@@ -27,7 +27,7 @@ from ddrecon.kernels.launch import launch
 from ddrecon.light.fused import receive
 from ddrecon.light.fused.point_light import way_kernel
 from ddrecon.light.fused.receive import receive_kernel
-from ddrecon.light.fused.shear import shear_kernels
+from ddrecon.light.fused.shear import _KERNELS, shear_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -216,6 +216,8 @@ def test_opaque_and_empty_media_have_finite_derivatives():
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    kernels = [*vars(shear_kernels(32)).values(), way_kernel(False, 32), way_kernel(True, 32)]
+    kernels = [shear_kernel(name, 32) for name in _KERNELS]
+    kernels += [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
+    kernels += [way_kernel(False, 32), way_kernel(True, 32)]
     kernels += [receive_kernel(kind, 32) for kind in ("receive", "tangent", "receive_back")]
     assert_compiles(kernels, tmp_path)

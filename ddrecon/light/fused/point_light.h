@@ -8,12 +8,12 @@ template <class F> INLINE F blend(F a, F low, F high) { return low + a * (high -
 
 template <class F, int BLOCK> struct Ways {
     int ways, samples, channels, depth, height, width;
-    const F *fields, *firsts, *lasts, *lengths, *fraction;
+    const F *field, *first, *last, *length, *fraction;
 
     // Where sample i of way t lies along an axis, z, y or x.
     INLINE F place(int i, int t, int axis) const {
-        const F last = lasts[axis * ways + t];
-        return last - fraction[i] * (last - firsts[axis * ways + t]);
+        const F end = last[axis * ways + t];
+        return end - fraction[i] * (end - first[axis * ways + t]);
     }
     INLINE int count_from(int begin) const { return begin + BLOCK < ways ? BLOCK : ways - begin; }
     INLINE long long cells() const { return (long long)depth * height * width; }
@@ -44,10 +44,9 @@ template <class F, int BLOCK> struct Ways {
               x(all.place(i, t, 2), F(all.width - 1)) {
             at = (z.n * all.height + y.n) * all.width + x.n;
         }
-        // The field there.
-        INLINE F look(const Ways& all, const F* field) const {
+        INLINE F look(const Ways& all, const F* values) const {
             auto row = [&](int from) HERE {
-                return blend(x.a, field[at + from], field[at + from + all.up_x()]);
+                return blend(x.a, values[at + from], values[at + from + all.up_x()]);
             };
             auto layer = [&](int from) HERE {
                 return blend(y.a, row(from), row(from + all.up_y()));
@@ -56,42 +55,44 @@ template <class F, int BLOCK> struct Ways {
         }
     };
 
-    INLINE void integrate(int item, F* totals) const {
+    INLINE void integrate(int item, F* total) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
-            const F* __restrict field = fields + channel * cells();
+            const F* __restrict values = field + channel * cells();
             F sum[BLOCK];
             for (int t = 0; t < count; ++t) sum[t] = F(0);
             for (int i = 0; i < samples; ++i)
                 for (int t = 0; t < count; ++t)
-                    sum[t] += Corners(*this, i, begin + t).look(*this, field);
-            F* __restrict total = totals + (long long)channel * ways + begin;
-            for (int t = 0; t < count; ++t) total[t] = sum[t] * lengths[begin + t] / F(samples);
+                    sum[t] += Corners(*this, i, begin + t).look(*this, values);
+            F* __restrict out = total + (long long)channel * ways + begin;
+            for (int t = 0; t < count; ++t) out[t] = sum[t] * length[begin + t] / F(samples);
         }
     }
 
-    // The field's cotangent, from those of `totals`.
-    INLINE void integrate_back(int item, const F* totals, F* fields_bar) const {
+    // The field's cotangent, from that of `total`.
+    INLINE void integrate_back(int item, const F* total, F* field_bar) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
-            const F* __restrict bar = totals + (long long)channel * ways + begin;
-            F part[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
+            const F* __restrict bar = total + (long long)channel * ways + begin;
+            F sample_bar[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
             int corner[BLOCK];
-            for (int t = 0; t < count; ++t) part[t] = bar[t] * lengths[begin + t] / F(samples);
+            for (int t = 0; t < count; ++t) sample_bar[t] = bar[t] * length[begin + t] / F(samples);
             for (int i = 0; i < samples; ++i) {
                 for (int t = 0; t < count; ++t) {
-                    const Corners own(*this, i, begin + t);
-                    corner[t] = own.at, az[t] = own.z.a, ay[t] = own.y.a, ax[t] = own.x.a;
+                    const Corners corners(*this, i, begin + t);
+                    corner[t] = corners.at;
+                    az[t] = corners.z.a, ay[t] = corners.y.a, ax[t] = corners.x.a;
                 }
                 for (int t = 0; t < count; ++t) {
                     auto add_row = [&](int from, F value) HERE {
-                        F* const to = fields_bar + channel * cells() + corner[t] + from;
+                        F* const to = field_bar + channel * cells() + corner[t] + from;
                         add_to(to, value - value * ax[t]), add_to(to + up_x(), value * ax[t]);
                     };
                     auto add_layer = [&](int from, F value) HERE {
                         add_row(from, value - value * ay[t]), add_row(from + up_y(), value * ay[t]);
                     };
-                    add_layer(0, part[t] - part[t] * az[t]), add_layer(up_z(), part[t] * az[t]);
+                    add_layer(0, sample_bar[t] - sample_bar[t] * az[t]),
+                        add_layer(up_z(), sample_bar[t] * az[t]);
                 }
             }
         }
