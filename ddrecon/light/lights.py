@@ -78,8 +78,8 @@ class BeamLight:
         return DirectionalLight(self.direction, self.power)
 
 
-Given = DirectionalLight | AmbientLight | PointLight | BeamLight
+PlainLight = DirectionalLight | AmbientLight | PointLight | BeamLight
 """Lights that are not decomposed into others."""
-Light = Given | EnvironmentLight
+Light = PlainLight | EnvironmentLight
 BRIGHTNESS = ("irradiance", "radiance", "intensity", "power", "scale")
 """Their numbers that multiply the light they send."""

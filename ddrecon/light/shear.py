@@ -44,9 +44,8 @@ def sum_masses(
     Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
-        beams = (_sum_period(field, grid, direction, bound) for direction in directions.split(1))
-        masses, steps = zip(*beams, strict=True)
-        return torch.cat(masses), torch.cat(steps)
+        beams = [_sum_period(field, grid, direction, bound) for direction in directions.split(1)]
+        return torch.cat([mass for mass, _ in beams]), torch.cat([step for _, step in beams])
     bound, shears = torch.as_tensor(bound).to(field), cross_grid(grid, directions)
     steps = torch.stack([shear.step for shear in shears])
     if is_fused(directions):

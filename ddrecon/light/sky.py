@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ddrecon.grid import array_order
 from ddrecon.light.environment import pixel_moments, refine_map, rotate_directions
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Given, Light
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PlainLight
 
 PIXELS_PER_REGION = 2
 """Maps with fewer are refined first. More would smear one bright pixel over several regions."""
@@ -47,7 +47,7 @@ class Sky:
     vector: Tensor
 
 
-Source = Given | Sky
+Source = PlainLight | Sky
 """What light comes from once environment maps are decomposed."""
 
 

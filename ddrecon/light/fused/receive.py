@@ -72,13 +72,12 @@ class _Received(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            values, d_values = tensors[:3], tensors[3:]
-            d_values = [
+            d_field, d_entered, d_numbers = (
                 torch.zeros_like(value) if d_value is None else d_value
-                for value, d_value in zip(values, d_values, strict=True)
-            ]
-            changed = dict(zip(("d_field", "d_entered", "d_numbers"), d_values, strict=True))
-            return _receive("tangent", *values, **changed)
+                for value, d_value in zip(tensors[:3], tensors[3:], strict=True)
+            )
+            d_values = {"d_field": d_field, "d_entered": d_entered, "d_numbers": d_numbers}
+            return _receive("tangent", *tensors[:3], **d_values)
 
         d_phi: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_phi
