@@ -35,8 +35,8 @@ class Beam:
     """A directional light inside the volume.
 
     `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
-    `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside.
-    With a `profile` [1, z, y, x] irradiance is that many times as much in each cell.
+    `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside,
+    in cells times the `profile` [1, z, y, x], if any.
     """
 
     mass: Tensor
@@ -49,8 +49,8 @@ class Beam:
     ) -> Tensor:
         """The integral of `scattering` p over each segment of view rays, `[N - 1, K or C, R]`.
 
-        That is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s per
-        unit of its scale, at the `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
+        E2.2 without E tau / (4 pi). `scattering` [N, K, R]: kappa_s per unit of its scale, at the
+        `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
         """
         cosine = -(nodes.direction @ self.direction)
         return nodes.integral(scattering * seen.along(peak, cosine))

@@ -1,8 +1,7 @@
 """A ground: an unbounded Lambertian plane under the box, and the light that it sends into that.
 
-The plane is divided into texels, which cover all of it (E5.2): even ones under the box, and beyond
-it ever wider ones. Light from the ground reaches cells along the directions of a quadrature, each
-cell along each from where its ray leaves the ground (E5.3).
+Texels cover all of the plane (E5.2): even ones under the box, and beyond it ever wider ones. The
+ground's light reaches cells along the directions of a quadrature (E5.3).
 """
 
 from __future__ import annotations
@@ -153,8 +152,8 @@ def _place(points: Tensor, grid: Grid, axis: int) -> Tensor:
 def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     """Unit directions [N, 3] towards higher indices along `axis`, and their solid angles [N].
 
-    They lie on a spiral, each turned by the golden angle, as dense everywhere for a `power` of 1,
-    and as the cosine to the axis for 1/2. Even light's irradiance is exact.
+    They lie on a spiral of the golden angle, as dense everywhere for a `power` of 1, and as the
+    cosine to the axis for 1/2. Even light's irradiance is exact.
     """
     number = torch.arange(count, dtype=torch.float64)
     share, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))

@@ -45,7 +45,7 @@ class ReversedBeam:
 
 @dataclass(frozen=True)
 class BeamPair:
-    """The beams `along` a light's `direction` [3] and `against` it, E / (4 pi) times F and G.
+    """E / (4 pi) times F `along` a light's `direction` [3], and times G `against` it.
 
     Both are [C, z, y, x], averaged over each cell; `received` is the part of F never scattered.
     """

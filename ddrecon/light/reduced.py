@@ -32,11 +32,10 @@ from ddrecon.numerics.remember import remember
 
 @dataclass(frozen=True)
 class Received:
-    """What each cell receives of beams, light that is not yet scattered, averaged over the cell.
+    """What each cell receives of light that is not yet scattered, averaged over the cell.
 
-    `source` [K, C, z, y, x]: Q0, Q1 and what follows, to the degree asked for. `mean` [C, z, y, x]:
-    that of the light itself over directions, what peaks have turned among it. `turned`: light that
-    backward peaks have turned back and forth (E8.11).
+    `source` [K, C, z, y, x]: Q0, Q1 and what follows, to a degree. `mean` [C, z, y, x]: the light's
+    mean over directions. `turned`: light that backward peaks have turned (E8.11), part of the mean.
     """
 
     source: Tensor
@@ -129,9 +128,8 @@ def ambient_sky(radiance: Tensor) -> Sky:
 def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Tensor | None:
     """phi of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
 
-    Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
-    and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
-    as going along its middle (E2.8).
+    Mean and flux are exact; moments of higher degree take all light of a region as going along its
+    middle (E2.8).
     """
     lit = []
     for sky, profile in _lit_skies(medium, lights):
@@ -156,8 +154,7 @@ def scatter_sky(
     """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
     That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact
-    phase function p. `towards`: unit, its components broadcast to cells; these, and the result, are
-    those of a `period` of the medium.
+    phase function p. `towards`: unit; its components and the result are those of a `period`.
     """
 
     def scatter(travel: Tensor, irradiance: Tensor) -> Tensor:

@@ -38,10 +38,9 @@ def sum_masses(
     [L, 3], unit, array order, the way light travels. `bound`: 1 over the most by which each of two
     corrections may change a mass, 0 for no limit.
 
-    Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
-    between slices, and its mass is carried back to cells to third order: the two corrections.
-    Slices' sides let it in as faces do (E5.9).
-    Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
+    Along an axis of the grid the sum is exact. The two corrections: a slanted beam is also sampled
+    midway between slices, and its mass is carried back to cells to third order. Slices' sides let
+    it in as faces do (E5.9). Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
         beams = [_sum_period(field, grid, direction, bound) for direction in directions.split(1)]
@@ -153,8 +152,8 @@ class Shear:
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        Beyond them they are as their outermost cells. On a cell's center slopes are those of cells
-        among rays, which move the other way: the sides are swapped.
+        On a cell's center slopes are those of cells among rays, which move the other way: the sides
+        are swapped.
         """
         points = self._points(_count(len(slices), slices) + shift, self.lattice, self.size, 1)
         return sample_slices(slices.flip(2, 3), -points).unflatten(-1, self.lattice)
@@ -181,9 +180,9 @@ class Shear:
 
 
 def slice_along(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
-    """How a beam along `direction` [3] goes through `grid`: in which slices, and how in these.
+    """The slices in which a beam along `direction` [3] goes through `grid`, its slope and step.
 
-    From one to the next it goes a `step` [u] and drifts by `slope` [2], in rows and columns.
+    From one slice to the next it drifts by `slope` [2] rows and columns, and goes a `step` [u].
     """
     speed = direction / constant(grid.spacing, direction)
     slicing = Slicing.of(speed.tolist())

@@ -1,10 +1,9 @@
-"""The light of an environment map on a volume, as three kinds of light: suns, a mean and a sky.
+"""The light of an environment map on a volume: suns, ambient light, and a sky.
 
 The sphere is cut into regions around well spread directions, in the map's own frame. A region that
-sends much of all light is a sun, a directional light. The mean of the rest is ambient light. By how
-much each region differs from that mean is the sky. The map's power and its first moment are kept
-exactly, and all but the suns' direction is linear in the map (docs/theory.md section 5,
-"Environment maps").
+sends much of all light is a sun, a directional light. The mean of the rest is ambient light; by how
+much regions differ from it is the sky. The map's power and first moment are exact, and all but the
+suns' direction is linear in the map (docs/theory.md section 5, "Environment maps").
 """
 
 from __future__ import annotations

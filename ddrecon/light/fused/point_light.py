@@ -61,8 +61,8 @@ class _Integral(torch.autograd.Function):
         threads = count_shares(thread_count(field), field.nbytes)
         bars = [{"field_bar": field.new_zeros(field.shape)} for _ in range(threads)]
         items, _ = cut(len(ways[2]), BLOCK, field)
-        given = _ways(field, *ways) | {"total": total_bar}
-        way_kernel(True, 8 * field.itemsize).launch(items, given, bars[0], shares=bars)
+        arguments = _ways(field, *ways) | {"total": total_bar}
+        way_kernel(True, 8 * field.itemsize).launch(items, arguments, bars[0], shares=bars)
         field_bar = functools.reduce(Tensor.add_, (bar["field_bar"] for bar in bars))
         return field_bar, None, None, None, None
 

@@ -24,9 +24,9 @@ def receive(
 ) -> Tensor:
     """Moments [moments, C, z, y, x] of L beams together: `weights` times tau, averaged over cells.
 
-    `field` [K, z, y, x] and `scale` [C, 1, 1, 1] of the extinction; `entered` [L, K, z, y, x]: the
-    mass up to where beams enter cells; `steps` [L] [u]: their paths in these; `weights`
-    [L, moments, C]. Numbers may have one color where others have three.
+    `field` [K, z, y, x] and `scale` [C or 1, 1, 1, 1] of the extinction; `entered` [L, K, z, y, x]:
+    the mass up to where beams enter cells; `steps` [L] [u]: their paths in these; `weights`
+    [L, moments, C or 1].
     """
     colors = max(weights.shape[2], len(scale))
     weights, scales = weights.expand(-1, -1, colors), scale.view(-1).expand(len(steps), 1, colors)

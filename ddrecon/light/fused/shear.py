@@ -104,7 +104,7 @@ class _Masses(torch.autograd.Function):
                 for value, d_value in zip(tensors, changes, strict=False)
             )
             slicings = _slicings(ctx.shears)
-            laid = {k: both for k, *both in zip(slicings, fields, d_fields, strict=True)}
+            laid = {k: pair for k, *pair in zip(slicings, fields, d_fields, strict=True)}
             tangents = []
             for shear, row, d_row in zip(ctx.shears, numbers, d_numbers, strict=True):
                 field, d_field = laid[shear.slicing]
