@@ -72,11 +72,6 @@ class BeamLight:
     power: Tensor
     radius: Tensor
 
-    @property
-    def unconfined(self) -> DirectionalLight:
-        """Light of an irradiance equal to its power, everywhere."""
-        return DirectionalLight(self.direction, self.power)
-
 
 PlainLight = DirectionalLight | AmbientLight | PointLight | BeamLight
 """Lights that are not decomposed into others."""

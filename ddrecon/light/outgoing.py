@@ -15,7 +15,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
@@ -28,14 +27,8 @@ def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
 
 def _factors(medium: Medium) -> Tensor:
     """(1 - f) p_l, or p_l, by the degree l."""
-    if medium.is_cellwise:
-        return remaining_moments(medium)
-    return _weigh(medium.forward_fraction, remaining_moments(medium))
-
-
-@remember
-def _weigh(fraction: Tensor, moments: Tensor) -> Tensor:
-    return (1 - fraction) * moments
+    moments = remaining_moments(medium)
+    return moments if medium.is_cellwise else (1 - medium.forward_fraction) * moments
 
 
 def scatter_towards(

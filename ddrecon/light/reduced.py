@@ -72,8 +72,9 @@ def _sort_lights(
         if medium.index != 1 and isinstance(light, DirectionalLight | BeamLight):
             confined += enter_faces(medium.grid, medium.index, light)
         elif isinstance(light, BeamLight):
-            beam = light.position, light.direction, light.radius
-            confined.append(RefractedBeam(light.unconfined, profile_in(medium.grid, *beam)))
+            profile = profile_in(medium.grid, light.position, light.direction, light.radius)
+            power = DirectionalLight(light.direction, light.power)
+            confined.append(RefractedBeam(power, profile))
         elif isinstance(light, DirectionalLight):
             even.append(light)
     return even, confined, [light for light in lights if isinstance(light, PointLight)]

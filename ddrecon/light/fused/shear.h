@@ -49,13 +49,6 @@ struct Slices {
 template <class F, int BLOCK, class N> struct Shear : Slices {
     N slope_row, slope_column, step, bound;
 
-    INLINE Shear(const Slices& slices, const N* number)
-        : Slices(slices),
-          slope_row(number[0]),
-          slope_column(number[1]),
-          step(number[2]),
-          bound(number[3]) {}
-
     // Cell 0 of slice k among rays.
     static INLINE Position<N> place(int first, double k, const N& slope, int size) {
         Position<N> position(less_product(first, k, value_of(slope)), size);

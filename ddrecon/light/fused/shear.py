@@ -85,11 +85,16 @@ class _Masses(torch.autograd.Function):
         numbers_bar = torch.zeros_like(numbers)
         for light, shear in enumerate(ctx.shears):
             mass_bar = shear.slicing.lay(entered_bar[light]).contiguous()
-            row, field_bar = numbers[light], bars[shear.slicing]
-            _sum_back(shear, row, next(slopes), next(slopes), mass_bar, field_bar)
+            row, field, ray_slopes = numbers[light], laid[shear.slicing], next(slopes)
+            of_rays = {name: torch.empty_like(ray_slopes) for name in ("slices_bar", "midways_bar")}
+            of_cells = {"entered_bar": mass_bar, "corrections_bar": next(slopes) * mass_bar}
+            arguments = {"numbers": row, "slopes": ray_slopes} | of_cells
+            _launch("sum_back", shear, arguments, of_rays)
+            field_bar = {"field_bar": bars[shear.slicing]}
+            _launch("look_back", shear, {"numbers": row} | of_rays, field_bar)
             # Of numbers, which are few, by the tangents of each.
             for column in ctx.columns:
-                d_row, field = torch.zeros_like(row), laid[shear.slicing]
+                d_row = torch.zeros_like(row)
                 d_row[column].fill_(1)
                 d_mass = _sum_tangent(shear, field, row, torch.zeros_like(field), d_row)
                 numbers_bar[light, column] = (d_mass * mass_bar).sum(dtype=torch.float64)
@@ -141,22 +146,6 @@ def _sum_tangent(
     return _sum(shear, *duals)[0][..., 1].contiguous()
 
 
-def _sum_back(
-    shear: Shear,
-    numbers: Tensor,
-    ray_slopes: Tensor,
-    slopes: Tensor,
-    entered_bar: Tensor,
-    field_bar: Tensor,
-) -> None:
-    """Adds to the field's cotangent, from that of the mass."""
-    arguments = {"numbers": numbers, "slopes": ray_slopes, "entered_bar": entered_bar}
-    arguments["corrections_bar"] = slopes * entered_bar
-    bars = {name: torch.empty_like(ray_slopes) for name in ("slices_bar", "midways_bar")}
-    _launch("sum_back", shear, arguments, bars)
-    _launch("look_back", shear, {"numbers": numbers} | bars, {"field_bar": field_bar})
-
-
 _SIZES = "slices, channels, height, width, rows, columns, first_row, first_column"
 """Members of `Slices`."""
 _KERNELS = {
@@ -191,7 +180,8 @@ def shear_kernel(name: str, bits: int, is_dual: bool = False) -> TextKernel:
     call, written = _KERNELS[name]
     text = f"""
         typedef {"Dual<F>" if is_dual else "F"} N;
-        const Shear<F, IS_GPU ? 1 : {BLOCK}, N> shear({{{_SIZES}}}, (const N*)numbers);
+        const N* const n = (const N*)numbers;
+        const Shear<F, IS_GPU ? 1 : {BLOCK}, N> shear{{{{{_SIZES}}}, n[0], n[1], n[2], n[3]}};
         shear.{name}(item, {call});
     """
     arrays = call.replace("(const N*)", "").replace("(N*)", "").split(", ")
