@@ -93,9 +93,8 @@ class Shear:
     """Rays along a beam through `grid`: where they meet slices of `size`, by a `lattice` of them.
 
     From one slice to the next they drift by `slope` [2], in rows and columns, and go a `step` [u]:
-    `numbers` [3].
-    Ray r meets slice k at cell r - `first` + k `slope`; with this lattice there is a ray for every
-    cell. The `faces` by which light enters lie so far from cell 0.
+    `numbers` [3]. Ray r meets slice k at cell r - `first` + k `slope`; with this lattice there is a
+    ray for every cell.
     """
 
     grid: Grid
@@ -104,7 +103,6 @@ class Shear:
     size: tuple[int, ...]
     lattice: tuple[int, ...]
     first: tuple[int, ...]
-    faces: tuple[float, ...]
 
     @staticmethod
     def along(grid: Grid, direction: Tensor) -> Shear:
@@ -115,9 +113,7 @@ class Shear:
         drifts = [math.floor(abs(s) * (count - 1) + 1e-9) + 1 for s in slopes]
         lattice = tuple(n + drift + 3 for n, drift in zip(size, drifts, strict=True))
         first = tuple(1 + drift * (s > 0) for drift, s in zip(drifts, slopes, strict=True))
-        faces = (-0.5 + n * (s < -LEAST_SLOPE) for n, s in zip(size, slopes, strict=True))
-        numbers = torch.cat([slope, step[None]])
-        return Shear(grid, slicing, numbers, size, lattice, first, tuple(faces))
+        return Shear(grid, slicing, torch.cat([slope, step[None]]), size, lattice, first)
 
     @property
     def slope(self) -> Tensor:
@@ -137,8 +133,10 @@ class Shear:
         # On which slice a ray enters through a side of the box; through an edge by rows.
         steep = torch.where(self.slope.abs() > LEAST_SLOPE, self.slope, LEAST_SLOPE)
         rows, columns = (
-            (face + first - _count(n, steep)) / s
-            for s, n, first, face in zip(steep, self.lattice, self.first, self.faces, strict=True)
+            (cells * (s < 0) - 0.5 + first - _count(rays, steep)) / s
+            for s, cells, first, rays in zip(
+                steep, self.size, self.first, self.lattice, strict=True
+            )
         )
         rows, columns = torch.broadcast_tensors(rows[:, None], columns)
         is_by_row = columns - rows < nearly(rows, sum(self.lattice))
