@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
-from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight
 from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
@@ -64,6 +64,14 @@ def make_camera(
     origin = torch.tensor(eye, dtype=kind.get("dtype", torch.float64))
     pose = look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0]))
     return Camera(pose, size, half_width, is_perspective)
+
+
+def light_of(
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48, up: str = "y"
+) -> EnvironmentLight:
+    """The light of a map `radiance` [C, h, w]."""
+    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
+    return EnvironmentLight(radiance, *numbers, directions, up)
 
 
 def make_scene(
