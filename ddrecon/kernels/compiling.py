@@ -9,7 +9,7 @@ import functools
 import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Lock, Timer, get_ident
+from threading import Timer
 from typing import Any
 
 import torch
@@ -49,25 +49,10 @@ def _load(kernel: Any, device: str) -> None:
     line.daemon = True
     line.start()
     try:
-        if device != "cpu" or _has_headers(kernel):
-            wp.load_module(kernel.module, device=device)
+        wp.load_module(kernel.module, device=device)
     finally:
         line.cancel()
     _loaded.add((kernel, device))
-
-
-def _has_headers(kernel: Any) -> bool:
-    """Whether there are Warp's own headers, translated; else `kernel` is loaded, which does it.
-
-    Each thread would translate them anew, for which it takes as long as for ten kernels.
-    """
-    folders: dict[int, Any] = wp._src.context.runtime._pch_dirs
-    with _first_load():
-        if not folders:
-            wp.load_module(kernel.module, device="cpu")
-            return False
-        folders.setdefault(get_ident(), next(iter(folders.values())))
-        return True
 
 
 @functools.cache
@@ -77,17 +62,10 @@ def _announce() -> None:
 
 
 @functools.cache
-def _first_load() -> Lock:
-    """Held while the first kernel is compiled: others wait for the headers."""
-    return Lock()
-
-
-@functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "compiling")
 
 
 # Threads do not live on in a process forked from this one, and what they had begun never ends.
 os.register_at_fork(after_in_child=_pool.cache_clear)
-os.register_at_fork(after_in_child=_first_load.cache_clear)
 os.register_at_fork(after_in_child=_named.clear)
