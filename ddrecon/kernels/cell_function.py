@@ -83,7 +83,7 @@ class RowFunction:
         written = {"made": _one_by_one(outputs)}
         sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
-        given = {
+        inputs = {
             "width": width,
             "rows": items // colors,
             "colors": colors,
@@ -93,7 +93,7 @@ class RowFunction:
         }
         kernel = self.kernel(kind, len(fields), 8 * like.element_size())
         kernel.launch(
-            items, given | self.more | more, written | ({"sums": sums} if has_sums else {})
+            items, inputs | self.more | more, written | ({"sums": sums} if has_sums else {})
         )
         return tuple(outputs), sums
 
