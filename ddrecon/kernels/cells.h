@@ -85,17 +85,23 @@ template <class Cell, class F> INLINE void find_cotangents(
     for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] = F(0);
     INDEPENDENT
     for (int i = 0; i < row.width; ++i) {
-        N x[INPUTS], y[Cell::OUTS];
+        // With one array for fields and numbers the loop would not become vector code.
+        N x[Cell::INS], number[Cell::NUMBERS], y[Cell::OUTS];
         F x_bar[INPUTS];
         UNROLLED
-        for (int k = 0; k < INPUTS; ++k) {
-            x[k] = N(k < Cell::INS ? inputs.in[k][i] : inputs.number[k - Cell::INS]);
+        for (int k = 0; k < Cell::INS; ++k) {
+            x[k] = N(inputs.in[k][i]);
             x[k].by[k] = F(1);
-            x_bar[k] = F(0);
         }
-        Cell::find(x, x + Cell::INS, y);
+        UNROLLED
+        for (int k = 0; k < Cell::NUMBERS; ++k) {
+            number[k] = N(inputs.number[k]);
+            number[k].by[Cell::INS + k] = F(1);
+        }
+        Cell::find(x, number, y);
         UNROLLED
         for (int k = 0; k < INPUTS; ++k) {
+            x_bar[k] = F(0);
             UNROLLED
             for (int o = 0; o < Cell::OUTS; ++o) x_bar[k] += bar[o][i] * y[o].by[k];
         }
