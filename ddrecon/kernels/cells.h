@@ -24,10 +24,19 @@ struct Row {
           at((long long)item * width) {}
     // Where the row begins in an array of so many colors, `channels`, which come again and again.
     INLINE long long begin(int channels) const { return color % channels * size + start; }
-    // The row in each of COUNT arrays of all colors.
+    // The row in each of COUNT arrays, of all colors or of `channels`.
     template <int COUNT, class P> INLINE void in_all(P* const* arrays, P** rows) const {
         UNROLLED
         for (int k = 0; k < COUNT; ++k) rows[k] = arrays[k] + at;
+    }
+    template <int COUNT, class P>
+    INLINE void in_all(P* const* arrays, const int* channels, P** rows) const {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) rows[k] = arrays[k] + begin(channels[k]);
+    }
+    template <int COUNT, class F> INLINE void of_color(const F* numbers, F* values) const {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) values[k] = numbers[k * colors + color];
     }
 };
 
@@ -75,10 +84,10 @@ template <class Cell, class F> INLINE void find_cotangents(
     REORDERED
     constexpr int INPUTS = Cell::INS + Cell::NUMBERS;
     typedef Dual<F, INPUTS> N;
-    const Inputs<F, Cell::INS, Cell::NUMBERS, F> inputs(
-        row, channels, fields, nullptr, numbers, nullptr);
-    const F* bar[Cell::OUTS];
-    F sum[Cell::NUMBERS], *out[Cell::INS];
+    const F *in[Cell::INS], *bar[Cell::OUTS];
+    F of_row[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS];
+    row.in_all<Cell::INS>(fields, channels, in);
+    row.of_color<Cell::NUMBERS>(numbers, of_row);
     row.in_all<Cell::OUTS>(bars, bar);
     row.in_all<Cell::INS>(outputs, out);
     UNROLLED
@@ -90,12 +99,12 @@ template <class Cell, class F> INLINE void find_cotangents(
         F x_bar[INPUTS];
         UNROLLED
         for (int k = 0; k < Cell::INS; ++k) {
-            x[k] = N(inputs.in[k][i]);
+            x[k] = N(in[k][i]);
             x[k].by[k] = F(1);
         }
         UNROLLED
         for (int k = 0; k < Cell::NUMBERS; ++k) {
-            number[k] = N(inputs.number[k]);
+            number[k] = N(of_row[k]);
             number[k].by[Cell::INS + k] = F(1);
         }
         Cell::find(x, number, y);

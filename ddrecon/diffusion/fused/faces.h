@@ -211,14 +211,14 @@ template <class Flow, class N, class F> INLINE void find_values(
 template <class Flow, class F> INLINE void find_cotangents(
     const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
     const F* const* fields, const F* numbers, const F* const* bars, F* const* made, F* sums) {
-    const Inputs<F, Flow::GIVEN, Flow::NUMBERS, F> given(
-        row, channels, fields, nullptr, numbers, nullptr);
-    const F* bar[Flow::OUTS];
-    F sum[Flow::NUMBERS], *out[Flow::MADE];
+    const F *in[Flow::GIVEN], *bar[Flow::OUTS];
+    F number[Flow::NUMBERS], sum[Flow::NUMBERS], *out[Flow::MADE];
+    row.in_all<Flow::GIVEN>(fields, channels, in);
+    row.of_color<Flow::NUMBERS>(numbers, number);
     row.in_all<Flow::MADE>(made, out);
     Flow::rows_of(row, bars, bar, own);
     mesh.visit([&](const auto& mesh) HERE {
-        Flow::find_back(row, mesh, given.in, given.number, bar, out, sum, row.color < own, times);
+        Flow::find_back(row, mesh, in, number, bar, out, sum, row.color < own, times);
     });
     for (int k = 0; k < Flow::NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
 }

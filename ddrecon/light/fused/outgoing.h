@@ -163,11 +163,12 @@ template <class Cell, class N, class F> INLINE void find_values(
 template <class Cell, class F> INLINE void find_cotangents(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
     const F* numbers, const F* const* bars, F* const* outputs, F* sums) {
-    const Inputs<F, Cell::INS, Cell::NUMBERS, F> inputs(
-        row, channels, fields, nullptr, numbers, nullptr);
-    F* out[Cell::INS];
+    const F* in[Cell::INS];
+    F number[Cell::NUMBERS], *out[Cell::INS];
+    row.in_all<Cell::INS>(fields, channels, in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
     row.in_all<Cell::INS>(outputs, out);
-    Cell::scatter_back(row, view, inputs.in, inputs.number, bars[0] + row.at, out, sums);
+    Cell::scatter_back(row, view, in, number, bars[0] + row.at, out, sums);
 }
 
 } // namespace ddrecon
