@@ -43,7 +43,7 @@ class RowFunction:
 
     `find_values` and its like have the row, then the C++ expressions in `place`, made of `more`,
     which is `declared`. The last fields, as many as are `added`, are but added to the outputs, one
-    after another. As many before them as are `alike` have the same cotangents as those before these.
+    after another. As many before them as are `alike` have the same cotangents as those before.
     """
 
     header: str
