@@ -12,8 +12,8 @@ INLINE constexpr double find_root(double x) {
 }
 // What makes the mean square of a harmonic 1; and (2 M - 1)!!.
 template <int L, int M> constexpr double NORM =
-    find_root((M ? 2 : 1) * (2 * L + 1) * FACTORIAL<L - M> / FACTORIAL<L + M>);
-template <int M> constexpr double ODD = FACTORIAL<2 * M> / (FACTORIAL<M> * (1 << M));
+    find_root((M ? 2 : 1) * (2 * L + 1) * factorial(L - M) / factorial(L + M));
+template <int M> constexpr double ODD = factorial(2 * M) / (factorial(M) * (1 << M));
 
 // y_k of a vector v, z first, from those of order M and degree L on (`numerics/harmonics.py`):
 // `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `below` that of L - 1.
