@@ -135,7 +135,7 @@ def _glows(volume: Volume) -> bool:
 
 
 def _turns_back(phase: PhaseFunction) -> bool:
-    return float(phase.backward_tail(3, 1).max()) > BACKWARD
+    return float(phase.peak_tail(3, 1, -1).max()) > BACKWARD
 
 
 def _axes_that_vary(media: Iterable[Volume]) -> str:

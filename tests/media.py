@@ -205,5 +205,8 @@ def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
     """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`."""
+    if has_cells := seen.phase.cells is not None:
+        depth, cosine = depth[..., None], cosine[..., None]
     weights = peaked_series(seen.phase, seen.degree, depth[..., None])
-    return (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)
+    total = (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)
+    return total[..., 0] if has_cells else total
