@@ -189,7 +189,7 @@ class Medium:
     def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
         """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
         cellwise = ["g", "forward_fraction"] if self.is_cellwise else []
-        seen = replace(self.seen, phase=self.seen.phase.put(put))
+        seen = replace(self.seen, phase=self.seen.phase.move_cells(put))
         return self.mapped(put, "support", "emission", "peak", *cellwise, grid=grid, seen=seen)
 
 
@@ -200,7 +200,7 @@ def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> V
     fields: dict[str, Any] = {
         name: put(value) for name, value in values.items() if value is not None and value.ndim >= 3
     }
-    return replace(volume, grid=grid, phase=volume.phase.put(put), media=None, **fields)
+    return replace(volume, grid=grid, phase=volume.phase.move_cells(put), media=None, **fields)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
@@ -209,7 +209,7 @@ def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     f is what of the phase function lies beyond `degree`. Source: Joseph, Wiscombe, Weinman 1976,
     doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    return _medium(volume, degree, _forward_fraction(volume.phase, degree))
+    return _medium(volume, degree, peak_fraction(volume.phase, degree, 1))
 
 
 def keep_medium(volume: Volume) -> Medium:
@@ -321,8 +321,9 @@ def _mean_cosine(phase: PhaseFunction) -> Tensor:
 
 
 @remember_of_phase
-def _forward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
-    return _by_color(phase.peak_tail(degree, 1)[:, 0])
+def peak_fraction(phase: PhaseFunction, degree: int, sign: int) -> Tensor:
+    """The part of scattering that a peak is, f or b by the `sign`, as of `Medium`."""
+    return _by_color(phase.peak_tail(degree, 1, sign)[:, 0])
 
 
 def _by_color(numbers: Tensor) -> Tensor:

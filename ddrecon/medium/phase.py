@@ -101,9 +101,9 @@ class PhaseFunction(ABC):
         assert self.CELLWISE is not None
         return replace(self, **{self.CELLWISE: number})
 
-    def put(self, put: Callable[[Tensor], Tensor]) -> Self:
-        """The same with what `put` makes of the number that differs from cell to cell, if any."""
-        return self if self.cells is None else self.with_cells(put(self.cells))
+    def move_cells(self, move: Callable[[Tensor], Tensor]) -> Self:
+        """The same with what `move` makes of the number that differs from cell to cell, if any."""
+        return self if self.cells is None else self.with_cells(move(self.cells))
 
 
 @dataclass(frozen=True, eq=False)

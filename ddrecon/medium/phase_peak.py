@@ -76,11 +76,12 @@ class SeenPhase:
         coefficients = look_up(self.table(has_peak).to(cosine.dtype), angle.double())
         rows = coefficients.permute(3, 1, 0, 2).unflatten(0, (-1, terms))
         seen = [row[0] if depth is None else evaluate(row, depth_place(depth)) for row in rows]
-        kind, is_summed = self.phase.kind, self.number is not None
-        value = sum_series(seen, number_place(kind, self.number)) if is_summed else seen[0]
+        if self.number is None:
+            return seen[0].clamp(min=0) if has_peak else seen[0]
+        kind = self.phase.kind
+        value = sum_series(seen, number_place(kind, self.number))
         value = value.clamp(min=0) if has_peak else value
-        is_ratio = is_summed and is_scaled(kind)
-        return henyey_greenstein(cosine, self.number) * value if is_ratio else value
+        return henyey_greenstein(cosine, self.number) * value if is_scaled(kind) else value
 
     def table(self, has_peak: bool) -> Tensor:
         """Of S its coefficients, [C, steps + 1, 2, K], or without a peak of p the values.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import P1_DEGREE, Medium
+from ddrecon.medium.coefficients import P1_DEGREE, Medium, peak_fraction
 from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
 from ddrecon.medium.phase_peak import (
     is_scaled,
@@ -48,17 +48,8 @@ def unturned_moments(medium: Medium) -> Tensor:
 
 
 def backward_fraction(medium: Medium) -> Tensor:
-    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E8.11).
-
-    It is [C or 1, z, y, x] where the phase function differs from cell to cell.
-    """
-    return _backward_fraction(medium.seen.phase, medium.seen.degree)
-
-
-@remember_of_phase
-def _backward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
-    fraction = phase.peak_tail(degree, 1, -1)[:, 0]
-    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
+    """b, the part of scattering that counts as turned back (E8.11), shaped as f of `Medium`."""
+    return peak_fraction(medium.seen.phase, medium.seen.degree, -1)
 
 
 def has_backward_peak(medium: Medium) -> bool:
