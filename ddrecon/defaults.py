@@ -99,7 +99,7 @@ def _choose_rounds(
 ) -> tuple[int, int, list[str]]:
     """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
     reasons, glows = list[str](), [volume.emission, volume.black_body]
-    turns_back = float(volume.phase.backward_tail(3, 1).max()) > BACKWARD
+    turns_back = float(volume.phase.peak_tail(3, 1, -1).max()) > BACKWARD
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
     if is_flat or turns_back:
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
