@@ -80,7 +80,7 @@ class RowFunction:
         written = {"made": _one_by_one(outputs)}
         sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
-        inputs = {
+        inputs: dict[str, Any] = {
             "width": width,
             "rows": items // colors,
             "colors": colors,
