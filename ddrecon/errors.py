@@ -6,8 +6,12 @@ All are a `DdreconError`; whatever else is raised is a bug and keeps its traceba
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 LONGEST = 1000
 """Lines of more characters are shortened in the middle."""
@@ -153,7 +157,24 @@ class Problems:
             raise FormatError(first.path, first.reason, lines[1:])
 
 
+def gather(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """What `function` makes of each of `items`; raises the problems of all of them together."""
+    problems, results = Problems(), list[R]()
+    for item in items:
+        with problems.collecting():
+            results.append(function(item))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    return results
+
+
 def suggestion(name: str, known: Collection[str]) -> str:
     """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them."""
+    return nearest(name, known) or f"; known: {', '.join(known)}"
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """`; did you mean 'x'?` with the nearest of the `known` names, empty where none is near."""
     near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST_NAME else []
-    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -23,7 +23,7 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import add, fill, weigh
+from ddrecon.light.moments import add, cut, fill, weigh
 from ddrecon.light.pairs import ReversedBeam
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.refracted import enter_faces
@@ -42,7 +42,7 @@ from ddrecon.settings import RenderSettings
 from ddrecon.transport.bounced import TURNS, follow_inside
 from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.rounds import face_mirror
-from ddrecon.transport.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
+from ddrecon.transport.sweep import DIRECTIONS, emitted_light, steep_gradient, sweep_rule
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
 """The faces of the box, in array order."""
@@ -181,8 +181,7 @@ class _Box:
         power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
         empty = power / (2 * len(FACES))
         even = torch.ones_like(medium.extinction.value)
-        source = even[None], cell_gradient(even)
-        leaving = (self.sweep_out(medium.emitting, *source) for medium in self.media)
+        leaving = (self.sweep_out(medium.emitting, even[None]) for medium in self.media)
         return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *leaving))
 
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
@@ -192,10 +191,12 @@ class _Box:
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
         falling = math.pi * (halves * areas)[..., None].to(radiance.device) * radiance
-        index, source = self.media[0].index, (nothing[None], cell_gradient(nothing))
+        index = self.media[0].index
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
         inflow = index**2 * radiance.view(-1, 1, 1, 1)
-        leaving = (empty + self.sweep_out(medium, *source, inflow) for medium in self.media)
+        leaving = (
+            empty + self.sweep_out(medium, nothing[None], None, inflow) for medium in self.media
+        )
         crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *leaving))
         return crossing * crossing.new_tensor(sides).view(2, 1, 1)
 
@@ -252,17 +253,20 @@ class _Box:
         self,
         medium: Medium,
         source: Tensor,
-        rise: Tensor,
+        gradient: Tensor | None = None,
         inflow: Tensor | None = None,
         light: Tensor | None = None,
     ) -> Tensor:
         """The power that leaves in one sweep of light that `source` phi scatters in `medium`.
 
-        `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in
-        an empty box. Light that faces reflect inside is swept until it has come to rest, from
-        `light` on, None for none.
+        `gradient` is `steep_gradient` of what scatters, None for zero. With `inflow` it is less
+        what that would be in an empty box. Light that faces reflect inside is swept until it has
+        come to rest, from `light` on, None for none.
         """
-        grid, moments, cells = medium.grid, fill(source, medium.degree), average_cells(medium)
+        grid, cells = medium.grid, average_cells(medium)
+        extinction, moments = cells.extinction.value, fill(source, medium.degree)
+        moments = emitted_light(cells, cut(moments), inflow)
+        gradient = torch.zeros_like(moments[:1]) if gradient is None else gradient
         courses, weights, values = sweep_rule(self.directions, len(moments))
         mirror, rows = face_mirror(medium, self.directions), values.to(moments)
         begun = 0 * moments if light is None else fill(light, medium.degree)
@@ -271,9 +275,10 @@ class _Box:
                 mirror.begin(begun if sweep == 0 else None)
             power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
             for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
-                scatters = torch.tensordot(rows[number], moments, 1)
+                emitted = torch.tensordot(rows[number], moments, 1)
                 ends = None if mirror is None else mirror.entering(number)
-                _, out = radiance_along(cells, scatters, rise, inflow, direction, ends)
+                fields = extinction, emitted, gradient.expand(3, *emitted.shape)
+                _, out = radiance_along(grid, *fields, direction, ends)
                 if mirror is not None:
                     mirror.left.append(out)
                     out = mirror.released(number)
