@@ -173,13 +173,13 @@ def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margi
 
 def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: float) -> Tensor:
     """The box of `bound_smoke` of one frame."""
-    factors = [math.ceil(max(camera.size) / MOST_PIXELS) for camera in cameras]
-    cameras = [camera.resize(factor) for camera, factor in zip(cameras, factors, strict=True)]
-    shown = [
-        adaptive_max_pool2d(mask.float()[None], camera.size)[0] > 0
-        for camera, mask in zip(cameras, shown, strict=True)
-    ]
-    seen = [cast_rays(c).select(mask.flatten()) for c, mask in zip(cameras, shown, strict=True)]
+    views = list[tuple[Camera, Tensor, float]]()
+    for camera, mask in zip(cameras, shown, strict=True):
+        factor = math.ceil(max(camera.size) / MOST_PIXELS)
+        small = camera.resize(factor)
+        reduced = adaptive_max_pool2d(mask.float()[None], small.size)[0] > 0
+        views.append((small, reduced, margin / factor))
+    seen = [cast_rays(camera).select(mask.flatten()) for camera, mask, _ in views]
     origins = array_order(torch.stack([rays.origin.mean(0) for rays in seen])).double().cpu()
     directions = array_order(torch.stack([rays.direction.mean(0) for rays in seen])).double().cpu()
     directions = normalize(directions)
@@ -195,10 +195,7 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     while bool((sides < SHRINKS).any()):
         low, high = box.tolist()
         grid = Grid.from_xyz((BOX_CELLS,) * 3, tuple(low), tuple(high))
-        hulls = [
-            hull_of(camera, mask, grid, margin / factor)[0]
-            for camera, mask, factor in zip(cameras, shown, factors, strict=True)
-        ]
+        hulls = [hull_of(camera, mask, grid, width)[0] for camera, mask, width in views]
         places = array_order(torch.stack(hulls).all(0).nonzero()).cpu()
         if not len(places):
             raise HullError("of each place some view shows nothing; check the cameras")
