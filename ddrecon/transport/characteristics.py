@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.shear import cross_grid
+from ddrecon.light.shear import slice_along
 from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import NEARLY, Slicing, across
@@ -77,7 +77,7 @@ class Characteristic:
     @staticmethod
     def along(grid: Grid, direction: Tensor) -> Characteristic:
         """The same of unit `direction` [3], which may be varied."""
-        slicing, (row, column), step = cross_grid(grid, direction)
+        slicing, (row, column), step = slice_along(grid, direction)
         forward = -1 if slicing.is_reversed else 1
         return Characteristic(slicing.order, forward, (row, column), step, grid.shape[slicing.axis])
 

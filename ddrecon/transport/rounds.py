@@ -138,7 +138,9 @@ def _round(
     off, start = None, light[0].detach()[0]
     if round_index > 1:
         mean, first = mean_and_first(light[0])
-        off = recompute(_imbalance, operator, right, mean), problem.flux(mean, begun=first, sign=-1)
+        flux = problem.flux(mean)
+        off_first = None if first is None or flux is None else first - flux
+        off = recompute(_imbalance, operator, right, mean), off_first
     gain, source, turned = _gain(medium, low, off, directions, cosine)
     solve_round = replace(rounds.solve, round_index=round_index, start=start)
     u = problem.solved(solve_round, problem.right_side(source, turned))
