@@ -16,7 +16,7 @@ from ddrecon.transport.characteristics import Characteristic, Direction
 from ddrecon.transport.sweep import sweep_rule
 
 POINTS = 4
-"""Cells upwind that light comes from at most."""
+"""Cells upwind that light comes from, unless it comes from one."""
 MOST = 24
 """Ordinates in a team at most: more read moments less often, fewer leave more of a cache."""
 
@@ -62,8 +62,9 @@ class Ordinate:
     """How the ordinate `number` of a quadrature set crosses the grid.
 
     `axis`: that across which its slices lie; `step` [u]: its path through a cell; `moved`: cells
-    that it passes along z, y and x meanwhile, with signs. Light comes from `points`, so many cells
-    away, against its senses, with `weights`. Across x the first lies in the same row.
+    that it passes along z, y and x meanwhile, with signs. Light comes from four `points`, so many
+    cells away, against its senses, with `weights`: the largest first, but across x the point in the
+    same row.
     """
 
     number: int
@@ -78,15 +79,14 @@ class Ordinate:
         """The ordinate of a `direction` through `grid` (E2.9)."""
         course = Characteristic.of(grid, direction)
         axis, moved = course.order[0] - 1, course.moved
-        points, weights = list[tuple[int, ...]](), list[float]()
-        for point in product(*((1,) if a == axis else (0, 1) for a in range(3))):
-            weight = math.prod(
-                abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True)
-            )
-            # Scalar recurrences in rows want their own point, whatever its weight.
-            if weight > 0 or (axis == 2 and not points):
-                points.append(point)
-                weights.append(weight)
+
+        def weight(point: tuple[int, ...]) -> float:
+            return math.prod(abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
+
+        points = list(product(*((1,) if a == axis else (0, 1) for a in range(3))))
+        if axis < 2:
+            points.sort(key=weight, reverse=True)
+        weights = [weight(point) for point in points]
         # Equal paths share decay terms: mirror images have equal ones but for rounding.
         step = float(f"{course.step:.14g}")
         return Ordinate(number, axis, step, tuple(moved), points, weights)
@@ -104,17 +104,14 @@ class Ordinate:
     def integers(self, width: int) -> list[int]:
         """The struct `Ordinate` for rows of so many cells."""
         _, up, along = self.senses
-        shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
-        lacking = [0] * (POINTS - len(self.points))
-        is_single = len(self.points) == 1 and self.axis < 2
+        count = 1 if self.axis < 2 and self.weights[1] == 0 else POINTS
         backs = [back for back, _, _ in self.points]
-        count = 1 if is_single else POINTS
-        return [self.axis, *self.senses, count, *backs, *lacking, *shifts, *lacking]
+        shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
+        return [self.axis, *self.senses, count, *backs, *shifts]
 
     def numbers(self) -> list[float]:
         """The struct `Path`."""
-        lacking = [0.0] * (POINTS - len(self.weights))
-        return [self.step, *(self.step * m for m in self.moved), *self.weights, *lacking]
+        return [self.step, *(self.step * m for m in self.moved), *self.weights]
 
 
 @dataclass(frozen=True)
