@@ -80,7 +80,6 @@ class RowFunction:
             shapes = [(*field.shape[:-4], colors, *shape) for field in different]
         outputs = [like.new_empty(of) for of in shapes]
         outputs += outputs[len(outputs) - self.alike :] if has_sums else []
-        written = {"made": _one_by_one(outputs)}
         sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
         inputs = {
@@ -90,11 +89,11 @@ class RowFunction:
             "numbers": numbers,
             "fields": fields,
             "channels": [len(field) for field in fields],
+            **self.more,
+            **more,
         }
-        kernel = self.kernel(kind, len(fields), 8 * like.element_size())
-        kernel.launch(
-            items, inputs | self.more | more, written | ({"sums": sums} if has_sums else {})
-        )
+        written = {"made": _one_by_one(outputs)} | ({"sums": sums} if has_sums else {})
+        self.kernel(kind, len(fields), 8 * like.element_size()).launch(items, inputs, written)
         return tuple(outputs), sums
 
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:

@@ -38,7 +38,7 @@ def find_flow(before: Tensor, after: Tensor) -> Tensor:
         flow = interpolate(flow[None], shape, mode="trilinear", align_corners=False)[0]
         flow = flow * flow.new_tensor(stretch).view(3, 1, 1, 1)
         for _ in range(WARPS):
-            flow = _relax(*coarse, flow)
+            flow = _relax(coarse[0], coarse[1], flow)
         factor //= 2
     return flow
 
