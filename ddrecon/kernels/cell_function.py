@@ -43,7 +43,7 @@ class RowFunction:
 
     `find_values` and its like have the row, then the C++ expressions in `place`, made of `more`,
     which is `declared`. The last fields, as many as are `added`, are but added to the outputs, one
-    after another. As many before them as are `alike` have the same cotangents as those before.
+    after another.
     """
 
     header: str
@@ -54,7 +54,6 @@ class RowFunction:
     declared: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
-    alike: int = 0
 
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
         """The outputs for `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
@@ -74,12 +73,8 @@ class RowFunction:
         like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[-3:]
         width = 1 if like.is_cuda else self.width
         items, has_sums = colors * math.prod(shape) // width, kind == "cotangents"
-        shapes: Sequence[tuple[int, ...]] = self.shapes
-        if has_sums:
-            different = fields[: len(fields) - self.alike]
-            shapes = [(*field.shape[:-4], colors, *shape) for field in different]
-        outputs = [like.new_empty(of) for of in shapes]
-        outputs += outputs[len(outputs) - self.alike :] if has_sums else []
+        of_fields = ((*field.shape[:-4], colors, *shape) for field in fields)
+        outputs = [like.new_empty(of) for of in (of_fields if has_sums else self.shapes)]
         sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
         inputs = {

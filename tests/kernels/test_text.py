@@ -134,7 +134,7 @@ def test_what_it_only_reads_it_cannot_write(capfd):
 
 @pytest.mark.slow
 def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
-    text = "Given<F> rays = {}; rays.ray_count = ray_count; place[item] = rays.row_of(row);"
+    text = "Arguments<F> rays = {}; rays.ray_count = ray_count; place[item] = rays.row_of(row);"
     found = torch.empty(1, dtype=torch.int64)
     given = "int ray_count, row; long *place"
     kernel = TextKernel("find_row", 32, text, given, "place", "march/fused/rays.h")
