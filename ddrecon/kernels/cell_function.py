@@ -73,11 +73,8 @@ class RowFunction:
         like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[-3:]
         width = 1 if like.is_cuda else self.width
         items, has_sums = colors * math.prod(shape) // width, kind == "cotangents"
-        shapes: Sequence[tuple[int, ...]] = self.shapes
-        if has_sums:
-            shapes = [(*field.shape[:-4], colors, *shape) for field in fields]
-        outputs = [like.new_empty(of) for of in shapes]
-        written = {"made": _one_by_one(outputs)}
+        of_fields = ((*field.shape[:-4], colors, *shape) for field in fields)
+        outputs = [like.new_empty(of) for of in (of_fields if has_sums else self.shapes)]
         sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
         inputs: dict[str, Any] = {
@@ -87,11 +84,11 @@ class RowFunction:
             "numbers": numbers,
             "fields": fields,
             "channels": [len(field) for field in fields],
+            **self.more,
+            **more,
         }
-        kernel = self.kernel(kind, len(fields), 8 * like.element_size())
-        kernel.launch(
-            items, inputs | self.more | more, written | ({"sums": sums} if has_sums else {})
-        )
+        written = {"made": _one_by_one(outputs)} | ({"sums": sums} if has_sums else {})
+        self.kernel(kind, len(fields), 8 * like.element_size()).launch(items, inputs, written)
         return tuple(outputs), sums
 
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
