@@ -114,13 +114,13 @@ def _find_lack(outgoing: OutgoingLight, inflow: Inflow, axis: int) -> Tensor:
     if first:
         inward = 1 - 2 * (ends > 0).to(received).view(-1, *[1] * (2 - axis))
         received = received + 0.5 * inward * flux_along_axes(first)[axis]
-    light = outermost(outgoing.diffuse) + inflow.kept * received
+    light = outermost(outgoing.diffuse) + inflow.unpeaked * received
     lost = extinction.scale * outermost(extinction.field)
     scattered = diffusing.scale * outermost(diffusing.field)
     sent = scattered * light - lost * inflow.outside
     if outgoing.emitted is not None:
         sent = sent + outermost(outgoing.emitted)
-    weight = width * inflow.kept * torch.stack([*inflow.backward[2 * axis :][:2]], 1 + axis)
+    weight = width * inflow.unpeaked * torch.stack([*inflow.backward[2 * axis :][:2]], 1 + axis)
     lack = weight * sent / (UNEVEN + width * lost + weight * scattered)
     return lack if outgoing.emitted is None else diffusing.scale * lack
 
