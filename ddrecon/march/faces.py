@@ -7,6 +7,8 @@ optical depth at most; but it is zero on faces through which the light shines.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -37,44 +39,43 @@ def extend_fields(outgoing: OutgoingLight, axis: int | None) -> dict[str, Tensor
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
     outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
-    extended = dict[str, Tensor]()
-    for name, field in outgoing.fields.items():
-        if name == "diffuse" or name.startswith("mass "):
-            extended[name] = _extend_light(outgoing, name, field, axis)
-        else:
-            extended[name] = pad(field[None], [1] * 6, mode="replicate")[0]
-    return extended
+    names = ["diffuse", *(f"mass {index}" for index in range(len(outgoing.beams)))]
+    light = dict(zip(names, _extend_light(outgoing, names, axis), strict=True))
+    return {
+        name: light[name] if name in light else pad(field[None], [1] * 6, mode="replicate")[0]
+        for name, field in outgoing.fields.items()
+    }
 
 
-def _extend_light(outgoing: OutgoingLight, name: str, field: Tensor, axis: int | None) -> Tensor:
-    """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
-    grid, extinction = outgoing.grid, outgoing.extinction
+def _extend_light(outgoing: OutgoingLight, names: list[str], axis: int | None) -> list[Tensor]:
+    """Diffuse light and masses, by their `names`, extended."""
+    fields = [outgoing.fields[name] for name in names]
+    grid, counts, cells = outgoing.grid, [len(field) for field in fields], torch.cat(fields)
     axes = [along for along in range(3) if grid.shape[along] > 1]
-    places, neighbors = _surround(grid, field.device)
+    places, neighbors = _surround(grid, cells.device)
     # On faces: the nearest cells, and the line through the two outermost ones.
-    nearest, line = field.flatten(1).index_select(1, neighbors), pad(field, [1] * 6)
+    nearest, line = cells.flatten(1).index_select(1, neighbors), pad(cells, [1] * 6)
     for along in range(3):
         line = _add_to_ends(line, along, 1, (1.5, -0.5) if along in axes else (1.0, 0.0))
     straight = line.flatten(1).index_select(1, places)
-    if name == "diffuse":
-        matter = extinction.field[: len(field)].flatten(1).index_select(1, neighbors)
-        share = thinness(grid, extinction.scale[: len(field)].view(-1, 1) * matter, OPAQUE)
-        on_faces = torch.lerp(nearest, straight, for_channels(share, len(field)))
-    else:
-        unlit = _find_unlit(outgoing.beams[int(name.split()[1])], grid)
-        limited = _limit(nearest, straight, extinction.mass_bound)
-        on_faces = unlit.index_select(0, places) * limited
+    diffuse, *masses = zip(nearest.split(counts), straight.split(counts), strict=True)
+    on_faces = [_limit_light(outgoing, neighbors, *diffuse)]
+    for beam, mass in zip(outgoing.beams, masses, strict=True):
+        unlit = _find_unlit(beam, grid).index_select(0, places)
+        on_faces.append(unlit * _limit_mass(*mass, outgoing.extinction.mass_bound))
+
     # Half a cell beyond faces, but not across `axis`.
-    layer = torch.zeros_like(line).flatten(1).index_add(1, places, on_faces)
-    extended = pad(field, [1] * 6) + layer.view(line.shape)
+    layer = torch.zeros_like(line).flatten(1).index_add(1, places, torch.cat(on_faces))
+    extended = pad(cells, [1] * 6) + layer.view(line.shape)
     for along in axes:
         if along != axis:
             extended = _add_to_ends(extended, along, 0, (1.0, -1.0))
-    if name == "diffuse" and outgoing.inflow is not None:
-        for along in axes:
-            lack = _find_lack(outgoing, outgoing.inflow, along).expand(len(field), -1, -1, -1)
-            _lower_ends(extended, along, lack, 1.0 if along == axis else 2 + RAISED)
-    return extended
+    light = [*extended.split(counts)]
+    if outgoing.inflow is not None and axes:
+        light[0] = light[0].clone()
+        for along, lack in zip(axes, _find_lacks(outgoing, outgoing.inflow, axes), strict=True):
+            _lower_ends(light[0], along, lack, 1.0 if along == axis else 2 + RAISED)
+    return light
 
 
 def _add_to_ends(field: Tensor, axis: int, first: int, factors: tuple[float, float]) -> Tensor:
@@ -82,9 +83,20 @@ def _add_to_ends(field: Tensor, axis: int, first: int, factors: tuple[float, flo
 
     The `first` of them is so many layers from each end, and the other one more.
     """
-    ends, layers = _find_layers(field.shape[axis - 3], first, field.device)
-    outer, inner = field.index_select(axis - 3, layers).chunk(2, axis - 3)
-    return field.index_add_(axis - 3, ends, factors[0] * outer + factors[1] * inner)
+    like = field.dtype, field.device
+    ends, layers, weights = _find_layers(field.shape[axis - 3], first, factors, *like)
+    change = field.index_select(axis - 3, layers) * weights.view(-1, *[1] * (2 - axis))
+    return field.index_add_(axis - 3, ends, change)
+
+
+def _limit_light(
+    outgoing: OutgoingLight, neighbors: Tensor, nearest: Tensor, straight: Tensor
+) -> Tensor:
+    """Diffuse light on faces: the `nearest` cells' where these are opaque, else `straight`."""
+    count, extinction = len(nearest), outgoing.extinction
+    matter = extinction.field[:count].flatten(1).index_select(1, neighbors)
+    share = thinness(outgoing.grid, extinction.scale[:count].view(-1, 1) * matter, OPAQUE)
+    return torch.lerp(nearest, straight, for_channels(share, count))
 
 
 def _lower_ends(field: Tensor, axis: int, lack: Tensor, times: float) -> None:
@@ -92,49 +104,58 @@ def _lower_ends(field: Tensor, axis: int, lack: Tensor, times: float) -> None:
 
     The outermost cells gain a part of it.
     """
-    ends, layers = _find_layers(field.shape[axis - 3], 0, field.device)
+    like = field.dtype, field.device
+    ends, layers, _ = _find_layers(field.shape[axis - 3], 0, (0.0, 0.0), *like)
     sides = [int(across != axis) for across in (2, 1, 0) for _ in range(2)]
+    lack = lack.expand(len(field), -1, -1, -1)
     around = pad(lack[None], sides, mode="replicate")[0]
-    field.index_add_(axis - 3, ends, around, alpha=-times)
+    field.index_add_(axis - 3, ends[:2], around, alpha=-times)
     field.index_add_(axis - 3, layers[2:], pad(lack, sides), alpha=RAISED)
 
 
-def _find_lack(outgoing: OutgoingLight, inflow: Inflow, axis: int) -> Tensor:
-    """By how much light on faces across `axis` is less than on the line to there (E2.17).
+def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, axes: list[int]) -> list[Tensor]:
+    """By how much light on faces is less than on the line to there (E2.17).
 
-    It is [C, z, y, x] with two layers, one for each face.
+    For each of `axes` it is [C, z, y, x] with two layers across it.
     """
     grid, extinction, diffusing = outgoing.grid, outgoing.extinction, outgoing.diffusing
-    ends, width = _find_layers(grid.shape[axis], 0, inflow.received.device)[0], grid.spacing[axis]
+    shapes = [[2 if a == axis else n for a, n in enumerate(grid.shape)] for axis in axes]
+    cells, outward, width = _find_outermost(grid, outgoing.diffuse.dtype, outgoing.diffuse.device)
 
     def outermost(field: Tensor) -> Tensor:
-        return field.index_select(axis - 3, ends)
+        return field.flatten(1).index_select(1, cells)
 
-    received, *first = outermost(inflow.received).unbind()
+    # Moments beside colors: along a third axis torch takes entries one by one.
+    moments = outermost(inflow.received.flatten(0, 1))
+    received, *first = moments.unflatten(0, inflow.received.shape[:2]).unbind()
     if first:
-        inward = 1 - 2 * (ends > 0).to(received).view(-1, *[1] * (2 - axis))
-        received = received + 0.5 * inward * flux_along_axes(first)[axis]
-    light = outermost(outgoing.diffuse) + inflow.kept * received
-    lost = extinction.scale * outermost(extinction.field)
-    scattered = diffusing.scale * outermost(diffusing.field)
-    sent = scattered * light - lost * inflow.outside
+        flux = torch.stack(flux_along_axes(first))
+        received = received - 0.5 * (outward[:, None] * flux).sum(0)
+    unpeaked, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
+    light = outermost(outgoing.diffuse) + unpeaked * received
+    lost = extinction.scale.view(-1, 1) * outermost(extinction.field)
+    scattered = scale * outermost(diffusing.field)
+    sent = scattered * light - lost * inflow.outside.view(-1, 1)
     if outgoing.emitted is not None:
         sent = sent + outermost(outgoing.emitted)
-    weight = width * inflow.kept * torch.stack([*inflow.backward[2 * axis :][:2]], 1 + axis)
+    backward = [
+        torch.stack([*inflow.backward[2 * axis :][:2]], 1 + axis).expand(-1, *shape).flatten(1)
+        for axis, shape in zip(axes, shapes, strict=True)
+    ]
+    weight = width * unpeaked * torch.cat(backward, 1)
     lack = weight * sent / (UNEVEN + width * lost + weight * scattered)
-    return lack if outgoing.emitted is None else diffusing.scale * lack
+    lack = lack if outgoing.emitted is None else scale * lack
+    split = lack.split([math.prod(shape) for shape in shapes], 1)
+    return [part.unflatten(1, shape) for part, shape in zip(split, shapes, strict=True)]
 
 
 def _find_unlit(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     """What is left of masses to `beam` in all places of an extended field: 0 on lit faces."""
-    low, high = (1 - shine_through(beam, grid)).view(3, 2).unbind(1)
-    unlit = [
-        torch.cat([low[[axis]], low.new_ones(count), high[[axis]]])
-        if count > 1
-        else low.new_ones(3)
-        for axis, count in enumerate(grid.shape)
-    ]
-    z, y, x = torch.meshgrid(*unlit, indexing="ij")
+    unlit, along = (1 - shine_through(beam, grid)).view(3, 2), list[Tensor]()
+    for ends, count in zip(unlit, grid.shape, strict=True):
+        inner = ends.new_ones(count if count > 1 else 3)
+        along.append(torch.cat([ends[:1], inner, ends[1:]]) if count > 1 else inner)
+    z, y, x = torch.meshgrid(*along, indexing="ij")
     return (z * y * x).flatten()
 
 
@@ -152,7 +173,7 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     return (lit * lit * (3 - 2 * lit)).flatten()
 
 
-def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
+def _limit_mass(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     """`goal`, less than `layer` by 1 over `bound` at most."""
     fall = (goal - layer).clamp(max=0)
     # squared, which must not overflow
@@ -168,8 +189,40 @@ def _surround(grid: Grid, device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 @remember
-def _find_layers(count: int, first: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Both ends of `count` layers [2]; and those `first` from these, and the next ones, [4]."""
-    low = torch.tensor([0, first, first + 1], device=device)
-    ends, *layers = torch.stack([low, count - 1 - low], 1)
-    return ends.clone(), torch.cat(layers)
+def _find_layers(
+    count: int,
+    first: int,
+    factors: tuple[float, float],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Both ends of `count` layers, twice; layers that are `first` from these, then the next ones.
+
+    And what each of these is to be multiplied by; all are [4].
+    """
+    near, far = torch.tensor([0, first, first + 1]), torch.tensor(factors, dtype=torch.float64)
+    ends, *layers = torch.stack([near, count - 1 - near], 1).to(device)
+    return ends.repeat(2), torch.cat(layers), far.repeat_interleave(2).to(device, dtype)
+
+
+@remember
+def _find_outermost(
+    grid: Grid, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The S outermost cells across all axes of more than one cell, twice where they are at edges.
+
+    With their outward normals [3, S] and their widths [u] across faces, [S].
+    """
+    numbers = torch.arange(grid.cells).view(grid.shape)
+    cells, outward, width = list[Tensor](), list[Tensor](), list[Tensor]()
+    for axis, count in enumerate(grid.shape):
+        if count > 1:
+            layers = numbers.index_select(axis, torch.tensor([0, count - 1]))
+            side = torch.tensor([-1.0, 1.0]).view(-1, *[1] * (2 - axis)).expand(layers.shape)
+            cells.append(layers.flatten())
+            normal = torch.eye(3)[axis]
+            outward.append(normal[:, None] * side.flatten())
+            width.append(torch.full((layers.numel(),), grid.spacing[axis], dtype=torch.float64))
+    columns = torch.cat(outward, 1), torch.cat(width)
+    normals, widths = (column.to(device, dtype) for column in columns)
+    return torch.cat(cells).to(device), normals, widths

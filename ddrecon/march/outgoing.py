@@ -23,13 +23,14 @@ class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
     `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, z, y, x] of what cells
-    receive of beams, `kept` times which counts as `diffuse` light does. `backward` are, by face,
-    the parts [C, rows, columns] of light from there that are scattered into the camera's rays.
+    receive of beams, of which the share `unpeaked` counts as `diffuse` light does. `backward` are,
+    by face, the parts [C, rows, columns] of light from there that are scattered into the camera's
+    rays.
     """
 
     outside: Tensor
     received: Tensor
-    kept: Tensor
+    unpeaked: Tensor
     backward: Sequence[Tensor]
 
 
