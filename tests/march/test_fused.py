@@ -1,6 +1,8 @@
 """The view-ray integral by fused kernels is torch's, in values, adjoints and tangents."""
 
+import functools
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +16,7 @@ from ddrecon.engine import use_engine
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.picture import render_each
 from ddrecon.scene import Scene
@@ -29,63 +31,55 @@ from ddrecon.march.fused.kernels import Case, Layout
 pytestmark = pytest.mark.slow
 
 SHAPE = (7, 9, 8)
+in_double = functools.partial(torch.tensor, dtype=torch.float64)
 OUTSIDE, INSIDE = {"half_width": 0.4}, {"eye": (0.1, 0.12, 0.05), "half_width": 0.6}
 LIGHT = ["density", "g", "lights.0.irradiance", "lights.0.direction"]
 POINT = ["lights.1.position", "lights.1.intensity"]
 POSE = ["views.view.camera"]
 
 
-def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:
+NUMBERS, COLORS = (
+    random_values(*shape, seed=seed) for shape, seed in ((SHAPE, 7), ((3, *SHAPE), 8))
+)
+FIELDS = {
+    name: factor * (0.5 + random_values(3, *SHAPE, seed=seed))
+    for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
+}
+MEDIA: dict[str, dict[str, Any]] = {
+    "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,)},
+    "backward": {"g": -0.4, "ambient": (0.2, 0.1, 0.3)},
+    "peaked": {"g": 0.5},
+    "points": {"g": -0.3},
+    "fields": {"g": 0.5, **FIELDS},
+}
+PHASES = {
+    "lobes by color": TwoLobe(in_double([0.6, -0.4]), in_double([0.9, 0.5, 0.2])),
+    # Of both signs.
+    "g by cell": HenyeyGreenstein(1.6 * NUMBERS - 0.7),
+    "weight by cell": TwoLobe(in_double([0.6, -0.4]), COLORS),
+    "blend by cell": Blend(
+        HenyeyGreenstein(in_double([0.6, 0.5, -0.3])), Rayleigh(in_double(0.0)), NUMBERS
+    ),
+    "backward weight by cell": TwoLobe(in_double([-0.2, -0.5]), NUMBERS),
+}
+LAMP_OUTSIDE = PointLight(in_double([0.9, 0.7, 0.2]), in_double([1.0, 2.0, 0.5]))
+LAMP_INSIDE = PointLight(in_double([0.1, 0.05, -0.1]), in_double([0.3]))
+LAMPS = {
+    "fields": [LAMP_OUTSIDE, LAMP_INSIDE],
+    "points": [LAMP_OUTSIDE, LAMP_INSIDE],
+    "lobes by color": [LAMP_OUTSIDE],
+    "weight by cell": [LAMP_OUTSIDE],
+}
+
+
+def scene_of(kind: str, view: dict, size: int = 9) -> Scene:
     """A scene with a directional light, `kind` of medium and lights, seen by one camera."""
-    density = half_empty(*SHAPE, dtype=dtype)
-    camera = make_camera(size=(size, size + 1), dtype=dtype, **view)
-    if kind == "gray":
-        return make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera)
-    if kind == "backward":
-        return make_scene(density, g=-0.4, ambient=(0.2, 0.1, 0.3), camera=camera)
-    if kind == "peaked":
-        return make_scene(density, g=0.5, camera=camera)
-    if kind == "lobes by color":
-        scene = make_scene(density, camera=camera)
-        lobes, weight = density.new_tensor([0.6, -0.4]), density.new_tensor([0.9, 0.5, 0.2])
-        scene.volume.phase = TwoLobe(lobes, weight)
-        outside = density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5])
-        scene.lights.append(PointLight(*outside))
-        return scene
-    if "by cell" in kind:
-        scene = make_scene(density, camera=camera)
-        scene.volume.phase = cellwise_phase(kind, density)
-        if kind == "weight by cell":
-            place = density.new_tensor([0.9, 0.7, 0.2])
-            scene.lights.append(PointLight(place, density.new_tensor([1.0, 2.0, 0.5])))
-        return scene
-    fields = {
-        name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
-        for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
-    }
-    scene = (
-        make_scene(density, g=-0.3, camera=camera)
-        if kind == "points"
-        else make_scene(density, g=0.5, camera=camera, **fields)
-    )
-    outside = PointLight(density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5]))
-    inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
-    scene.lights += [outside, inside]
+    camera = make_camera(size=(size, size + 1), **view)
+    scene = make_scene(half_empty(*SHAPE), camera=camera, **MEDIA.get(kind, {}))
+    if kind in PHASES:
+        scene.volume.phase = PHASES[kind]
+    scene.lights += LAMPS.get(kind, [])
     return scene
-
-
-def cellwise_phase(kind: str, density: Tensor) -> PhaseFunction:
-    """Both signs of g; two lobes, by color or backward; or weights that colors share."""
-    numbers = random_values(*SHAPE, seed=7, dtype=density.dtype)
-    if kind == "g by cell":
-        return HenyeyGreenstein(1.6 * numbers - 0.7)
-    if kind == "weight by cell":
-        colors = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
-        return TwoLobe(density.new_tensor([0.6, -0.4]), colors)
-    if kind == "blend by cell":
-        air = Rayleigh(density.new_zeros(()))
-        return Blend(HenyeyGreenstein(density.new_tensor([0.6, 0.5, -0.3])), air, numbers)
-    return TwoLobe(density.new_tensor([-0.2, -0.5]), numbers)
 
 
 def images(scene: Scene, values: dict[str, Tensor], engine: str) -> list[Tensor]:
