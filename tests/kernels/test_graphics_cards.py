@@ -16,7 +16,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.build import load_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-MOST_REGISTERS = {"transpose": 168}
+MOST_REGISTERS = {"transpose": 192}
 """Of a thread, of a kernel that needs many."""
 REGISTERS_OF_OTHERS = 128
 """Two blocks of 256 threads then have room beside each other."""

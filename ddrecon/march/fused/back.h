@@ -271,15 +271,17 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         for (int l = 0; l < LANES && begin + l <= last; ++l)
             array[row_of(k) + begin + l] = P::lane(bar, l);
     }
-    void store() const {
+    void store() {
         for (int k = 0; k <= 2 * L::C; ++k)
             bars.numbers[k * bars.packets + this->item] = P::sum(number_bar[k]);
         if (MOVES && bars.rays) {
-            const int y = this->is_turned ? 2 : 1, x = 3 - y,
-                      order[] = {0, y, x, 3, 3 + y, 3 + x, 6, 7};
+            if (this->is_turned) {
+                swap(ray_bar[1], ray_bar[2]);
+                swap(ray_bar[4], ray_bar[5]);
+            }
             for (int l = 0; l < LANES && begin + l <= last; ++l)
                 for (int k = 0; k < 8; ++k)
-                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[order[k]], l);
+                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[k], l);
         }
         for (int b = 0; b < L::BEAMS && bars.angles; ++b) {
             put(bars.angles, b, foot_bar[b]);

@@ -60,8 +60,8 @@ template <class F> struct Numbers : Packets<F> {
     static INLINE F lane_in_memory(const V& x, int l) { return ((const F*)&x)[l]; }
 };
 
-template <class Node> INLINE void swap(Node*& a, Node*& b) {
-    Node* const former = a;
+template <class X> INLINE void swap(X& a, X& b) {
+    const X former = a;
     a = b;
     b = former;
 }

@@ -173,11 +173,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         if (high * high <= wide * wide) return;
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
-        for (int k = 1; k <= 4; k += 3) {
-            const Length y = ray[k];
-            ray[k] = ray[k + 1];
-            ray[k + 1] = y;
-        }
+        swap(ray[1], ray[2]);
+        swap(ray[4], ray[5]);
     }
     long long row_of(int k) const { return arguments.row_of(k); }
     // What the rays have at `at` of an array, and its change.
