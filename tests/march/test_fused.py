@@ -1,24 +1,28 @@
 """The view-ray integral by fused kernels is torch's, in values, adjoints and tangents."""
 
-import functools
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import torch.autograd.forward_ad as forward
 from graphics_cards import assert_compiles
-from media import assert_near, half_empty, make_camera, make_scene, random_values
+from media import (
+    assert_near,
+    half_empty,
+    image_gradients,
+    make_camera,
+    make_scene,
+    random_values,
+)
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.picture import render_each
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
@@ -31,86 +35,62 @@ from ddrecon.march.fused.kernels import Case, Layout
 pytestmark = pytest.mark.slow
 
 SHAPE = (7, 9, 8)
-in_double = functools.partial(torch.tensor, dtype=torch.float64)
 OUTSIDE, INSIDE = {"half_width": 0.4}, {"eye": (0.1, 0.12, 0.05), "half_width": 0.6}
 LIGHT = ["density", "g", "lights.0.irradiance", "lights.0.direction"]
 POINT = ["lights.1.position", "lights.1.intensity"]
 POSE = ["views.view.camera"]
 
 
-NUMBERS, COLORS = (
-    random_values(*shape, seed=seed) for shape, seed in ((SHAPE, 7), ((3, *SHAPE), 8))
-)
-FIELDS = {
-    name: factor * (0.5 + random_values(3, *SHAPE, seed=seed))
-    for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
-}
-MEDIA: dict[str, dict[str, Any]] = {
-    "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,)},
-    "backward": {"g": -0.4, "ambient": (0.2, 0.1, 0.3)},
-    "peaked": {"g": 0.5},
-    "points": {"g": -0.3},
-    "fields": {"g": 0.5, **FIELDS},
-}
-PHASES = {
-    "lobes by color": TwoLobe(in_double([0.6, -0.4]), in_double([0.9, 0.5, 0.2])),
-    # Of both signs.
-    "g by cell": HenyeyGreenstein(1.6 * NUMBERS - 0.7),
-    "weight by cell": TwoLobe(in_double([0.6, -0.4]), COLORS),
-    "blend by cell": Blend(
-        HenyeyGreenstein(in_double([0.6, 0.5, -0.3])), Rayleigh(in_double(0.0)), NUMBERS
-    ),
-    "backward weight by cell": TwoLobe(in_double([-0.2, -0.5]), NUMBERS),
-}
-LAMP_OUTSIDE = PointLight(in_double([0.9, 0.7, 0.2]), in_double([1.0, 2.0, 0.5]))
-LAMP_INSIDE = PointLight(in_double([0.1, 0.05, -0.1]), in_double([0.3]))
-LAMPS = {
-    "fields": [LAMP_OUTSIDE, LAMP_INSIDE],
-    "points": [LAMP_OUTSIDE, LAMP_INSIDE],
-    "lobes by color": [LAMP_OUTSIDE],
-    "weight by cell": [LAMP_OUTSIDE],
-}
-
-
-def scene_of(kind: str, view: dict, size: int = 9) -> Scene:
+def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:
     """A scene with a directional light, `kind` of medium and lights, seen by one camera."""
-    camera = make_camera(size=(size, size + 1), **view)
-    scene = make_scene(half_empty(*SHAPE), camera=camera, **MEDIA.get(kind, {}))
-    if kind in PHASES:
-        scene.volume.phase = PHASES[kind]
-    scene.lights += LAMPS.get(kind, [])
+    density = half_empty(*SHAPE, dtype=dtype)
+    tensor, camera = density.new_tensor, make_camera(size=(size, size + 1), dtype=dtype, **view)
+    sigma_a, sigma_s = (0.5 + random_values(3, *SHAPE, seed=k, dtype=dtype) for k in (1, 2))
+    outside = PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5]))
+    both = [outside, PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3]))]
+    medium, lights = {
+        "gray": ({"sigma_a": (1.0,), "sigma_s": (6.0,)}, []),
+        "backward": ({"g": -0.4, "ambient": (0.2, 0.1, 0.3)}, []),
+        "peaked": ({"g": 0.5}, []),
+        "points": ({"g": -0.3}, both),
+        "fields": ({"g": 0.5, "sigma_a": sigma_a, "sigma_s": 6 * sigma_s}, both),
+        "lobes by color": ({}, [outside]),
+        "weight by cell": ({}, [outside]),
+    }.get(kind, ({}, []))
+    scene = make_scene(density, camera=camera, **medium)
+    scene.lights += lights
+    scene.volume.phase = phases(density).get(kind, scene.volume.phase)
     return scene
 
 
-def images(scene: Scene, values: dict[str, Tensor], engine: str) -> list[Tensor]:
-    use_engine(engine)
-    changed = with_values(scene, values)
-    return render_each(changed, changed.views, SolveMemory())
-
-
-def weights_of(image: Tensor) -> Tensor:
-    """Those of a functional of `image` that asks nothing of its first two rows."""
-    weights = random_values(*image.shape, seed=3).to(image)
-    weights[..., :2, :] = 0
-    return weights
+def phases(density: Tensor) -> dict[str, PhaseFunction]:
+    """Both signs of g; two lobes, by color or backward; or weights that colors share."""
+    tensor, numbers = density.new_tensor, random_values(*SHAPE, seed=7, dtype=density.dtype)
+    by_color = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
+    haze, air = HenyeyGreenstein(tensor([0.6, 0.5, -0.3])), Rayleigh(density.new_zeros(()))
+    return {
+        "lobes by color": TwoLobe(tensor([0.6, -0.4]), tensor([0.9, 0.5, 0.2])),
+        "g by cell": HenyeyGreenstein(1.6 * numbers - 0.7),
+        "weight by cell": TwoLobe(tensor([0.6, -0.4]), by_color),
+        "blend by cell": Blend(haze, air, numbers),
+        "backward weight by cell": TwoLobe(tensor([-0.2, -0.5]), numbers),
+    }
 
 
 def gradients(scene: Scene, names: list[str], engine: str) -> tuple[Tensor, list[Tensor]]:
-    """The first image, and the derivatives of a random functional of all of them."""
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    rendered = images(scene, leaves, engine)
-    loss = sum((image * weights_of(image)).sum() for image in rendered)
-    return rendered[0].detach(), list(torch.autograd.grad(loss, list(leaves.values())))
+    use_engine(engine)
+    return image_gradients(scene, names)
 
 
 def tangent(scene: Scene, names: list[str], engine: str) -> Tensor:
+    use_engine(engine)
     with forward.dual_level():
         duals = {}
         for name in names:
             value = value_of(scene, name).detach()
             change = random_values(*value.shape, seed=5).to(value)
             duals[name] = forward.make_dual(value, change)
-        return forward.unpack_dual(images(scene, duals, engine)[0]).tangent
+        return forward.unpack_dual(render(with_values(scene, duals))[0]).tangent
 
 
 EMISSIONS = [
