@@ -67,37 +67,37 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
 
     // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
     void walk(const V* bar, W* m) {
-        Node nodes[2];
+        Node nodes[2], *a = nodes, *b = nodes + 1;
         for (int from = this->last_node, to; this->stretch_before(from, to);) {
-            this->locate(to, nodes[to % 2]);
-            reach(nodes[to % 2], m);
+            this->locate(to, *b);
+            reach(*b, m);
             for (int n = to - 1; n >= from; --n) {
-                Node &a = nodes[n % 2], &b = nodes[(n + 1) % 2];
-                this->locate(n, a);
-                for (int k = 0; k < L::EXTINCTION; ++k) m[k] -= this->mass_between(a, b, k);
-                reach(a, m);
+                this->locate(n, *a);
+                for (int k = 0; k < L::EXTINCTION; ++k) m[k] -= this->mass_between(*a, *b, k);
+                reach(*a, m);
                 for (int i = 0; i < L::OUT; ++i) {
-                    const Decay<F> decay(a.u[i], b.u[i], a.decay[i], b.decay[i]);
-                    const V half = F(0.5) * bar[i], sum = a.w[i] + b.w[i];
-                    const V measured = half * this->measure(a, b, i);
-                    a.w_bar[i] = measured * decay.mean;
-                    b.w_bar[i] += a.w_bar[i];
-                    a.u_bar[i] = measured * sum * decay.by0;
-                    b.u_bar[i] += measured * sum * decay.by1;
-                    if (MOVES) stretch(half * sum * decay.mean, i, a, b);
+                    const Decay<F> decay(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+                    const V half = F(0.5) * bar[i], sum = a->w[i] + b->w[i];
+                    const V measured = half * this->measure(*a, *b, i);
+                    a->w_bar[i] = measured * decay.mean;
+                    b->w_bar[i] += a->w_bar[i];
+                    a->u_bar[i] = measured * sum * decay.by0;
+                    b->u_bar[i] += measured * sum * decay.by1;
+                    if (MOVES) stretch(half * sum * decay.mean, i, *a, *b);
                 }
-                finish(b);
+                finish(*b);
                 // Its mass is that of node a and half the sum of extinctions, by the length.
                 for (int k = 0; k < L::EXTINCTION; ++k) {
                     const V half = F(0.5) * m_bar[k];
-                    a.v_bar[k] = half * (b.t - a.t);
-                    b.v_bar[k] += a.v_bar[k];
-                    if (MOVES) lengthen(half * (a.v[k] + b.v[k]), a, b);
+                    a->v_bar[k] = half * (b->t - a->t);
+                    b->v_bar[k] += a->v_bar[k];
+                    if (MOVES) lengthen(half * (a->v[k] + b->v[k]), *a, *b);
                 }
-                spread(b);
+                spread(*b);
+                swap(a, b);
             }
-            finish(nodes[from % 2]);
-            spread(nodes[from % 2]);
+            finish(*b);
+            spread(*b);
         }
     }
     // A node with the mass `m` behind it, of which nothing is known yet.
@@ -118,9 +118,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         if (i < L::C || !L::is_point(beam)) return lengthen(bar, a, b);
         Dual<V, 4> x[] = {foot[beam], across[beam], a.t, b.t};
         for (int k = 0; k < 4; ++k) x[k].by[k] = one;
-        const auto slopes = Point<F>::subtended(x[0], x[1], x[2], x[3]);
-        V* const to[] = {&foot_bar[beam], &across_bar[beam], &a.t_bar, &b.t_bar};
-        for (int k = 0; k < 4; ++k) *to[k] += bar * slopes.by[k];
+        const auto angle = Point<F>::subtended(x[0], x[1], x[2], x[3]);
+        foot_bar[beam] += bar * angle.by[0];
+        across_bar[beam] += bar * angle.by[1];
+        a.t_bar += bar * angle.by[2];
+        b.t_bar += bar * angle.by[3];
     }
 
     // What a node emits goes back to its values.
@@ -138,36 +140,36 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             for (int c = 0; c < L::C; ++c) {
                 const int k = L::extinction(c), s = L::scattering(c);
                 const int i = L::C + b * L::C + c, j = L::mass(b, c);
-                const V way = P::narrow(node.m[k]) + node.v[j];
+                const V passed = P::narrow(node.m[k]) + node.v[j];
                 const V p_bar = node.w_bar[i] * node.v[s];
-                V way_bar = node.u_bar[i] * this->number(c);
-                number_bar[c] += node.u_bar[i] * way;
+                V passed_bar = node.u_bar[i] * this->number(c);
+                number_bar[c] += node.u_bar[i] * passed;
                 node.v_bar[s] += node.w_bar[i] * node.p[i].value;
                 // What scatters nothing has no phase function to vary.
                 if (!node.is_empty) {
                     const E& p = node.p[i];
                     if constexpr (L::HAS_PEAK) {
                         const V depth_bar = p_bar * p.by[DEPTH];
-                        way_bar += depth_bar * this->peak_of(node, c);
+                        passed_bar += depth_bar * this->peak_of(node, c);
                         V& peak_bar =
                             L::IS_PEAK_FIELD ? node.v_bar[L::peak(c)] : number_bar[L::C + c];
-                        peak_bar += depth_bar * way;
+                        peak_bar += depth_bar * passed;
                     }
                     if constexpr (L::HAS_NUMBERS)
                         node.v_bar[L::FIRST_NUMBER + L::number(c)] += p_bar * p.by[NUMBER];
                     if constexpr (TURNS) place_bar += p_bar * p.by[PLACE];
                     if constexpr (TURNS && L::IS_SCALED) cosine_bar += p_bar * p.by[COSINE];
                     if constexpr (VARIES_TABLES)
-                        if (L::has_curve(b)) finish_curve(node, b, c, way, p_bar);
+                        if (L::has_curve(b)) finish_curve(node, b, c, passed, p_bar);
                 }
-                m_bar[k] += way_bar;
-                node.v_bar[j] += way_bar;
+                m_bar[k] += passed_bar;
+                node.v_bar[j] += passed_bar;
             }
-            if (TURNS) turn(node, b, place_bar, cosine_bar);
+            if (TURNS) finish_angles(node, b, place_bar, cosine_bar);
         }
     }
     // What p of beam b in color c had of the coefficients in its table.
-    void finish_curve(const Node& node, int b, int c, V way, V p_bar) {
+    void finish_curve(const Node& node, int b, int c, V passed, V p_bar) {
         const int table = L::table(c);
         const bool is_held = L::HOLDS && !L::is_point(b);
         V number = zero, cosine, bars_at_node[L::CURVE] = {};
@@ -175,17 +177,17 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             number = number_place<F, L::IS_SCALED>(node.v[L::FIRST_NUMBER + L::number(c)]);
         if (L::HAS_PEAK) p_bar = P::pick(node.p[L::C + b * L::C + c].value > zero, p_bar, zero);
         V* const bar = is_held ? curve_bar + b * L::HELD + table * L::CURVE : bars_at_node;
-        const V depth = L::HAS_PEAK ? value_of(this->peak_of(node, c)) * way : zero;
+        const V depth = L::HAS_PEAK ? value_of(this->peak_of(node, c)) * passed : zero;
         Polynomials<F, L::TERMS, L::POWERS>::spread(p_bar, depth, number, bar);
         if (is_held) return;
         const auto place = this->see(b, foot[b], across[b], node.t, cosine);
         Table::spread(place, bars.table + table * Table::SIZE, bar);
     }
     // What bars of beam b's place in tables, and of the cosine there, are for its angles.
-    void turn(Node& node, int b, V place_bar, V cosine_bar) {
+    void finish_angles(Node& node, int b, V place_bar, V cosine_bar) {
         Dual<V, 3> x[] = {foot[b], across[b], node.t}, cosine;
         for (int k = 0; k < 3; ++k) x[k].by[k] = one;
-        const Dual<V, 3> place = this->see(b, x[0], x[1], x[2], cosine).part;
+        const Dual<V, 3> place = this->see(b, x[0], x[1], x[2], cosine).fraction;
         V* const to[] = {&foot_bar[b], &across_bar[b], &node.t_bar};
         for (int k = 0; k < 3; ++k) *to[k] += place_bar * place.by[k] + cosine_bar * cosine.by[k];
     }
@@ -269,15 +271,17 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         for (int l = 0; l < LANES && begin + l <= last; ++l)
             array[row_of(k) + begin + l] = P::lane(bar, l);
     }
-    void store() const {
+    void store() {
         for (int k = 0; k <= 2 * L::C; ++k)
             bars.numbers[k * bars.packets + this->item] = P::sum(number_bar[k]);
         if (MOVES && bars.rays) {
-            const int y = this->is_turned ? 2 : 1, x = 3 - y,
-                      order[] = {0, y, x, 3, 3 + y, 3 + x, 6, 7};
+            if (this->is_turned) {
+                swap(ray_bar[1], ray_bar[2]);
+                swap(ray_bar[4], ray_bar[5]);
+            }
             for (int l = 0; l < LANES && begin + l <= last; ++l)
                 for (int k = 0; k < 8; ++k)
-                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[order[k]], l);
+                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[k], l);
         }
         for (int b = 0; b < L::BEAMS && bars.angles; ++b) {
             put(bars.angles, b, foot_bar[b]);

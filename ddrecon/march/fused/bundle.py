@@ -1,4 +1,4 @@
-"""What kernels are given of rays and of beams, found once where neither is varied."""
+"""Arguments of kernels that describe rays and beams, computed once where neither is varied."""
 
 from __future__ import annotations
 
@@ -78,17 +78,6 @@ def table_of(outgoing: OutgoingLight, layout: Layout) -> Tensor:
     if not layout.has_curves:
         return outgoing.diffuse.new_empty(0, 1)
     return outgoing.seen.table(layout.peak >= 0).to(outgoing.diffuse).flatten(0, 2)
-
-
-def factors_of(outgoing: OutgoingLight, layout: Layout, angles: Tensor) -> list[Tensor | None]:
-    """p of each beam [1 or C, R] where it is the same all along a ray, else None (E2.2)."""
-    count = len(outgoing.beams)
-    if layout.peak >= 0 or layout.numbers:
-        return [None] * count
-    return [
-        None if is_point else outgoing.seen.phase.value(cosine)
-        for is_point, cosine in zip(layout.beams, angles[count:], strict=True)
-    ]
 
 
 def numbers_of(outgoing: OutgoingLight) -> Tensor:

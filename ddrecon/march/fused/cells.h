@@ -12,10 +12,10 @@ struct Lines {
     int rows, columns, row, column;
 };
 
-// The four cells around a place on a line, which lies a part `a` of the way from the second to the
-// third, a center being the second; and a (1 - a) / 2, the `excess` of second differences that
-// linear values have. Faces are midway between the outermost cells of a line and the next: values
-// stay beyond them, and are linear up to them. On a center derivatives are those beyond it.
+// The four cells around a place on a line, which lies the fraction `a` of the way from the second
+// to the third, a center being the second; and a (1 - a) / 2, the `excess` of second differences
+// that linear values have. Faces are midway between the outermost cells of a line and the next:
+// values stay beyond them, and are linear up to them. On a center derivatives are those beyond it.
 template <class F, class N> struct Place {
     typedef Numbers<F> P;
     typedef typename P::V V;
@@ -53,17 +53,15 @@ template <class F, class N> struct Place {
     }
 };
 
-template <class N, class X> INLINE X between(const N& part, const X& first, const X& second) {
-    return first + part * (second - first);
+template <class N, class X>
+INLINE auto between(const N& fraction, const X& first, const X& second) {
+    return first + fraction * (second - first);
 }
 // The linear value at y and x, of which `cell(r, c)` is that in one of four rows and one of four
 // columns; if it `is_cubic`, in `bend` what that is off by.
 template <class Y, class Cell, class X>
 INLINE X interpolate(const Y& y, const Y& x, Cell cell, bool is_cubic, X& bend) {
-    auto line = [&](int r) HERE -> X {
-        const auto first = cell(r, 1), second = cell(r, 2);
-        return first + x.a * (second - first);
-    };
+    auto line = [&](int r) HERE -> X { return between(x.a, cell(r, 1), cell(r, 2)); };
     const X top = line(1), low = line(2);
     if (is_cubic) {
         auto curve = [&](int r) HERE -> X {
@@ -107,8 +105,8 @@ template <class F, bool IS_SLICED, class N> struct Spot {
     }
 };
 
-// Which segments of packet `item` of `rays` [R, 8] are `walked` [packets, words]: those between
-// nodes in slices at `planes` of which one has cells that are `touched` [N, rows, columns].
+// Sets bits of `walked` [packets, words], of segments of packet `item` of `rays` [R, 8]: those
+// between nodes in slices at `planes` of which one has cells that are `touched` [N, rows, columns].
 template <class F> INLINE void mark(
     int item, const F* planes, const F* rays, const bool* touched, int* walked, int ray_count,
     int node_count, int rows, int columns, int words) {
@@ -119,7 +117,6 @@ template <class F> INLINE void mark(
     for (int k = 0; k < 8; ++k) ray[k] = P::load(rays + k, begin, 8, last);
     const V near = ray[6], far = ray[7], none = P::all(F(0)), one = P::all(F(1));
     V before = none, touched_before = none;
-    unsigned word = 0;
     for (int n = 0; n < node_count; ++n) {
         // Which lanes' cells at node n the support touches.
         const V s = (planes[n] - ray[0]) / ray[3];
@@ -130,11 +127,8 @@ template <class F> INLINE void mark(
         for (int l = 0; l < LANES; ++l) P::put(touches, l, F(slice[P::lane_of(cell, l)]));
         // And which lanes' segments before it lie in the box.
         const V inside = P::pick((s > near) & (before < far) & (near < far), one, none);
-        if (n > 0 && !P::every(inside * (touches + touched_before) == none)) word |= 1u << (n % 32);
-        if (n % 32 == 31 || n == node_count - 1) {
-            walked[(long long)item * words + n / 32] = (int)word;
-            word = 0;
-        }
+        if (n > 0 && !P::every(inside * (touches + touched_before) == none))
+            walked[(long long)item * words + n / 32] |= (int)(1u << (n % 32));
         before = s;
         touched_before = touches;
     }

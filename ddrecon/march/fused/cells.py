@@ -106,7 +106,7 @@ def find_walked(support: Tensor, planes: Tensor, rays: Tensor) -> Tensor:
     """
     (nodes, rows, columns), (packets, _) = support.shape, cut(len(rays), LANES, rays)
     words = -(-nodes // BITS)
-    walked = rays.new_empty(packets, words, dtype=torch.int32)
+    walked = rays.new_zeros(packets, words, dtype=torch.int32)
     arguments = {"planes": planes, "rays": rays, "touched": _touched(support), "words": words}
     arguments |= {"ray_count": len(rays), "node_count": nodes, "rows": rows, "columns": columns}
     mark_kernel(torch.finfo(rays.dtype).bits).launch(packets, arguments, {"walked": walked})

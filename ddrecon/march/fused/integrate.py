@@ -17,7 +17,7 @@ from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
-from ddrecon.march.fused.bundle import factors_of, numbers_of, pack_rays, see_beams, table_of
+from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
     Case,
@@ -58,22 +58,23 @@ def march_rays(
     )
     # The walk's masses begin with what is in front.
     masses = masses if front is None else masses - front
-    return _compose(outgoing, out, factors_of(outgoing, layout, angles)), masses
+    return _compose(outgoing, layout, out, angles), masses
 
 
-def _compose(outgoing: OutgoingLight, out: Tensor, factors: Sequence[Tensor | None]) -> Tensor:
+def _compose(outgoing: OutgoingLight, layout: Layout, out: Tensor, angles: Tensor) -> Tensor:
     """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
-    light that of what remains; beams' irradiances, and p where it is one of the `factors`
-    [1 or C, R] (E2.2).
+    light that of what remains; beams' irradiances, and p where beams are seen at one of `angles`
+    (E2.2).
     """
     diffuse, *arriving = out.split(outgoing.colors)
     scattered = diffuse * outgoing.diffuse_scale.view(-1, 1)
-    for beam, light, factor in zip(outgoing.beams, arriving, factors, strict=True):
-        weighted = light if factor is None else light * factor
+    for index, (beam, light) in enumerate(zip(outgoing.beams, arriving, strict=True)):
+        if not layout.has_curve(index):
+            light = light * outgoing.seen.phase.value(angles[len(arriving) + index])
         strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
-        scattered = scattered + weighted * strength.view(-1, 1)
+        scattered = scattered + light * strength.view(-1, 1)
     return scattered
 
 

@@ -71,10 +71,14 @@ class Layout(NamedTuple):
             torch.finfo(outgoing.diffuse.dtype).bits,
         )
 
+    def has_curve(self, beam: int) -> bool:
+        """Whether p of a beam changes along a ray."""
+        return self.peak >= 0 or self.numbers > 0 or self.beams[beam]
+
     @property
     def has_curves(self) -> bool:
-        """Whether p of any beam changes along a ray."""
-        return bool(self.beams) and (self.peak >= 0 or self.numbers > 0 or any(self.beams))
+        """Whether p of any beam does."""
+        return any(map(self.has_curve, range(len(self.beams))))
 
     @property
     def channels(self) -> int:

@@ -15,11 +15,11 @@ template <class F> struct Numbers : Packets<F> {
     template <int K> using D = Dual<V, K>;
     using P::gather, P::least, P::log, P::most, P::narrow, P::pick, P::read, P::root, P::wide;
 
-    template <int K> static INLINE D<K> pick(M is, const D<K>& one, const D<K>& other) {
+    template <int K> static INLINE D<K> pick(M is, const D<K>& yes, const D<K>& no) {
         D<K> r;
-        r.value = pick(is, one.value, other.value);
+        r.value = pick(is, yes.value, no.value);
         UNROLLED
-        for (int k = 0; k < K; ++k) r.by[k] = pick(is, one.by[k], other.by[k]);
+        for (int k = 0; k < K; ++k) r.by[k] = pick(is, yes.by[k], no.by[k]);
         return r;
     }
     // Of arrays and their changes.
@@ -36,8 +36,8 @@ template <class F> struct Numbers : Packets<F> {
         return pick(a.value > b.value, a, b);
     }
     template <int K> static INLINE D<K> root(const D<K>& x) {
-        const V found = root(x.value);
-        return x.chain(found, F(0.5) / found);
+        const V value = root(x.value);
+        return x.chain(value, F(0.5) / value);
     }
     template <int K> static INLINE D<K> log(const D<K>& x) {
         return x.chain(log(x.value), F(1) / x.value);
@@ -57,8 +57,14 @@ template <class F> struct Numbers : Packets<F> {
         return y.chain(atan2(y.value, x.value), x.value * inverse, x, -y.value * inverse);
     }
     // Lane l, of many in memory: where l is no constant.
-    static INLINE F own(const V& x, int l) { return ((const F*)&x)[l]; }
+    static INLINE F lane_in_memory(const V& x, int l) { return ((const F*)&x)[l]; }
 };
+
+template <class X> INLINE void swap(X& a, X& b) {
+    const X former = a;
+    a = b;
+    b = former;
+}
 
 // Angles of tables are so many steps from 0 to pi; S has so many coefficients over the depth.
 constexpr int ANGLE_STEPS = 1024, COEFFICIENTS = 12;
@@ -140,24 +146,24 @@ template <class F, bool IS_G, class N> INLINE N number_place(const N& number) {
 template <class F, class N> struct Cubic {
     typedef Numbers<F> P;
     typename P::I first;
-    N part;
+    N fraction;
     INLINE Cubic() {}
-    INLINE Cubic(typename P::I first, const N& part) : first(first), part(part) {}
+    INLINE Cubic(typename P::I first, const N& fraction) : first(first), fraction(fraction) {}
     // Of an angle in steps.
     INLINE explicit Cubic(const N& angle) {
         const auto least = P::all(F(0)), most = P::all(F(ANGLE_STEPS - 1));
         first = P::whole(P::least(P::most(value_of(angle), least), most));
-        part = angle - P::real(first);
+        fraction = angle - P::real(first);
     }
-    INLINE Cubic<F, typename P::V> value() const { return {first, value_of(part)}; }
+    INLINE Cubic<F, typename P::V> value() const { return {first, value_of(fraction)}; }
     // What value and slope at both angles count.
     INLINE void weigh(N* w) const {
         constexpr F step = F(PI / ANGLE_STEPS);
-        const N u = part, rest = F(1) - u;
-        w[0] = (F(1) + u + u) * rest * rest;
-        w[1] = step * u * rest * rest;
-        w[2] = (F(1) + rest + rest) * u * u;
-        w[3] = -(step * rest) * u * u;
+        const N u = fraction, v = F(1) - u;
+        w[0] = (F(1) + u + u) * v * v;
+        w[1] = step * u * v * v;
+        w[2] = (F(1) + v + v) * u * u;
+        w[3] = -(step * v) * u * u;
     }
 };
 

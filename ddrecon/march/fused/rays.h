@@ -173,11 +173,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         if (high * high <= wide * wide) return;
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
-        for (int k = 1; k <= 4; k += 3) {
-            const Length y = ray[k];
-            ray[k] = ray[k + 1];
-            ray[k + 1] = y;
-        }
+        swap(ray[1], ray[2]);
+        swap(ray[4], ray[5]);
     }
     long long row_of(int k) const { return arguments.row_of(k); }
     // What the rays have at `at` of an array, and its change.
@@ -253,7 +250,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     static bool is_nothing(const V& x) { return P::every(x == P::all(F(0))); }
     static bool is_nothing(const Dual<V>& x) { return is_nothing(x.value) && is_nothing(x.by[0]); }
     // Values of channels `from` to before `to`.
-    INLINE void sample(Node& node, int from, int to) const {
+    void sample(Node& node, int from, int to) const {
 #if !IS_GPU
         if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
             if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
@@ -292,7 +289,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     void read_table(
         const Cubic<F, Length>& place, int h, int first, int count,
         Coefficient* coefficients) const {
-        const Cubic<F, Coefficient> angle(place.first, seed<PLACE, Coefficient>(place.part));
+        const Cubic<F, Coefficient> angle(place.first, seed<PLACE, Coefficient>(place.fraction));
         const int at = h * Table::SIZE + first;
         Table::read(angle, arguments.table + at, count, coefficients);
         if constexpr (IS_TANGENT && VARIES_TABLES) {
@@ -345,7 +342,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             for (int c = 0; c < L::C; ++c) {
                 const int i = L::C + b * L::C + c, k = L::number(c);
                 const N scattering = node.v[L::scattering(c)];
-                const N way = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
+                const N passed = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
                 E p(P::all(F(1)));
                 if (L::has_curve(b)) {
                     auto row = [&](int m) -> const Coefficient* {
@@ -353,7 +350,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                         read_table(place, L::table(c), m * L::TERMS, L::TERMS, at_node);
                         return at_node;
                     };
-                    const E depth = seed<DEPTH, E>(peak_of(node, c) * way);
+                    const E depth = seed<DEPTH, E>(peak_of(node, c) * passed);
                     p = Polynomials<F, L::TERMS, L::POWERS>::template at<E>(row, depth, places[k]);
                 }
                 if (L::HAS_PEAK) p = P::most(p, E(P::all(F(0))));
@@ -364,7 +361,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                     node.w[i] = scattering * p.value;
                 else
                     node.w[i] = scattering * p;
-                node.u[i] = number(c) * way;
+                node.u[i] = number(c) * passed;
             }
         }
         for (int i = 0; i < L::OUT; ++i) node.decay[i] = P::decay(value_of(node.u[i]));
@@ -392,26 +389,26 @@ template <class F, class L, class Which, Mode MODE, class Masses> void walk(
     typename Rays::Mass m[L::EXTINCTION];
     for (int i = 0; i < L::OUT; ++i) total[i] = N(P::all(F(0)));
     for (int k = 0; k < L::EXTINCTION; ++k) m[k] = rays.front(k);
-    typename Rays::Node nodes[2];
+    typename Rays::Node nodes[2], *a = nodes, *b = nodes + 1;
     for (int from, to = rays.first_node; rays.next_stretch(from, to);) {
-        rays.locate(from, nodes[from % 2]);
-        nodes[from % 2].is_lit = false;
+        rays.locate(from, *a);
+        a->is_lit = false;
         for (int n = from + 1; n <= to; ++n) {
-            typename Rays::Node &a = nodes[(n - 1) % 2], &b = nodes[n % 2];
-            rays.locate(n, b);
-            b.is_lit = !(a.is_empty && b.is_empty);
+            rays.locate(n, *b);
+            b->is_lit = !(a->is_empty && b->is_empty);
             // Between empty nodes nothing is added: what light there is does not matter.
-            if (b.is_lit) {
-                if (!a.is_lit) rays.emit(a, m);
+            if (b->is_lit) {
+                if (!a->is_lit) rays.emit(*a, m);
                 // The mass passed on the way to the next node, and what it emits behind that.
-                for (int k = 0; k < L::EXTINCTION; ++k) m[k] += rays.mass_between(a, b, k);
-                rays.emit(b, m);
+                for (int k = 0; k < L::EXTINCTION; ++k) m[k] += rays.mass_between(*a, *b, k);
+                rays.emit(*b, m);
                 // E2.2, E2.3: what arrives from the segment between both.
                 for (int i = 0; i < L::OUT; ++i) {
-                    const N decay = Decay<F>::of(a.u[i], b.u[i], a.decay[i], b.decay[i]);
-                    total[i] += F(0.5) * (a.w[i] + b.w[i]) * rays.measure(a, b, i) * decay;
+                    const N decay = Decay<F>::of(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+                    total[i] += F(0.5) * (a->w[i] + b->w[i]) * rays.measure(*a, *b, i) * decay;
                 }
             }
+            swap(a, b);
         }
     }
     for (int l = 0; l < LANES && rays.begin + l <= rays.last; ++l) {

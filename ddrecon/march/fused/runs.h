@@ -4,14 +4,7 @@
 // Neighboring rays meet the same cells: some lanes of a packet, a run, lie between the same two
 // rows and within LANES columns. Values: rows of these columns are read in one piece, and lanes
 // pick theirs by a permutation, which makes views 1.18 times as fast. Cotangents: cells of the
-// columns add up all shares of the run in vectors, and are written once:
-//
-//                  lane l, with weights L of its columns i, j
-//         row m    .  .  .  .  .  .  .
-//         row i    .  .  #  #  .  .  .      # += (1 - a) bar L
-//         row j    .  .  #  #  .  .  .      # += a bar L
-//         row p    .  .  .  .  .  .  .
-//               first column
+// columns add up all shares of the run in vectors, and are written once.
 
 namespace ddrecon {
 
@@ -59,9 +52,9 @@ template <class F> struct Runs {
             run[count++] = {ALL_LANES, 0, low, high, low < most ? low : most};
             return;
         }
-        for (unsigned rest = ALL_LANES; rest; rest &= ~run[count++].lanes) {
-            const int lane = __builtin_ctz(rest);
-            const I in_row = (y.cells[1] == P::lane_of(y.cells[1], lane)) & P::lanes_of(rest);
+        for (unsigned remaining = ALL_LANES; remaining; remaining &= ~run[count++].lanes) {
+            const int lane = __builtin_ctz(remaining);
+            const I in_row = (y.cells[1] == P::lane_of(y.cells[1], lane)) & P::lanes_of(remaining);
             const int low = __builtin_reduce_min(P::pick(in_row, x.cells[0], I{} + lines.columns));
             const I in_run = in_row & (x.cells[3] < low + LANES);
             const int high = __builtin_reduce_max(P::pick(in_run, x.cells[3], I{}));
@@ -134,11 +127,11 @@ template <class F> struct Shares {
             rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
         const typename P::I column = P::numbers() + run.first;
         const V weights[] = {x.bend(0), x.bend(1), x.bend(2), x.bend(3), x.linear(1), x.linear(2)};
-        for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest);
+        for (unsigned remaining = run.lanes; remaining; remaining &= remaining - 1) {
+            const int l = __builtin_ctz(remaining);
             auto at = [&](int c, int weight) HERE -> V {
                 const auto is = column == ((const int*)&x.cells[c])[l];
-                const V all = P::all(P::own(weights[weight], l));
+                const V all = P::all(P::lane_in_memory(weights[weight], l));
                 return P::pick(__builtin_convertvector(is, typename P::M), all, V{});
             };
             linear[l] = at(1, 4) + at(2, 5);
@@ -156,13 +149,14 @@ template <class F> struct Shares {
             line_bar[r] += bend_bar * y.bend(r);
             curve_bar[r] = bend_bar * y.linear(r);
         }
-        for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest);
+        for (unsigned remaining = run.lanes; remaining; remaining &= remaining - 1) {
+            const int l = __builtin_ctz(remaining);
             UNROLLED
-            for (int r = FIRST; r < AFTER; ++r) sum[r] += P::own(line_bar[r], l) * linear[l];
+            for (int r = FIRST; r < AFTER; ++r)
+                sum[r] += P::lane_in_memory(line_bar[r], l) * linear[l];
             if (!IS_CUBIC) continue;
-            sum[1] += P::own(curve_bar[1], l) * bend[l];
-            sum[2] += P::own(curve_bar[2], l) * bend[l];
+            sum[1] += P::lane_in_memory(curve_bar[1], l) * bend[l];
+            sum[2] += P::lane_in_memory(curve_bar[2], l) * bend[l];
         }
         for (int r = FIRST; r < AFTER; ++r) write(field + rows[r], sum[r]);
     }
@@ -171,7 +165,7 @@ template <class F> struct Shares {
             P::write(row + run.first, P::read(row + run.first) + sum);
         } else {
             for (int j = run.low; j <= run.high; ++j)
-                row[(long long)j * lines.column] += P::own(sum, j - run.first);
+                row[(long long)j * lines.column] += P::lane_in_memory(sum, j - run.first);
         }
     }
 };
