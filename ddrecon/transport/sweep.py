@@ -131,13 +131,14 @@ def emitted_light(medium: Medium, scatters: Cut, inflow: Tensor | None = None) -
     That is (1 - f) kappa_s times what `scatters`, less kappa_t `inflow`: light from outside is
     there without a medium, and what is swept is the rest, I - inflow. So a white furnace is exact.
     """
-    low, high = scatters
-    emitted = medium.remaining.value * (torch.cat([low, high]) if len(high) else low)
-    if inflow is None:
-        return emitted
-    mean = emitted[:1] - medium.extinction.value * inflow
-    # Light from outside may have more colors than gray light that scatters.
-    return torch.cat([mean, emitted[1:].expand(-1, *mean.shape[1:])])
+    scattering, (low, high) = medium.remaining.value, scatters
+    mean, first = (scattering * moments for moments in low.split([1, len(low) - 1]))
+    if inflow is not None:
+        mean = mean - medium.extinction.value * inflow
+    fields = [field for field in (mean, first, scattering * high) if len(field)]
+    # In gray light of a gray medium some moments have fewer colors than what comes from outside.
+    colors = max(field.shape[1] for field in fields)
+    return torch.cat([field.expand(-1, colors, *mean.shape[2:]) for field in fields])
 
 
 def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
