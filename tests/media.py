@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
-from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight
 from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
@@ -66,6 +66,14 @@ def make_camera(
     return Camera(pose, size, half_width, is_perspective)
 
 
+def light_of(
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48, up: str = "y"
+) -> EnvironmentLight:
+    """The light of a map `radiance` [C, h, w]."""
+    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
+    return EnvironmentLight(radiance, *numbers, directions, up)
+
+
 def make_scene(
     density: Tensor,
     *,
@@ -109,7 +117,8 @@ def march_rays(
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid), grid.periodic)
+    loss = absorption + boundary_loss(diffusion, grid)
+    return Operator((z, y, x), loss, grid.periodic, grid.spacing)
 
 
 def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:

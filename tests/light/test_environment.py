@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from media import random_values
+from media import light_of, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -19,13 +19,6 @@ from ddrecon.light.environment import (
 from ddrecon.light.lights import EnvironmentLight
 
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
-
-
-def light_of(
-    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, up: str = "y"
-) -> EnvironmentLight:
-    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
-    return EnvironmentLight(radiance, *numbers, up=up)
 
 
 def directions(count: int, seed: int = 0) -> Tensor:
@@ -96,7 +89,7 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float, up: str):
         interaction = mitsuba.SurfaceInteraction3f()
         interaction.wi = mitsuba.Vector3f(*(-component for component in way))
         expected.append(list(environment.eval(interaction)))
-    found = environment_radiance(light_of(radiance, 1.5, rotation, up), array_order(ways))
+    found = environment_radiance(light_of(radiance, 1.5, rotation, up=up), array_order(ways))
     torch.testing.assert_close(found, torch.tensor(expected).to(found).T, rtol=1e-5, atol=1e-5)
 
 

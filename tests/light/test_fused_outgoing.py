@@ -63,10 +63,10 @@ def test_radiance_and_cotangents_are_those_of_torch(shape: tuple[int, int, int],
         known, found = (
             radiance_and_bars(engine, shape, colors, view, g, dtype) for engine in ("torch", "warp")
         )
-        for one, other in zip(found, known, strict=True):
+        for value, expected in zip(found, known, strict=True):
             # Sums over cells cancel in part.
-            size = max(float(other.detach().norm()), 1e-3) * (1 if one.ndim > 1 else 30)
-            torch.testing.assert_close(one, other, rtol=0, atol=error * size)
+            size = max(float(expected.detach().norm()), 1e-3) * (1 if value.ndim > 1 else 30)
+            torch.testing.assert_close(value, expected, rtol=0, atol=error * size)
 
 
 def test_radiance_is_bent_somewhere():

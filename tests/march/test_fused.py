@@ -198,19 +198,19 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
     packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
     packets += [
-        kernels.tangent_kernel(one, Case(False, True, True)),
+        kernels.tangent_kernel(one, Case(False, True)),
         kernels.adjoint_kernel(several, Case(False)),
     ]
     assert_compiles(packets, tmp_path)
 
 
 def test_places_beyond_the_numbers_of_an_int_are_refused():
-    planes, shape = torch.zeros(2), (3, 2048, 1024, 1024)
+    planes, rays, shape = torch.zeros(2), torch.zeros(1, 8), (3, 2048, 1024, 1024)
     order = torch.zeros(2, dtype=torch.int32)
-    assert Cells(planes, 0, order).strides(shape)["plane_stride"] == 2**20
+    assert Cells(planes, 0, order).arguments(rays, shape)["plane_stride"] == 2**20
     for cells in (Cells(planes), Cells(planes, 1, order)):
         with pytest.raises(UsageError, match=r"2\^31"):
-            cells.strides(shape)
+            cells.arguments(rays, shape)
 
 
 def test_empty_space_and_rays_that_miss():
