@@ -208,7 +208,7 @@ class ViewSource:
 
     ring: Cameras in a circle; see below.
     transforms: `transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.
-    colmap: Folder of COLMAP's sparse model as text, such as `sparse/0`.
+    colmap: Folder of COLMAP's sparse model, such as `sparse/0`; text or binary.
     images: For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted by the numbers
         in their names, belong to the cameras in turn. For COLMAP: the folder of its pictures.
     test_every: The first of so many views is a test view, where transforms do not say which are.

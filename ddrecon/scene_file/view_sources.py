@@ -1,7 +1,7 @@
 """Views that a scene does not list one by one, and the names of all.
 
-A COLMAP model is a folder with `cameras.txt` and `images.txt`. Its poses are world to camera with
-OpenCV's axes (right, down, forward); its points are of no use and are skipped.
+A COLMAP model is a folder with `cameras.txt` and `images.txt`, or the same as `.bin`. Its poses are
+world to camera with OpenCV's axes (right, down, forward); its points are of no use and are skipped.
 Source: https://colmap.github.io/format.html
 """
 
@@ -10,10 +10,11 @@ from __future__ import annotations
 import glob
 import math
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError, Problems
 from ddrecon.grid import Triple
@@ -38,7 +39,19 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-"""The camera models that are read, with their parameters in order."""
+"""The camera models that are read, in the order of their numbers in binary files, with their
+parameters in order.
+"""
+OTHERS = {
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
+"""The next models, whose cameras may be there but have no image, and how many parameters they have.
+"""
 Lens = tuple[str, tuple[int, int], Sequence[float]]
 """A camera of a model: what it is called, its width and height, and its parameters."""
 DECIMAL = r"(?:(?<=_)-)?[0-9]+(?:\.[0-9]+)?"
@@ -69,29 +82,23 @@ def views_of(
     cameras = ring_cameras(source.ring, up)
     images: list[Path] | list[None] = [None] * len(cameras)
     if source.images is not None:
-        images = _find_images(entries["images"], source.images, folder, len(cameras))
+        # Wildcards stand in the last two parts: those above may match without end.
+        patterns = [source.images, source.images.replace("\\", "/")]  # as Windows writes it
+        is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
+        names = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
+        there = sorted(next(filter(None, names), []), key=in_order)
+        if there != sorted(there, key=lambda name: in_order(name, DECIMAL)):
+            what = "matches names with fractions or signs, whose order is not plain: count them"
+            raise entries["images"].refused(f"{source.images!r} {what} 0, 1, 2, ...")
+        images = [path for name in there if (path := (folder / name).absolute()).is_file()]
+        if len(images) != len(cameras):
+            what = f"{source.images!r} matches {len(images)} files, but the ring has"
+            raise entries["images"].refused(f"{what} {len(cameras)} cameras")
     views = [
         ViewSection(name=f"ring_{index:02d}", camera=camera, image=image)
         for index, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]
     return tuple(split_views(views, every))
-
-
-def _find_images(node: Node, pattern: str, folder: Path, count: int) -> list[Path]:
-    """The files in `folder` that match `pattern`, which `node` says, by their numbers: `count`."""
-    # Wildcards stand in the last two parts: those above may match without end.
-    patterns = [pattern, pattern.replace("\\", "/")]  # as Windows writes it
-    is_endless = glob.has_magic(str(Path(patterns[1]).parent.parent))
-    matches = [[]] if is_endless else [glob.glob(text, root_dir=folder) for text in patterns]
-    names = sorted(next(filter(None, matches), []), key=in_order)
-    if names != sorted(names, key=lambda name: in_order(name, DECIMAL)):
-        fault = "matches names with fractions or signs, whose order is not plain"
-        raise node.refused(f"{pattern!r} {fault}: count them 0, 1, 2, ...")
-    paths = [path for name in names if (path := (folder / name).absolute()).is_file()]
-    if len(paths) != count:
-        fault = f"matches {len(paths)} files, but the ring has {count} cameras"
-        raise node.refused(f"{pattern!r} {fault}")
-    return paths
 
 
 def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]:
@@ -107,8 +114,8 @@ def name_listed(node: Node, views: Sequence[ViewSection]) -> tuple[ViewSection, 
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:
             child = node.children()[index]
-            fault = f"{name!r} is already the name of view {first[name]}"
-            problems.note(child.entries().get("name", child).refused(fault))
+            what = f"{name!r} is already the name of view {first[name]}"
+            problems.note(child.entries().get("name", child).refused(what))
     problems.raise_any()
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
@@ -154,16 +161,16 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
     Their pictures are in the folder `images`; they have no names yet. Raises SceneError where there
     is no model, FormatError for one that is damaged or distorted in a way that is not known.
     """
-    path, of_cameras = folder / "images.txt", folder / "cameras.txt"
-    if (folder / "images.bin").is_file() and not path.is_file():
-        command = "colmap model_converter --output_type TXT --input_path M --output_path M"
-        raise node.refused(f"{folder} is a binary model; write it as text: {command}")
-    if not (path.is_file() and of_cameras.is_file()):
-        raise node.refused(f"{folder} has no COLMAP model; expected cameras.txt and images.txt")
+    suffix = next((end for end in ("txt", "bin") if (folder / f"images.{end}").is_file()), None)
+    if suffix is None or not (folder / f"cameras.{suffix}").is_file():
+        raise node.refused(
+            f"{folder} has no COLMAP model; expected cameras.txt and images.txt, or .bin"
+        )
+    path, of_cameras = folder / f"images.{suffix}", folder / f"cameras.{suffix}"
     with guard_reading(of_cameras):
-        cameras = _read_cameras(of_cameras)
+        cameras = dict(READERS[suffix][0](of_cameras))
     with guard_reading(path):
-        posed = sorted(_read_images(path), key=lambda image: in_order(image[0]))
+        posed = sorted(READERS[suffix][1](path), key=lambda image: in_order(image[0]))
     if not posed:
         raise FormatError(path, "has no images")
     views = []
@@ -176,8 +183,8 @@ def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
         camera = _camera(of_cameras, number, *cameras[number])
         frame = camera | {"transform_matrix": _matrix(path, name, pose)}
         with in_file(of_cameras):
-            entry = node_of(f"camera {number}", str(of_cameras), frame)
-            section = read_camera(entry, entry.entries(), folder)
+            said = node_of(f"camera {number}", str(of_cameras), frame)
+            section = read_camera(said, said.entries(), folder)
         views.append(ViewSection(camera=section, image=path_in(images, name)))
     return views
 
@@ -203,15 +210,16 @@ def _camera(
     path: Path, number: int, model: str, size: tuple[int, int], parameters: Sequence[float]
 ) -> dict[str, Any]:
     """Camera `number` in the words of transforms.json."""
-    if (names := MODELS.get(model)) is None:
+    names = MODELS.get(model, ())
+    if model not in MODELS:
         raise FormatError(path, f"camera {number}: lens model {model} is not known; {REMEDY}")
     if len(parameters) != len(names):
-        fault = f"{model} has {len(names)} parameters, {', '.join(names)}"
-        raise FormatError(path, f"camera {number}: {fault}")
-    lens = dict(zip(names, parameters, strict=True))
-    focal = lens.pop("f", 0.0)
-    camera = {"camera_model": model, "w": size[0], "h": size[1], "fl_x": focal, "fl_y": focal}
-    return camera | lens
+        what = f"{model} has {len(names)} parameters, {', '.join(names)}"
+        raise FormatError(path, f"camera {number}: {what}")
+    given = dict(zip(names, parameters, strict=True))
+    focal = given.pop("f", 0.0)
+    lens = {"camera_model": model, "w": size[0], "h": size[1], "fl_x": focal, "fl_y": focal}
+    return lens | given
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -222,22 +230,22 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 yield number, line
 
 
-def _read_cameras(path: Path) -> dict[int, Lens]:
-    cameras = dict[int, Lens]()
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     for number, line in _lines(path):
         if not line:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            cameras[int(camera)] = model, (int(width), int(height)), [*map(float, parameters)]
+            index = int(camera)
+            lens = model, (int(width), int(height)), [*map(float, parameters)]
         except ValueError as error:
             raise FormatError(
                 path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
             ) from error
-    return cameras
+        yield index, lens
 
 
-def _read_images(path: Path) -> Iterator[Posed]:
+def _text_images(path: Path) -> Iterator[Posed]:
     """After the line of an image there may be one of its points, which may be empty."""
     may_be_points = False
     for number, line in _lines(path):
@@ -263,3 +271,37 @@ def _are_points(line: str) -> bool:
     except ValueError:
         return False
     return len(words) % 3 == 0
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            number, model, width, height = _unpack(path, stream, "<iiQQ")
+            if not 0 <= model < len(lengths):
+                raise FormatError(path, f"camera {number}: lens model {model} is not known")
+            name = [*lengths][model]
+            yield number, (name, (width, height), _unpack(path, stream, f"<{lengths[name]}d"))
+
+
+def _binary_images(path: Path) -> Iterator[Posed]:
+    with path.open("rb") as stream:
+        for _ in range(*_unpack(path, stream, "<Q")):
+            _, *pose, camera = _unpack(path, stream, "<i7di")
+            name = bytearray()
+            while (letter := _unpack(path, stream, "c")[0]) != b"\0":
+                name += letter
+            (points,) = _unpack(path, stream, "<Q")
+            stream.seek(24 * points, 1)
+            yield name.decode(), camera, pose
+
+
+def _unpack(path: Path, stream: BinaryIO, layout: str) -> tuple[Any, ...]:
+    data = stream.read(struct.calcsize(layout))
+    if len(data) < struct.calcsize(layout):
+        raise FormatError(path, "ends too soon")
+    return struct.unpack(layout, data)
+
+
+READERS = {"txt": (_text_cameras, _text_images), "bin": (_binary_cameras, _binary_images)}
+"""What reads cameras and images, by the suffix of their files."""

@@ -131,13 +131,13 @@ def emitted_light(medium: Medium, scatters: Cut, inflow: Tensor | None = None) -
     That is (1 - f) kappa_s times what `scatters`, less kappa_t `inflow`: light from outside is
     there without a medium, and what is swept is the rest, I - inflow. So a white furnace is exact.
     """
-    scattering, (low, high) = medium.remaining.value, scatters
-    moments = [scattering * low]
-    if inflow is not None:
-        mean, first = low.split([1, len(low) - 1])
-        moments = [scattering * mean - medium.extinction.value * inflow, scattering * first]
-    moments = [field for field in (*moments, scattering * high) if len(field)]
-    return torch.cat(moments) if len(moments) > 1 else moments[0]
+    low, high = scatters
+    emitted = medium.remaining.value * (torch.cat([low, high]) if len(high) else low)
+    if inflow is None:
+        return emitted
+    mean = emitted[:1] - medium.extinction.value * inflow
+    # Light from outside may have more colors than gray light that scatters.
+    return torch.cat([mean, emitted[1:].expand(-1, *mean.shape[1:])])
 
 
 def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:

@@ -1,5 +1,6 @@
-"""COLMAP's models: rays as its manual has them, and refusals in one line."""
+"""COLMAP's models: rays as its manual has them, text and binary alike, and refusals in one line."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ddrecon.errors import FormatError, SceneError
 from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.view_sources import MODELS
+from ddrecon.scene_file.view_sources import MODELS, OTHERS
 from ddrecon.settings import LENSES
 
 Read = Callable[..., SceneFile]
@@ -50,14 +51,29 @@ def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
     )
 
 
+def write_binary(folder: Path, model: str, name: str = "b c.png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = CAMERAS[model]
+    header = struct.pack("<QiiQQ", 1, 7, list(MODELS).index(model), 8, 6)
+    (folder / "cameras.bin").write_bytes(header + struct.pack(f"<{len(numbers)}d", *numbers))
+    content = struct.pack("<Q", 2)
+    for index, label, points in ((3, name, 2), (4, "a.png", 0)):
+        content += struct.pack("<i7di", index, *QUATERNION, *SHIFT, 7) + label.encode() + b"\0"
+        content += struct.pack("<Q", points) + bytes(24 * points)
+    (folder / "images.bin").write_bytes(content)
+
+
 def scene_text(**others: Any) -> str:
     return changed(views={"colmap": "sparse/0", "images": "pictures", **others})
 
 
+@pytest.mark.parametrize("store", [write_text, write_binary])
 @pytest.mark.parametrize("model", CAMERAS)
-def test_points_are_seen_where_the_manual_says(read: Read, tmp_path: Path, model: str) -> None:
+def test_points_are_seen_where_the_manual_says(
+    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+) -> None:
     """x = R X + t, divided by its depth, distorted, and times the focal lengths plus the center."""
-    write_text(tmp_path / "sparse/0", model)
+    store(tmp_path / "sparse/0", model)
     scene_file = read(scene_text())
     first, second = scene_file.tree.views
     assert (first.name, second.name) == ("a", "b_c")
@@ -132,11 +148,22 @@ def test_models_of_windows_are_read(read: Read, tmp_path: Path) -> None:
         read(scene_text())
 
 
-def test_cameras_that_no_image_has_may_be_of_any_model(read: Read, tmp_path: Path) -> None:
-    write_text(tmp_path / "sparse/0", "PINHOLE")
+@pytest.mark.parametrize("store", [write_text, write_binary])
+@pytest.mark.parametrize("model", OTHERS)
+def test_cameras_that_no_image_has_may_be_of_any_model(
+    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+) -> None:
+    folder, numbers = tmp_path / "sparse/0", [0.5] * OTHERS[model]
+    store(folder, "PINHOLE")
     before = read(scene_text()).tree
-    with (tmp_path / "sparse/0/cameras.txt").open("a") as stream:
-        stream.write("8 THIN_PRISM_FISHEYE 8 6 0.5 0.5\n")
+    if store is write_text:
+        with (folder / "cameras.txt").open("a") as stream:
+            stream.write(f"8 {model} 8 6 {' '.join(map(str, numbers))}\n")
+    else:
+        count, cameras = struct.pack("<Q", 2), (folder / "cameras.bin").read_bytes()[8:]
+        kind = [*MODELS, *OTHERS].index(model)
+        strange = struct.pack(f"<iiQQ{len(numbers)}d", 8, kind, 8, 6, *numbers)
+        (folder / "cameras.bin").write_bytes(count + strange + cameras)
     assert read(scene_text()).tree == before
 
 
@@ -168,10 +195,14 @@ def test_a_damaged_text_is_refused(
     assert problem in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_binary_model_is_refused_with_the_command_that_converts_it(
-    refusal: Callable[..., list[str]], tmp_path: Path
-) -> None:
-    (tmp_path / "sparse/0").mkdir(parents=True)
-    (tmp_path / "sparse/0/images.bin").touch()
-    (line,) = refusal(scene_text())
-    assert "views.colmap: " in line and "colmap model_converter --output_type TXT" in line
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
+def test_a_damaged_binary_is_refused(read: Read, tmp_path: Path, file: str) -> None:
+    """Cut anywhere but where points are skipped, or claiming more than there is."""
+    write_binary(tmp_path / "sparse/0", "OPENCV")
+    path = tmp_path / "sparse/0" / file
+    whole = path.read_bytes()
+    for damaged in (whole[:5], whole[:30], whole[:60], b"\xff" * 8 + whole[8:], b""):
+        path.write_bytes(damaged)
+        with pytest.raises((FormatError, SceneError)) as caught:
+            read(scene_text())
+        assert "\n" not in str(caught.value)
