@@ -53,10 +53,10 @@ def test_an_iteration_names_the_adjoints_that_it_launches(
     Reconstruction(load_scene(BALL, overrides=change)).step()
     named = {kernel.key for kernel, was_named in launched.items() if was_named}
     assert {kernel for kernel, _ in compiling._named} <= launched.keys()
-    assert {"ordinates_go_back", "transpose", "flow_cotangents"} < named
+    assert {"ordinates_back", "transpose", "flow_cotangents"} < named
     adjoints = ("back", "cotangents", "adjoint", "transpose")
     later = {one.key for one in launched if one.key.endswith(adjoints)}
-    assert named == later | {"multigrid_iterate", "multigrid_prepare", "ordinates_follow"}
+    assert named == later | {"multigrid_iterate", "multigrid_prepare", "ordinates_light"}
 
 
 def fill_kernels() -> list[TextKernel]:
