@@ -64,17 +64,18 @@ template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(A a, Dual
     b.value = a + b.value;
     return b;
 }
-template <class A, class F, int COUNT>
-INLINE Dual<F, COUNT> operator+(const Dual<F, COUNT>& a, A b) {
-    return b + a;
+// A copy that changes: of a sum the other way around, loops do not become vector code.
+template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(Dual<F, COUNT> a, A b) {
+    a.value = a.value + b;
+    return a;
 }
 template <class A, class F, int COUNT>
 INLINE Dual<F, COUNT> operator-(A a, const Dual<F, COUNT>& b) {
     return a + -b;
 }
-template <class A, class F, int COUNT>
-INLINE Dual<F, COUNT> operator-(const Dual<F, COUNT>& a, A b) {
-    return -b + a;
+template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator-(Dual<F, COUNT> a, A b) {
+    a.value = a.value - b;
+    return a;
 }
 template <class A, class F, int COUNT>
 INLINE Dual<F, COUNT> operator*(A a, const Dual<F, COUNT>& b) {

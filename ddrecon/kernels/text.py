@@ -37,10 +37,6 @@ _TYPES = {
 _PACKETS = Path(__file__).with_name("packets.h").read_text(encoding="utf-8")
 LANES = int(re.findall(r"LANES = (\d+);", _PACKETS)[-1])
 """Items in a packet on a processor (`packets.h`)."""
-FLAGS = "-march=native"
-"""Of clang. Headers say themselves what is inlined: with Warp's own flags it takes 1.16 times as
-long for all kernels of an iteration, twice for those of rays, and none runs faster.
-"""
 _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 
 
@@ -83,7 +79,7 @@ class TextKernel:
         Record = wp.struct(type("Record", (), {"__annotations__": members, "__module__": __name__}))
 
         begin = f"using namespace ddrecon;\ntypedef {'double' if bits == 64 else 'float'} F;\n"
-        options = {"extra_build_options": include(header), "cpu_compiler_flags": FLAGS}
+        options = {"extra_build_options": include(header)}
 
         @wp.func_native(begin + "".join(variables) + text)
         def do_item(item: int, record: Record): ...

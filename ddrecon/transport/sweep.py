@@ -131,14 +131,15 @@ def emitted_light(medium: Medium, scatters: Cut, inflow: Tensor | None = None) -
     That is (1 - f) kappa_s times what `scatters`, less kappa_t `inflow`: light from outside is
     there without a medium, and what is swept is the rest, I - inflow. So a white furnace is exact.
     """
-    scattering, (low, high) = medium.remaining.value, scatters
-    mean, first = (scattering * moments for moments in low.split([1, len(low) - 1]))
+    fields = [medium.remaining.value * moments for moments in scatters if len(moments)]
     if inflow is not None:
-        mean = mean - medium.extinction.value * inflow
-    fields = [field for field in (mean, first, scattering * high) if len(field)]
+        mean, first = fields[0][:1], fields[0][1:]
+        fields[:1] = [mean - medium.extinction.value * inflow, first]
+    if len(fields) == 1:
+        return fields[0]
     # In gray light of a gray medium some moments have fewer colors than what comes from outside.
     colors = max(field.shape[1] for field in fields)
-    return torch.cat([field.expand(-1, colors, *mean.shape[2:]) for field in fields])
+    return torch.cat([field.expand(-1, colors, *field.shape[2:]) for field in fields])
 
 
 def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
