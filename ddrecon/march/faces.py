@@ -8,6 +8,9 @@ optical depth at most; but it is zero on faces through which the light shines.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,132 +34,119 @@ of cells. And the optical depth of cells in which half of the lack is within the
 """
 OPAQUE = 20.0
 """Optical depths of a cell from which on light no longer goes on to faces: it would be negative."""
+FACES = tuple(product(range(3), range(2)))
+"""Axis and side, 0 the lower one, in the order of what differs from face to face."""
+_Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Along an axis, for each place: of two cells, which and how much of it."""
+_Entries = tuple[Tensor, Tensor, Tensor]
+"""Rows, columns and weights of a sparse matrix."""
 
 
-def extend_fields(outgoing: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
-    """The fields of `outgoing` with a layer on each side, [channels, z + 2, y + 2, x + 2].
+class _Table(NamedTuple):
+    """A sparse matrix: `weights` [E] in its `rows` [E] and `columns` [E]."""
+
+    rows: Tensor
+    columns: Tensor
+    weights: Tensor
+
+    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
+        """`total` [C, rows], to which the product with `values` [C, columns] is added in place."""
+        return total.index_add_(1, self.rows, values.index_select(1, self.columns) * self.weights)
+
+
+class _Shell(NamedTuple):
+    """The M places of the layer around a box, and the S places on those faces where lines end.
+
+    `nearest` [M]: the cell nearest to each place. `line` [M, cells]: light on faces, on the line
+    through the two outermost centers. `faces` [3, M]: beyond which of `FACES` a place lies, by
+    axis; 6 for none. `inner` [M, cells] and `around` [places of an extended field, M]: what stands
+    beyond faces, less what `inner` makes of cells, is `around` times light on faces; `places` [M]
+    says where. `lacking` [places of an extended field, S]: what that changes by where light lacks
+    on faces. `outermost` [S]: the cells there, with their `width` and normals `outward` [3, S].
+    """
+
+    nearest: Tensor
+    line: _Table
+    faces: Tensor
+    inner: _Table
+    around: _Table
+    lacking: _Table
+    outermost: Tensor
+    width: Tensor
+    outward: Tensor
+
+
+def extend_fields(emission: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
+    """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
     outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
-    names = ["diffuse", *(f"mass {index}" for index in range(len(outgoing.beams)))]
-    light = dict(zip(names, _extend_light(outgoing, names, axis), strict=True))
-    return {
-        name: light[name] if name in light else pad(field[None], [1] * 6, mode="replicate")[0]
-        for name, field in outgoing.fields.items()
-    }
+    grid, field = emission.grid, emission.extinction.field
+    shell, extended = _surround(grid, axis, field.dtype, field.device), dict[str, Tensor]()
+    for name, field in emission.fields.items():
+        if name == "diffuse" or name.startswith("mass "):
+            extended[name] = _extend_light(emission, shell, name, field)
+        else:
+            extended[name] = pad(field[None], [1] * 6, mode="replicate")[0]
+    return extended
 
 
-def _extend_light(outgoing: OutgoingLight, names: list[str], axis: int | None) -> list[Tensor]:
-    """Diffuse light and masses, by their `names`, extended."""
-    fields = [outgoing.fields[name] for name in names]
-    grid, counts, cells = outgoing.grid, [len(field) for field in fields], torch.cat(fields)
-    axes = [along for along in range(3) if grid.shape[along] > 1]
-    places, neighbors = _surround(grid, cells.device)
-    # On faces: the nearest cells, and the line through the two outermost ones.
-    nearest, line = cells.flatten(1).index_select(1, neighbors), pad(cells, [1] * 6)
-    for along in range(3):
-        line = _add_to_ends(line, along, 1, (1.5, -0.5) if along in axes else (1.0, 0.0))
-    straight = line.flatten(1).index_select(1, places)
-    diffuse, *masses = zip(nearest.split(counts), straight.split(counts), strict=True)
-    on_faces = [_limit_light(outgoing, neighbors, *diffuse)]
-    for beam, mass in zip(outgoing.beams, masses, strict=True):
-        unlit = _find_unlit(beam, grid).index_select(0, places)
-        on_faces.append(unlit * _limit_mass(*mass, outgoing.extinction.mass_bound))
-
-    # Half a cell beyond faces, but not across `axis`.
-    layer = torch.zeros_like(line).flatten(1).index_add(1, places, torch.cat(on_faces))
-    extended = pad(cells, [1] * 6) + layer.view(line.shape)
-    for along in axes:
-        if along != axis:
-            extended = _add_to_ends(extended, along, 0, (1.0, -1.0))
-    light = [*extended.split(counts)]
-    if outgoing.inflow is not None and axes:
-        light[0] = light[0].clone()
-        for along, lack in zip(axes, _find_lacks(outgoing, outgoing.inflow, axes), strict=True):
-            _lower_ends(light[0], along, lack, 1.0 if along == axis else 2 + RAISED)
-    return light
+def _extend_light(emission: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
+    """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
+    grid, extinction, cells = emission.grid, emission.extinction, field.flatten(1)
+    nearest = cells.index_select(1, shell.nearest)
+    line = shell.line.add_to(torch.zeros_like(nearest), cells)
+    if name == "diffuse":
+        matter = extinction.field[: len(field)].flatten(1).index_select(1, shell.nearest)
+        share = thinness(grid, extinction.scale[: len(field)].view(-1, 1) * matter, OPAQUE)
+        on_faces = torch.lerp(nearest, line, for_channels(share, len(field)))
+    else:
+        lit = shine_through(emission.beams[int(name.split()[1])], grid)
+        z, y, x = pad(1 - lit, (0, 1), value=1.0).index_select(0, shell.faces.flatten()).chunk(3)
+        on_faces = z * y * x * _limit(nearest, line, extinction.mass_bound)
+    beyond = shell.inner.add_to(torch.zeros_like(nearest), cells)
+    values = torch.cat([on_faces.to(field), beyond], 1)
+    longer = shell.around.add_to(pad(field, [1] * 6).flatten(1), values)
+    if name == "diffuse" and emission.inflow is not None and len(shell.outermost):
+        lacks = _find_lacks(emission, emission.inflow, shell)
+        longer = shell.lacking.add_to(longer, lacks.expand(len(field), -1))
+    return longer.view(-1, *(count + 2 for count in grid.shape))
 
 
-def _add_to_ends(field: Tensor, axis: int, first: int, factors: tuple[float, float]) -> Tensor:
-    """`field`, to whose ends along `axis` two layers times `factors` are added in place.
-
-    The `first` of them is so many layers from each end, and the other one more.
-    """
-    like = field.dtype, field.device
-    ends, layers, weights = _find_layers(field.shape[axis - 3], first, factors, *like)
-    change = field.index_select(axis - 3, layers) * weights.view(-1, *[1] * (2 - axis))
-    return field.index_add_(axis - 3, ends, change)
-
-
-def _limit_light(
-    outgoing: OutgoingLight, neighbors: Tensor, nearest: Tensor, straight: Tensor
-) -> Tensor:
-    """Diffuse light on faces: the `nearest` cells' where these are opaque, else `straight`."""
-    count, extinction = len(nearest), outgoing.extinction
-    matter = extinction.field[:count].flatten(1).index_select(1, neighbors)
-    share = thinness(outgoing.grid, extinction.scale[:count].view(-1, 1) * matter, OPAQUE)
-    return torch.lerp(nearest, straight, for_channels(share, count))
-
-
-def _lower_ends(field: Tensor, axis: int, lack: Tensor, times: float) -> None:
-    """Takes so many `times` the `lack` [C, z, y, x] on faces across `axis` off the ends of `field`.
-
-    The outermost cells gain a part of it.
-    """
-    like = field.dtype, field.device
-    ends, layers, _ = _find_layers(field.shape[axis - 3], 0, (0.0, 0.0), *like)
-    sides = [int(across != axis) for across in (2, 1, 0) for _ in range(2)]
-    lack = lack.expand(len(field), -1, -1, -1)
-    around = pad(lack[None], sides, mode="replicate")[0]
-    field.index_add_(axis - 3, ends[:2], around, alpha=-times)
-    field.index_add_(axis - 3, layers[2:], pad(lack, sides), alpha=RAISED)
-
-
-def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, axes: list[int]) -> list[Tensor]:
-    """By how much light on faces is less than on the line to there (E2.17).
-
-    For each of `axes` it is [C, z, y, x] with two layers across it.
-    """
-    grid, extinction, diffusing = outgoing.grid, outgoing.extinction, outgoing.diffusing
-    shapes = [[2 if a == axis else n for a, n in enumerate(grid.shape)] for axis in axes]
-    cells, outward, width = _find_outermost(grid, outgoing.diffuse.dtype, outgoing.diffuse.device)
+def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
+    """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
+    extinction, diffusing, emitted = emission.extinction, emission.diffusing, emission.emitted
 
     def outermost(field: Tensor) -> Tensor:
-        return field.flatten(1).index_select(1, cells)
+        return field.flatten(1).index_select(1, shell.outermost)
 
     # Moments beside colors: along a third axis torch takes entries one by one.
     moments = outermost(inflow.received.flatten(0, 1))
     received, *first = moments.unflatten(0, inflow.received.shape[:2]).unbind()
     if first:
         flux = torch.stack(flux_along_axes(first))
-        received = received - 0.5 * (outward[:, None] * flux).sum(0)
-    unpeaked, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
-    light = outermost(outgoing.diffuse) + unpeaked * received
+        received = received - 0.5 * (shell.outward[:, None] * flux).sum(0)
+    kept, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
+    light = outermost(emission.diffuse) + kept * received
     lost = extinction.scale.view(-1, 1) * outermost(extinction.field)
     scattered = scale * outermost(diffusing.field)
     sent = scattered * light - lost * inflow.outside.view(-1, 1)
-    if outgoing.emitted is not None:
-        sent = sent + outermost(outgoing.emitted)
+    if emitted is not None:
+        sent = sent + outermost(emitted)
     backward = [
-        torch.stack([*inflow.backward[2 * axis :][:2]], 1 + axis).expand(-1, *shape).flatten(1)
-        for axis, shape in zip(axes, shapes, strict=True)
+        one.expand(-1, *_layer_of(emission.grid, axis)).flatten(1)
+        for one, (axis, _) in zip(inflow.backward, FACES, strict=True)
+        if emission.grid.shape[axis] > 1
     ]
-    weight = width * unpeaked * torch.cat(backward, 1)
-    lack = weight * sent / (UNEVEN + width * lost + weight * scattered)
-    lack = lack if outgoing.emitted is None else scale * lack
-    split = lack.split([math.prod(shape) for shape in shapes], 1)
-    return [part.unflatten(1, shape) for part, shape in zip(split, shapes, strict=True)]
+    weight = shell.width * kept * torch.cat(backward, 1)
+    lack = weight * sent / (UNEVEN + shell.width * lost + weight * scattered)
+    return lack if emitted is None else scale * lack
 
 
-def _find_unlit(beam: Beam | PointBeam, grid: Grid) -> Tensor:
-    """What is left of masses to `beam` in all places of an extended field: 0 on lit faces."""
-    unlit, along = (1 - shine_through(beam, grid)).view(3, 2), list[Tensor]()
-    for ends, count in zip(unlit, grid.shape, strict=True):
-        inner = ends.new_ones(count if count > 1 else 3)
-        along.append(torch.cat([ends[:1], inner, ends[1:]]) if count > 1 else inner)
-    z, y, x = torch.meshgrid(*along, indexing="ij")
-    return (z * y * x).flatten()
+def _layer_of(grid: Grid, axis: int) -> tuple[int, ...]:
+    """The shape of a layer of cells across `axis`."""
+    return tuple(count for other, count in enumerate(grid.shape) if other != axis)
 
 
 def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
@@ -173,7 +163,7 @@ def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
     return (lit * lit * (3 - 2 * lit)).flatten()
 
 
-def _limit_mass(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
+def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
     """`goal`, less than `layer` by 1 over `bound` at most."""
     fall = (goal - layer).clamp(max=0)
     # squared, which must not overflow
@@ -181,48 +171,103 @@ def _limit_mass(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
 
 
 @remember
-def _surround(grid: Grid, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The M places of the layer around the box of `grid`, and the cell nearest to each, [M]."""
-    cells = torch.arange(grid.cells, dtype=torch.float64, device=device).view(1, 1, *grid.shape)
-    places = (pad(cells, [1] * 6, value=-1.0).flatten() < 0).nonzero()[:, 0]
-    return places, pad(cells, [1] * 6, mode="replicate").flatten()[places].long()
+def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
+    """The places around the box of `grid`; across `axis` those that are extended are on faces."""
+    wide = tuple(count + 2 for count in grid.shape)
+    cells = torch.arange(grid.cells).view(1, *grid.shape)
+    nearest = pad(cells.double()[None], [1] * 6, mode="replicate").long()[0, 0]
+    is_outside = torch.ones(wide, dtype=torch.bool)
+    is_outside[1:-1, 1:-1, 1:-1] = False
+    places = is_outside.flatten().nonzero()[:, 0]
+    number = torch.zeros(math.prod(wide), dtype=torch.long)
+    number[places] = torch.arange(len(places))
+
+    # Along an axis, places and where each goes on from: value + share (value - value before).
+    on_line, beyond, faces = list[_Along](), list[_Along](), list[Tensor]()
+    for along, count in enumerate(grid.shape):
+        place = torch.arange(count + 2)
+        cell, low, high = (place - 1).clamp(0, count - 1), place == 0, place == count + 1
+        share = (low | high).double() * (count > 1)
+        before = (cell + low.long() - high.long()).clamp(0, count - 1)
+        on_line.append(((cell, 1 + share / 2), (before, -share / 2)))
+        share = share * (along != axis)
+        beyond.append(((place, 1 + share), (place.clamp(1, count), -share)))
+        face = torch.where(low, 2 * along, 2 * along + 1)
+        faces.append(torch.where((low | high) & (count > 1), face, len(FACES)))
+    line = _multiply(on_line, grid.shape, places)
+    rows, columns, weights = _multiply(beyond, wide, places)
+    is_inner = ~is_outside.flatten()[columns]
+    inner = rows[is_inner], nearest.flatten()[columns[is_inner]], weights[is_inner]
+    rows, columns, weights = (column[~is_inner] for column in (rows, columns, weights))
+    # Light on faces, then what is made of cells.
+    around = (
+        torch.cat([places[rows], places]),
+        torch.cat([number[columns], len(places) + torch.arange(len(places))]),
+        torch.cat([weights, torch.ones(len(places), dtype=torch.float64)]),
+    )
+    by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)[:, places]
+    lacking, outermost, width, outward = _find_layers(grid, axis, nearest)
+
+    def on_device(entries: _Entries) -> _Table:
+        rows, columns, weights = (column.to(device) for column in entries)
+        return _Table(rows, columns, weights.to(dtype))
+
+    return _Shell(
+        nearest.flatten()[places].to(device),
+        on_device(line),
+        by_axis.to(device),
+        on_device(inner),
+        on_device(around),
+        on_device(lacking),
+        outermost.to(device),
+        width.to(device, dtype),
+        outward.to(device, dtype),
+    )
 
 
-@remember
+def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _Entries:
+    """The product of three matrices with two entries a row, one an axis: rows that are `places`.
+
+    `size`: how many columns each matrix has.
+    """
+    rows, columns, weights = list[Tensor](), list[Tensor](), list[Tensor]()
+    for (z, a), (y, b), (x, c) in product(*axes):
+        column = (z[:, None, None] * size[1] + y[:, None]) * size[2] + x
+        weight = (a[:, None, None] * b[:, None] * c).flatten()[places]
+        row = weight.nonzero()[:, 0]
+        rows.append(row)
+        columns.append(column.flatten()[places[row]])
+        weights.append(weight[row])
+    return torch.cat(rows), torch.cat(columns), torch.cat(weights)
+
+
 def _find_layers(
-    count: int,
-    first: int,
-    factors: tuple[float, float],
-    dtype: torch.dtype,
-    device: torch.device,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Both ends of `count` layers, twice; layers that are `first` from these, then the next ones.
+    grid: Grid, axis: int | None, nearest: Tensor
+) -> tuple[_Entries, Tensor, Tensor, Tensor]:
+    """`lacking`, `outermost`, `width` and `outward` of a `_Shell`.
 
-    And what each of these is to be multiplied by; all are [4].
+    `nearest` [z + 2, y + 2, x + 2]: the cell nearest to each place.
     """
-    near, far = torch.tensor([0, first, first + 1]), torch.tensor(factors, dtype=torch.float64)
-    ends, *layers = torch.stack([near, count - 1 - near], 1).to(device)
-    return ends.repeat(2), torch.cat(layers), far.repeat_interleave(2).to(device, dtype)
-
-
-@remember
-def _find_outermost(
-    grid: Grid, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The S outermost cells across all axes of more than one cell, twice where they are at edges.
-
-    With their outward normals [3, S] and their widths [u] across faces, [S].
-    """
-    numbers = torch.arange(grid.cells).view(grid.shape)
-    cells, outward, width = list[Tensor](), list[Tensor](), list[Tensor]()
-    for axis, count in enumerate(grid.shape):
-        if count > 1:
-            layers = numbers.index_select(axis, torch.tensor([0, count - 1]))
-            side = torch.tensor([-1.0, 1.0]).view(-1, *[1] * (2 - axis)).expand(layers.shape)
-            cells.append(layers.flatten())
-            normal = torch.eye(3)[axis]
-            outward.append(normal[:, None] * side.flatten())
-            width.append(torch.full((layers.numel(),), grid.spacing[axis], dtype=torch.float64))
-    columns = torch.cat(outward, 1), torch.cat(width)
-    normals, widths = (column.to(device, dtype) for column in columns)
-    return torch.cat(cells).to(device), normals, widths
+    place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
+    number = torch.zeros(grid.cells, dtype=torch.long)
+    none = torch.zeros(0, dtype=torch.long)
+    layers = [(none, none, none.double(), none, none.double(), none.double().view(3, 0))]
+    for along, side in FACES:
+        if grid.shape[along] == 1:
+            continue
+        outer, last = (place.select(along, -1 - k if side else k) for k in range(2))
+        last = last[1:-1, 1:-1].flatten()
+        rows, cells = torch.cat([outer.flatten(), last]), nearest.flatten()[last]
+        number[cells] = count + torch.arange(len(cells))
+        count += len(cells)
+        # What stands for a face is less by what that lacks, and by what the last cell has more.
+        less = -1.0 if along == axis else -2.0 - RAISED
+        weights = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
+        width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
+        outward = torch.zeros(3, len(cells), dtype=torch.float64)
+        outward[along] = 2 * side - 1
+        layers.append((rows, number[nearest.flatten()[rows]], weights, cells, width, outward))
+    rows, columns, weights, cells, width, outward = (
+        torch.cat(many, -1) for many in zip(*layers, strict=True)
+    )
+    return (rows, columns, weights), cells, width, outward

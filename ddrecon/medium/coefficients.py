@@ -176,8 +176,9 @@ class Medium:
         """
         names = "extinction", "scattering", "remaining", "absorption"
         fields = {name: getattr(self, name).field for name in names}
-        # A field that coefficients share, they share there as well.
-        moved = {id(field): function(field) for field in fields.values()}
+        # A field that coefficients share is moved once, and they share it there as well.
+        different = {id(field): field for field in fields.values()}
+        moved = {key: function(field) for key, field in different.items()}
         for name, field in fields.items():
             changed[name] = replace(getattr(self, name), field=moved[id(field)])
         for name in others:
