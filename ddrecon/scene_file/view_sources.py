@@ -277,7 +277,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
-            number, model, width, height = _unpack(path, stream, "<iiQQ")
+            number, model, width, height = _unpack(path, stream, "<IiQQ")
             if not 0 <= model < len(lengths):
                 raise FormatError(path, f"camera {number}: lens model {model} is not known")
             name = [*lengths][model]
@@ -287,11 +287,13 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 def _binary_images(path: Path) -> Iterator[Posed]:
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
-            _, *pose, camera = _unpack(path, stream, "<i7di")
+            _, *pose, camera = _unpack(path, stream, "<I7dI")
             name = bytearray()
             while (letter := _unpack(path, stream, "c")[0]) != b"\0":
                 name += letter
             (points,) = _unpack(path, stream, "<Q")
+            if 24 * points > path.stat().st_size - stream.tell():
+                raise FormatError(path, "ends too soon")
             stream.seek(24 * points, 1)
             yield name.decode(), camera, pose
 
