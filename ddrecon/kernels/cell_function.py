@@ -87,7 +87,7 @@ class RowFunction:
             **self.more,
             **more,
         }
-        written = {"made": _one_by_one(outputs)} | ({"sums": sums} if has_sums else {})
+        written = {"results": _one_by_one(outputs)} | ({"sums": sums} if has_sums else {})
         self.kernel(kind, len(fields), 8 * like.element_size()).launch(items, inputs, written)
         return tuple(outputs), sums
 
@@ -157,16 +157,16 @@ def _one_by_one(fields: Sequence[Tensor]) -> list[Tensor]:
 def _kernel(
     kind: str, header: str, name: str, place: str, declared: str, ins: int, outs: int, bits: int
 ) -> TextKernel:
-    at, written = f"row, {place}channels, fields", "made"
+    at, written = f"row, {place}channels, fields", "results"
     if kind == "values":
-        more = f"*made[{outs}]"
-        call = f"find_values<{name}, F, F>({at}, nullptr, numbers, nullptr, made);"
+        more = f"*results[{outs}]"
+        call = f"find_values<{name}, F, F>({at}, nullptr, numbers, nullptr, results);"
     elif kind == "tangents":
-        more = f"*d_fields[{ins}], *d_numbers, *made[{outs}]"
-        call = f"find_values<{name}, Dual<F>, F>({at}, d_fields, numbers, d_numbers, made);"
+        more = f"*d_fields[{ins}], *d_numbers, *results[{outs}]"
+        call = f"find_values<{name}, Dual<F>, F>({at}, d_fields, numbers, d_numbers, results);"
     else:
-        more, written = f"*bars[{outs}], *made[{ins}], *sums", "made sums"
-        call = f"find_cotangents<{name}>({at}, numbers, bars, made, sums);"
+        more, written = f"*bars[{outs}], *results[{ins}], *sums", "results sums"
+        call = f"find_cotangents<{name}>({at}, numbers, bars, results, sums);"
     text = "const Row row(item, width, rows, colors);" + call
     all_declared = (
         f"int width, rows, colors, channels[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"

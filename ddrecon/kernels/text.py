@@ -61,14 +61,14 @@ class TextKernel:
         members, variables = dict[str, Any](), list[str]()
         self.arrays: dict[str, torch.dtype] = {}
         self.lists: dict[str, list[str]] = {}
-        self.made = set(outputs.split())
+        self.written = set(outputs.split())
         for word, is_array, variable, count in declarations(declared):
             c_type, number, dtype = types[word]
             entries = [f"{variable}_{k}" for k in range(count)] or [variable]
             # Pointers go as numbers: their addresses.
             members |= dict.fromkeys(entries, wp.uint64 if is_array else number)
             if is_array:
-                c_type = f"{c_type}*" if variable in self.made else f"const {c_type}*"
+                c_type = f"{c_type}*" if variable in self.written else f"const {c_type}*"
                 self.arrays |= dict.fromkeys(entries, dtype)
             values = ", ".join(f"({c_type})record.{entry}" for entry in entries)
             if count:
@@ -112,7 +112,7 @@ class TextKernel:
             return
         records = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
         for record, share in zip(records, shares, strict=True):
-            assert share.keys() <= self.made, share.keys() - self.made
+            assert share.keys() <= self.written, share.keys() - self.written
             self._write_all(record, share)
         launch(self.kernel, count, records, bound.arrays[0], len(records))
 
@@ -122,8 +122,10 @@ class TextKernel:
         Raises ValueError for an array that it writes and that is not among `outputs`: of a copy of
         that nobody would see what is written. And for one that is, and that it does not write.
         """
-        if wrong := (self.made & inputs.keys()) | (outputs.keys() - self.made):
-            raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
+        if wrong := (self.written & inputs.keys()) | (outputs.keys() - self.written):
+            raise ValueError(
+                f"{self.name} writes {self.written}: {wrong} are handed over as others"
+            )
         record = self.new_record()
         arrays = self._write_all(record, inputs) + self._write_all(record, outputs)
         return Bound(self, record, arrays)
@@ -136,7 +138,7 @@ class TextKernel:
             entries = zip(self.lists[name], value, strict=True) if is_list else [(name, value)]
             for entry, number in entries:
                 if isinstance(number, Tensor):
-                    if name not in self.made:
+                    if name not in self.written:
                         number = number.to(self.arrays.get(entry)).contiguous()
                     arrays.append(number)
                 self.write(record, entry, number)

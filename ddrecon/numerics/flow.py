@@ -67,11 +67,11 @@ def _relax(before: Tensor, after: Tensor, flow: Tensor) -> Tensor:
     pairs = _neighbors((carried + after) / 2)
     slope = torch.stack([(above - below) / 2 for below, above in pairs])
     # To first order f(x - d) is f - slope d: slope (new - flow) + after - carried is to vanish.
-    left = after - carried - (slope * flow).sum(0)
+    difference = after - carried - (slope * flow).sum(0)
     strength = 1 / (STIFFNESS + slope.square().sum(0))
     for _ in range(SWEEPS):
         mean = torch.stack([below + above for below, above in _neighbors(flow)]).sum(0) / 6
-        flow = mean - slope * ((slope * mean).sum(0) + left) * strength
+        flow = mean - slope * ((slope * mean).sum(0) + difference) * strength
     return flow
 
 

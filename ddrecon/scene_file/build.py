@@ -320,8 +320,8 @@ def _fill(
         return value.new_tensor(init)
     expected = f"a list of {count} numbers" if count else "one number"
     expected += " or [r, g, b]" if kind.is_color else ""
-    found = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
-    raise scene_file.refused(key, f"expected {expected}{found}")
+    length = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
+    raise scene_file.refused(key, f"expected {expected}{length}")
 
 
 def _spread(

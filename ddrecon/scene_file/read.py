@@ -110,12 +110,12 @@ def _read_kind(node: Node, rule: Rule) -> Any:
 def _refused(node: Node, rule: Rule) -> Exception:
     choices = [str(choice) for choice in rule.choices]
     expected = f"one of {', '.join(choices)}" if choices else describe_type(rule.hint)
-    found = describe_found(node)
+    description = describe_found(node)
     if isinstance(node.value, str):
-        found += nearest(node.value, choices)
+        description += nearest(node.value, choices)
     elif isinstance(node.value, int | float) and {str, Path} & set(rule.kinds) and not choices:
-        found += " (put it in quotes)"
-    return node.refused(f"expected {expected}, found {found}")
+        description += " (put it in quotes)"
+    return node.refused(f"expected {expected}, found {description}")
 
 
 def _read_number(node: Node, number: float, rule: Rule) -> float:

@@ -70,9 +70,9 @@ class Mirror:
             image = self.images[number][axis]
             layer = self.more[2 * axis + (direction[axis] < 0)]
             layer = lay_face(torch.tensordot(self.values[image].to(layer), layer, 1), place, course)
-            for left in (self.before, self.besides.left if self.besides and self.before else []):
-                if left and course.moved[axis]:
-                    layer = layer + left[image][place]
+            for earlier in (self.before, self.besides.left if self.besides and self.before else []):
+                if earlier and course.moved[axis]:
+                    layer = layer + earlier[image][place]
             ends.append(self.reflected[number][axis] * layer)
         return ends[0], ends[1], ends[2]
 

@@ -40,8 +40,8 @@ DIRECTIONS = [
 SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
 
 
-def assert_all_near(found: list[Tensor], known: list[Tensor], error: float) -> None:
-    for value, expected in zip(found, known, strict=True):
+def assert_all_near(fused: list[Tensor], known: list[Tensor], error: float) -> None:
+    for value, expected in zip(fused, known, strict=True):
         scale = max(float(expected.abs().max()), 1e-3)
         torch.testing.assert_close(value, expected, rtol=0, atol=error * scale)
 
@@ -51,7 +51,7 @@ def masses(engine: str, grid: Grid, field: Tensor, heading: Tensor, bound: float
     use_engine(engine)
     direction = torch.nn.functional.normalize(heading, dim=0)
     leaves = [
-        each.detach().clone().requires_grad_() for each in (field, direction, tensor(bound)[0])
+        value.detach().clone().requires_grad_() for value in (field, direction, tensor(bound)[0])
     ]
     (entered,), (step,) = sum_masses(leaves[0], grid, leaves[1][None], leaves[2])
     loss = (entered * random_values(*entered.shape, seed=1).to(entered)).sum() + 0.7 * step
@@ -131,9 +131,9 @@ NUMBERS += ["lights.1.irradiance", "lights.2.radiance", "lights.2.rotation"]
 
 
 def assert_as_torch(scene: Scene, names: list[str], degree: int, error: float) -> None:
-    found, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
-    assert all(bool(torch.isfinite(value).all()) for value in found)
-    assert_all_near(found, known, error)
+    fused, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
+    assert all(bool(torch.isfinite(value).all()) for value in fused)
+    assert_all_near(fused, known, error)
 
 
 @pytest.mark.parametrize("kind", ["gray", "colors", "fields"])

@@ -110,7 +110,7 @@ EMISSIONS = [
     ("blend by cell", OUTSIDE, ["density"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
-FORWARD = [one for one in EMISSIONS if one[0] == "lobes by color" or "by cell" in one[0]]
+FORWARD = [case for case in EMISSIONS if case[0] == "lobes by color" or "by cell" in case[0]]
 """Those whose tangents `tests/test_fused_tangents.py` does not try."""
 
 
@@ -193,12 +193,12 @@ def test_hard_cases_are_passed(name: str):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
+    layout = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)
     by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
     packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
     packets += [
-        kernels.tangent_kernel(one, Case(False, True)),
+        kernels.tangent_kernel(layout, Case(False, True)),
         kernels.adjoint_kernel(several, Case(False)),
     ]
     assert_compiles(packets, tmp_path)

@@ -74,8 +74,8 @@ def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
     torch.testing.assert_close(one.value(cosine), other.value(cosine), rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(one.moments(30), other.moments(30), rtol=0, atol=1e-10)
     for degree in (1, 3):
-        parts = (phase.peak_tail(degree, 1) for phase in (one, other))
-        torch.testing.assert_close(*parts, rtol=0, atol=1e-10)
+        tails = (phase.peak_tail(degree, 1) for phase in (one, other))
+        torch.testing.assert_close(*tails, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("phase", [*PHASES.values()][:-1], ids=[*PHASES][:-1])
@@ -84,8 +84,13 @@ def test_values_and_moments_have_both_derivatives(phase: PhaseFunction):
     numbers = [number.clone().requires_grad_() for number in phase.numbers]
 
     def found(cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
-        made = kind(*numbers)
-        return made.value(cosine), made.moments(5), made.peak_tail(1, 4), made.peak_tail(3, 4, -1)
+        phase = kind(*numbers)
+        return (
+            phase.value(cosine),
+            phase.moments(5),
+            phase.peak_tail(1, 4),
+            phase.peak_tail(3, 4, -1),
+        )
 
     assert torch.autograd.gradcheck(found, (cosine, *numbers), check_forward_ad=True)
 

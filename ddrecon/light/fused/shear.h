@@ -213,16 +213,16 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
             const Position<F> r = row_place(k), c = column_place(k);
             // Of rays, by gathering from cells: rows first, then columns.
             const Taps<F> row(r.a), column(c.a);
-            const int size = rays.hi - rays.lo, left = rays.lo - c.n - 2;
+            const int size = rays.hi - rays.lo, begin = rays.lo - c.n - 2;
             clear(linear, size + 3), clear(curved, size + 3);
             for (int t = 0; t < 4; ++t) {
                 const int y = rays.m - t;
                 if (y < 0 || y >= height) continue;
                 const F* mass = entered_bar + cell_row(rays.channel, k, y);
                 const F* correction = corrections_bar + cell_row(rays.channel, k, y);
-                add_row(linear, mass, left, size + 3, width, row.linear[t]);
-                add_row(linear, correction, left, size + 3, width, -row.bend[t]);
-                add_row(curved, correction, left, size + 3, width, row.linear[t]);
+                add_row(linear, mass, begin, size + 3, width, row.linear[t]);
+                add_row(linear, correction, begin, size + 3, width, -row.bend[t]);
+                add_row(curved, correction, begin, size + 3, width, row.linear[t]);
             }
             for (int t = 0; t < size; ++t)
                 bar[t] = column.linear[1] * linear[t + 2] + column.linear[2] * linear[t + 1] -
@@ -263,12 +263,12 @@ template <class F, int BLOCK, class N> struct Shear : Slices {
         auto gather = [&](const F* bars, int s, double shift, F weight) HERE {
             const Position<F> r = row_place(s + shift), c = column_place(s + shift);
             const int above = cells.row + r.n - row_place(s).n + 1;
-            const int left = cells.begin + c.n - column_place(s).n + 1;
+            const int begin = cells.begin + c.n - column_place(s).n + 1;
             clear(blended, cells.count + 1);
             for (int t = 0; t < 2; ++t)
                 if (above + t >= 0 && above + t < height + 3)
                     add_row(
-                        blended, bars + window_row(cells.channel, s, above + t), left,
+                        blended, bars + window_row(cells.channel, s, above + t), begin,
                         cells.count + 1, width + 3, weight * (t ? r.a : F(1) - r.a));
             for (int t = 0; t < cells.count; ++t)
                 out[t] += (F(1) - c.a) * blended[t] + c.a * blended[t + 1];

@@ -40,11 +40,11 @@ def sweep_fused(
         numbers = tables.numbers[chunk.ordinates]
         courses = [Characteristic.of(grid, points[n]) for n in numbers]
         ends = None if mirror is None else [mirror.entering(n) for n in numbers]
-        chunk_moments, left = recompute(
+        chunk_moments, leaving = recompute(
             _sweep_chunk, (grid, directions, number), fields, courses, ends
         )
         moments = moments + chunk_moments
-        gone |= zip(numbers, left, strict=bool(left))
+        gone |= zip(numbers, leaving, strict=bool(leaving))
     if mirror is not None:
         mirror.left.extend(gone[n] for n in range(directions))
     return moments

@@ -98,7 +98,7 @@ class _Launches:
         inputs = dict.fromkeys(kernel.arrays) | dict(zip(FIELDS, self.fields, strict=True))
         inputs |= {f"d_{name}": change for name, change in zip(FIELDS, changes, strict=True)}
         inputs |= {name: tables.arrays[name] for name in TABLES} | arrays
-        outputs = {name: inputs.pop(name) for name in kernel.made}
+        outputs = {name: inputs.pop(name) for name in kernel.written}
         numbers = {
             "depth": depth, "height": height, "width": width, "planes": planes,
             "back_planes": back_planes, "periodic": sum(2**axis for axis in self.grid.periodic),
