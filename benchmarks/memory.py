@@ -39,7 +39,8 @@ CASES = {
     "gray": {},
     "RGB": {"albedo": [0.95, 0.9, 0.8]},
     "RGB, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3},
-    "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1},
+    "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1, "degree": 3},
+    "RGB, g 0.3, degree 5": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1, "degree": 5},
     "RGB, flux-limited": {"albedo": [0.95, 0.9, 0.8], "model": "flux_limited"},
     "RGB fields": {"albedo": [0.95, 0.9, 0.8], "fields": True},
     "density, sigma_a and sigma_s": {"albedo": [0.95, 0.9, 0.8], "joint": True},
@@ -73,6 +74,7 @@ def scene_of(
     scene = {**SCENE, "volume": volume, "views": views}
     scene["diffusion"] = {
         "transport_rounds": case.get("rounds", 0),
+        "degree": case.get("degree"),
         "model": case.get("model", "p1"),
         "tolerance": 1e-2,
     }

@@ -20,20 +20,20 @@ from ddrecon.records import bounded, one_of
 from ddrecon.settings import LENSES
 
 NEWTON_STEPS = 12
-"""By which a view ray through a pane is found to rounding."""
+"""Steps of Newton's method that find a view ray through a pane to rounding."""
 
 
 @dataclass(eq=False)
 class Camera:
-    """A camera.
+    """A perspective or orthographic camera.
 
     `pose`: the rigid camera-to-world matrix `[3, 4]`, with OpenGL axes (right, up, backward,
-    origin). `size`: (height, width) in pixels. `is_perspective` chooses between perspective, whose
-    horizontal field of view is `2 atan(half_width)`, and orthographic, whose image is `2
-    half_width` world units wide. The axis meets the image at `principal_point`, as parts of its
-    width and height from the top left; `pixel_aspect` is the height of a pixel over its width. A
-    perspective camera's `lens` is that of `ddrecon.lenses` whose coefficients are `distortion`;
-    None is a pinhole. What is varied is a tensor: [] for `half_width`, [2] for `principal_point`.
+    origin). `size`: (height, width) in pixels. `half_width`: tangent of half the horizontal field
+    of view, or half the width of an orthographic image [u]. `principal_point`: where the axis meets
+    the image, in widths and heights from the top left. `pixel_aspect`: the height of a pixel over
+    its width. `lens`: that of `ddrecon.lenses` of a perspective camera, whose coefficients are
+    `distortion`; None is a pinhole. What is varied is a tensor: [] for `half_width`, [2] for
+    `principal_point`.
     """
 
     pose: Tensor
@@ -52,8 +52,8 @@ class Camera:
     @property
     def tensors(self) -> list[Tensor]:
         """All numbers that may be varied and are tensors, the pose first."""
-        others = self.half_width, self.principal_point, self.distortion
-        return [self.pose, *(other for other in others if isinstance(other, Tensor))]
+        optics = self.half_width, self.principal_point, self.distortion
+        return [self.pose, *(value for value in optics if isinstance(value, Tensor))]
 
     def resize(self, factor: int) -> Camera:
         """The same view with `factor` times fewer pixels along each side (at least one)."""
@@ -66,8 +66,7 @@ def twist(camera: Camera, change: Tensor, pivot: Triple) -> Camera:
     """`camera` turned about `pivot` (x, y, z), then shifted.
 
     `change` [6]: a rotation vector [rad] and a shift [u], both in the camera's own axes (right, up,
-    backward). With the pivot amid what the camera looks at, a turn shows another side of it and a
-    shift moves it in the image, so the two have effects that can be told apart.
+    backward). With the pivot amid what the camera looks at, the effects of both can be told apart.
     """
     axes, origin = camera.pose[:, :3], camera.pose[:, 3]
     center = origin.new_tensor(pivot)
@@ -123,9 +122,9 @@ class Pane:
 class Rays:
     """View rays, in array order.
 
-    `origin` [R, 3] in u; `direction` [R, 3], of unit length, away from the camera. `eye` [3] is the
-    point that all rays of a perspective camera pass through, None for parallel rays. Rays inside a
-    box that refracts light have passed a `pane` of it since.
+    `origin` [R, 3] in u; `direction` [R, 3], of unit length, away from the camera; `eye` [3]: what
+    all rays of a perspective camera pass through, None for parallel rays; `pane`: of a box that
+    refracts light, the face through which rays have come in.
     """
 
     origin: Tensor
@@ -140,8 +139,7 @@ class Rays:
     def towards_eye(self, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
         """Unit directions from the cells of `grid` to the camera: z, y, x, each for `[z, y, x]`.
 
-        All rays through a cell's center have the same direction, so light that leaves along them
-        is a field of the camera, interpolated like any other.
+        They are those of all rays through cells' centers, so light along them is a field.
         """
         if self.eye is None:
             z, y, x = -self.direction[0]
@@ -161,10 +159,9 @@ def pixel_width(camera: Camera, place: Tensor) -> float:
 
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Camera-to-world matrix `[3, 4]` of a camera at `origin` that looks at `target`.
+    """The `pose` of a camera at `origin` that looks at `target`; all vectors are [3] (x, y, z).
 
-    All three vectors are `[3]` (x, y, z). Raises ValueError when origin and target coincide or `up`
-    is parallel to the view direction.
+    Raises ValueError when origin and target coincide or `up` is parallel to the view direction.
     """
     forward = target - origin
     right = torch.linalg.cross(forward, up)
@@ -187,8 +184,7 @@ def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
 def cast_rays(camera: Camera, *offsets: tuple[float, float]) -> Rays:
     """The rays through every pixel, row by row, R = height * width for each of `offsets`.
 
-    `offsets`: where rays pass through their pixels, as parts of these (row, column); the middle
-    where there is none.
+    `offsets`: where rays pass through their pixels, in (rows, columns); the middle without any.
     """
     right, up, backward, origin = camera.pose.unbind(1)
     places = torch.cat([image_places(camera, offset) for offset in offsets or [(0.5, 0.5)]])
@@ -214,9 +210,20 @@ def _look_through(camera: Camera, places: Tensor) -> Tensor:
 def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Tensor:
     """Where pixels lie, `[R, 2]` (to the right and down), row by row.
 
-    Of a perspective camera in the plane one unit in front of it, of an orthographic one in its
-    image plane, in world units. `offset` is as for `cast_rays`.
+    Places are in the plane one unit in front of a perspective camera, or in the image plane of an
+    orthographic one, in world units. `offset` is as for `cast_rays`.
     """
+    return _pair(*_place_lines(camera, offset))
+
+
+def edge_places(camera: Camera) -> Tensor:
+    """Those of `image_places` that lie along the edges of the image, in any order."""
+    columns, rows = _place_lines(camera, (0.5, 0.5))
+    return torch.cat([_pair(columns, rows[[0, -1]]), _pair(columns[[0, -1]], rows)])
+
+
+def _place_lines(camera: Camera, offset: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """How far to the right columns lie, and how far down rows."""
     (height, width), like, middle = camera.size, camera.pose, camera.principal_point
     row, column = (
         torch.arange(count, dtype=like.dtype, device=like.device) + shift
@@ -224,21 +231,18 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
     )
     step = camera.half_width * 2 / width
     down = (row - middle[1] * height) * (step * camera.pixel_aspect)
-    right = (column - middle[0] * width) * step
-    return torch.stack(torch.meshgrid(right, down, indexing="xy"), -1).view(-1, 2)
+    return (column - middle[0] * width) * step, down
 
 
-def edge_places(camera: Camera) -> Tensor:
-    """Those of `image_places` that lie along the edges of the image."""
-    places = image_places(camera).view(*camera.size, 2)
-    return torch.cat([places[0], places[-1], places[:, 0], places[:, -1]])
+def _pair(columns: Tensor, rows: Tensor) -> Tensor:
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Where `points` [N, 3] (x, y, z) [u] are seen, `[N, 2]`, and how far away, `[N]`.
 
-    In columns and rows from the image's top left corner; NaN behind a perspective camera, and
-    beyond the corners of its image, where distortion may have folded over.
+    Places are columns and rows from the image's top left corner; NaN behind a perspective camera,
+    and beyond the corners of its image, where distortion may have folded over.
     """
     right, up, backward, origin = camera.pose.detach().unbind(1)
     away = points - origin

@@ -1,4 +1,4 @@
-"""What a scene gets whose settings leave something out, as its medium deserves."""
+"""What the medium of a scene chooses where settings leave something out."""
 
 from __future__ import annotations
 
@@ -11,37 +11,30 @@ from torch import Tensor
 
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase import PhaseFunction
 from ddrecon.settings import DiffusionSettings
 
 MOST_ROUNDS = 16
 """Rounds until light comes to rest; in all cases measured it has by then."""
 MORE_ROUNDS = 0.3, 0.6
-"""A second moment of the phase function above one of these deserves a round more: by about so much
-a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
-"""
+"""Each of these that the second moment of the phase function exceeds (|g| of 0.55 and 0.77) adds a
+round: a round multiplies what is left by about the second moment."""
 FEW_ANGLES = 0.1
-"""A second moment up to this needs no angles beyond diffusion's; |g| is up to 0.32 then."""
+"""A second moment up to this (|g| of 0.32) needs no angles beyond diffusion's."""
 THICK = 4.0
-"""With degree 5 there is a round more, and two where a cell has more optical depths: theta of E7.2
-is less than 1 then. Measured on half-spaces and slabs (docs/accuracy.md).
-"""
+"""Degree 5 adds a round, or two where a cell has more optical depths: theta of E7.2 is below 1
+then. Measured on half-spaces and slabs (docs/accuracy.md)."""
 FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
-"""Light is computed in cells a third as wide, or a ninth, where a cell has more optical depths, or
-in a flat medium has more than the second, and there are no more cells then. Measured on blocks,
-half-spaces and merged balls (docs/accuracy.md). Where there were more, cells stay as wide as they
-are along axes along which nothing varies and the box is so many times as long as along another;
-gray light may have as many then as three colors have numbers.
-"""
+"""Cells of light become 3, then 9 times narrower where a cell has more than `FINER` optical depths
+(`FINER_FLAT` in a flat medium), unless that makes more than `MOST_CELLS` cells. Measured on blocks,
+half-spaces and merged balls (docs/accuracy.md). If it does, axes stay undivided along which nothing
+varies and the box is `LONG` times as long as along another, up to three numbers for each cell."""
 SOFT = 3.0
-"""Where no face is dense and a cell has more optical depths, one round: later ones darken soft
-edges. Measured on merged balls (docs/accuracy.md).
-"""
+"""Where no face is dense and a cell has more optical depths, there is one round: later ones darken
+soft edges. Measured on merged balls (docs/accuracy.md)."""
 FLAT, BACKWARD = 0.5, 0.2
-"""A medium as dense on a face of the box as that part of its mean is flat: light leaves it on one
-side of a plane, which takes more directions. So do thick cells, and a backward peak of more than
-that part of scattering. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md).
-"""
+"""A medium is flat if its density on a face of the box exceeds `FLAT` times its mean: light leaves
+on one side of a plane, which takes degree 5. A backward peak of more than `BACKWARD` of scattering
+takes it as well. Measured on half-spaces, I3RC's step cloud and a plume (docs/accuracy.md)."""
 OPTIMIZED = 0.31
 """The second moment that stands for a phase function which is optimized: two rounds."""
 
@@ -49,12 +42,10 @@ OPTIMIZED = 0.31
 def choose_diffusion(
     settings: DiffusionSettings, volume: Volume, media: Sequence[Volume], optimized: Collection[str]
 ) -> tuple[DiffusionSettings, str]:
-    """`settings`, and what they leave out as the `media` of `volume` deserve; and why.
+    """`settings` with what they leave out chosen by the `media` of `volume`; and why.
 
-    By its phase function: one that is `optimized` may become any, and starts as one of strong peaks
-    does. If its density is not optimized, also by the depth of its thickest cell, and whether it
-    goes up to a face of the box. Cells are divided along all axes if there are not too many then,
-    else along those of which the media vary along any.
+    The phase function counts; where it is `optimized` it may become any, and counts as `OPTIMIZED`
+    at least. The thickest cell and dense faces count where density is not optimized.
     """
     left_out = None in (settings.transport_rounds, settings.degree, settings.refine)
     if not settings.rounds or not left_out:
@@ -107,14 +98,15 @@ def _choose_rounds(
     volume: Volume, optimized: Collection[str], left: float, depth: float, is_flat: bool
 ) -> tuple[int, int, list[str]]:
     """Rounds, their degree, and why, as of `choose_diffusion`; `left` is the second moment."""
-    reasons = list[str]()
+    reasons, glows = list[str](), [volume.emission, volume.black_body]
+    turns_back = float(volume.phase.peak_tail(3, 1, -1).max()) > BACKWARD
     rounds, degree = 1 + sum(left > bound for bound in MORE_ROUNDS), 3 if left > FEW_ANGLES else 1
-    if is_flat or _turns_back(volume.phase):
+    if is_flat or turns_back:
         reasons.append("a medium up to a face of the box" if is_flat else "a backward peak")
         rounds, degree = rounds + 1 + (depth > THICK), 5
     elif depth > SOFT:
         rounds = 1
-    elif _glows(volume) or "emission" in optimized:
+    elif "emission" in optimized or any(bool(x.any()) for x in glows if x is not None):
         # Around a small bright core diffusion is far too bright, and a single round too dark.
         reasons.append("emission")
         rounds = max(rounds, 2)
@@ -127,15 +119,6 @@ def _choose_rounds(
         reasons.append("faces that reflect light")
         rounds = max(rounds, 4)
     return rounds, degree, reasons
-
-
-def _glows(volume: Volume) -> bool:
-    glows = volume.emission, volume.black_body
-    return any(field is not None and bool(field.any()) for field in glows)
-
-
-def _turns_back(phase: PhaseFunction) -> bool:
-    return float(phase.backward_tail(3, 1).max()) > BACKWARD
 
 
 def _axes_that_vary(media: Iterable[Volume]) -> str:
@@ -163,13 +146,13 @@ def _varies(field: Tensor, axis: int) -> bool:
 
 def _is_flat(media: Iterable[Volume]) -> bool:
     """Whether `media`, all together, go up to a face of the box."""
-    faces, whole = np.zeros(6), 0.0
+    faces, mean = np.zeros(6), 0.0
     for medium in media:
         size = float(medium.sigma_a.mean() + medium.sigma_s.mean())
         ends = (medium.density.select(axis, end) for axis in range(3) for end in (0, -1))
         faces += [size * float(face.mean()) for face in ends]
-        whole += size * float(medium.density.mean())
-    return bool(faces.max() > FLAT * whole)
+        mean += size * float(medium.density.mean())
+    return bool(faces.max() > FLAT * mean)
 
 
 def count_colors(volume: Volume, media: Iterable[Volume]) -> int:

@@ -1,9 +1,8 @@
 """Which kernels run: PyTorch's, or fused ones in NVIDIA Warp.
 
-An engine is an implementation of the inner loops. `torch` is the readable definition and has them
-all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. `numerics.autodiff.is_fused` says where kernels
-run; what has none is torch's with either engine, such as the paper's own scheme.
+`torch` is the readable definition of all inner loops; `warp` (package warp-lang, the extra `fast`)
+fuses a loop into one kernel of the same formulas, so numbers agree to rounding.
+`numerics.autodiff.is_fused` says where kernels run.
 """
 
 from __future__ import annotations
@@ -56,10 +55,8 @@ def engine_versions() -> dict[str, str]:
     """The current `engine`, and the version of `warp-lang` where that is warp."""
     from importlib.metadata import version  # imported late, so that help answers at once
 
-    is_torch = current_engine() == "torch"
-    return (
-        {"engine": "torch"} if is_torch else {"engine": "warp", "warp-lang": version("warp-lang")}
-    )
+    engine = current_engine()
+    return {"engine": engine} | ({"warp-lang": version("warp-lang")} if engine == "warp" else {})
 
 
 def _resolve(name: str, asked: str) -> str:
@@ -79,27 +76,24 @@ def _resolve(name: str, asked: str) -> str:
 
 
 def _place_kernels(name: str, asked: str) -> str:
-    """`warp`, once there is a folder for its kernels; `torch` where there is none, with `auto`.
+    """`warp`, once there is a folder for its kernels.
 
-    Where the usual one cannot be written, as in containers, `auto` takes a temporary one. Raises
-    UsageError for `warp` there.
+    Where the usual one cannot be written, as in containers, `auto` takes a temporary one, or else
+    `torch`, and `warp` raises UsageError.
     """
     usual = os.environ.get(CACHE) or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     if os.name != "posix" or _is_writable(Path(usual)):
         return "warp"
-    lost, mend = (
-        f"kernels cannot be kept in {usual}",
-        f"set {CACHE} to a folder that can be written",
-    )
+    problem, remedy = f"kernels cannot be kept in {usual}", f"set {CACHE} to a folder to write to"
     if name == "warp":
-        raise UsageError(f"{asked}: {lost}; {mend}")
+        raise UsageError(f"{asked}: {problem}; {remedy}")
     folder = Path(os.environ.get("TMPDIR") or "/tmp", f"ddrecon-{os.getuid()}")
     # What others put there would be run as kernels.
-    is_own = _is_writable(folder) and folder.lstat().st_uid == os.getuid()
-    engine, instead = ("warp", f", but in {folder}") if is_own else ("torch", "")
-    if is_own:
-        os.environ[CACHE] = str(folder)
-    logging.getLogger(LOG).info(f"engine {engine}: {lost}{instead}; {mend}")
+    if _is_writable(folder) and folder.lstat().st_uid == os.getuid():
+        os.environ[CACHE], engine, problem = str(folder), "warp", f"{problem}, but in {folder}"
+    else:
+        engine = "torch"
+    logging.getLogger(LOG).info(f"engine {engine}: {problem}; {remedy}")
     return engine
 
 

@@ -1,14 +1,17 @@
-"""The ways ddrecon refuses its input or gives up, each with the exit code of the command line.
+"""Errors that a user can cause, each with the exit code of the command line.
 
-Everything a user can cause is a `DdreconError`; whatever else is raised is a bug and keeps its
-traceback.
+All are a `DdreconError`; whatever else is raised is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 LONGEST = 1000
 """Lines of more characters are shortened in the middle."""
@@ -19,10 +22,7 @@ LONGEST_NAME = 60
 
 
 def one_line(text: str) -> str:
-    """`text` as one line that can be printed, other characters escaped and its middle left out.
-
-    The middle is left out where there are more than `LONGEST` characters.
-    """
+    """`text` as one printable line, without its middle beyond `LONGEST` characters."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
@@ -37,13 +37,17 @@ class DdreconError(Exception):
 
     exit_code = 2
 
+    def advise(self, advice: str) -> None:
+        """Has the error end with more `advice`."""
+        self.args = (f"{self}; {advice}",)
+
 
 class _ProblemsError(DdreconError):
     """An error with one line for each of its `problems`."""
 
     def __init__(self, problems: str | Sequence[str]):
-        each = [problems] if isinstance(problems, str) else problems
-        self.problems = [one_line(problem) for problem in each]
+        lines = [problems] if isinstance(problems, str) else problems
+        self.problems = [one_line(line) for line in lines]
         super().__init__("\n".join(self.problems))
 
 
@@ -55,24 +59,17 @@ class SceneError(_ProblemsError):
 
 
 class UsageError(_ProblemsError):
-    """What the command line asks for cannot be done; the user changes the command, not the scene.
-
-    Such are an output that is there already, a folder that another process writes to, a device or
-    a checkpoint that is missing, and the name of a view or variable that the scene does not have.
-    """
+    """What the command asks for cannot be done; the user changes the command, not the scene."""
 
 
 class FormatError(DdreconError):
-    """A data file that exists but cannot be used.
-
-    Of several, `path` and `reason` are of the first, and `others` are the lines of the others.
-    """
+    """A data file, `path`, that exists but cannot be used; `more` are lines of further files."""
 
     exit_code = 3
 
-    def __init__(self, path: object, reason: str, others: Sequence[str] = ()):
+    def __init__(self, path: object, reason: str, more: Sequence[str] = ()):
         self.path, self.reason = str(path), reason
-        self.lines = [one_line(line) for line in (f"{path}: {reason}", *others)]
+        self.lines = [one_line(line) for line in (f"{path}: {reason}", *more)]
         super().__init__("\n".join(self.lines))
 
 
@@ -83,43 +80,34 @@ class MissingExtraError(DdreconError):
 
 
 class SolveError(DdreconError):
-    """A linear solve or an optimization that did not converge.
-
-    `what` failed after `iterations` with the relative `residual`; `advice` says what may help.
+    """A linear solve or an optimization that did not converge: `reason` after `iterations` with the
+    relative `residual`; `advice` says what may help.
     """
 
     exit_code = 4
 
-    def __init__(self, what: str, iterations: int, residual: float, advice: str):
+    def __init__(self, reason: str, iterations: int, residual: float, advice: str):
         self.iterations, self.residual, self.advice = iterations, residual, advice
         super().__init__(
-            f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}"
+            f"{reason} after {iterations} iterations (residual {residual:.2e}); {advice}"
         )
 
 
 class DivergenceError(SolveError):
     """An optimization that cannot go on; the last good state is kept.
 
-    `iteration`, counted from 1, failed as `what` says; `residual` is that of its solve.
+    `iteration`, counted from 1, failed for a `reason`; `residual` is that of its solve.
     """
 
-    def __init__(self, iteration: int, what: str, residual: float, advice: str):
-        self.what, self.iterations, self.residual, self.advice = what, iteration, residual, advice
-        DdreconError.__init__(self, f"iteration {iteration}: {what}; {advice}")
-
-    def with_advice(self, more: str) -> DivergenceError:
-        """The same error, its advice followed by `more`."""
-        return DivergenceError(self.iterations, self.what, self.residual, f"{self.advice}; {more}")
+    def __init__(self, iteration: int, reason: str, residual: float, advice: str):
+        self.iterations, self.residual, self.advice = iteration, residual, advice
+        DdreconError.__init__(self, f"iteration {iteration}: {reason}; {advice}")
 
 
 class RanksError(DdreconError):
     """Processes that share a run and lost, or never found, one another."""
 
     exit_code = 5
-
-    def with_advice(self, more: str) -> RanksError:
-        """The same error, followed by `more`."""
-        return RanksError(f"{self}; {more}")
 
 
 class DataWarning(UserWarning):
@@ -169,7 +157,24 @@ class Problems:
             raise FormatError(first.path, first.reason, lines[1:])
 
 
+def gather(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """What `function` makes of each of `items`; raises the problems of all of them together."""
+    problems, results = Problems(), list[R]()
+    for item in items:
+        with problems.collecting():
+            results.append(function(item))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    return results
+
+
 def suggestion(name: str, known: Collection[str]) -> str:
     """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them."""
+    return nearest(name, known) or f"; known: {', '.join(known)}"
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """`; did you mean 'x'?` with the nearest of the `known` names, empty where none is near."""
     near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST_NAME else []
-    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,12 +1,8 @@
-"""Optional packages: imported where they are needed.
-
-Where one is absent, the user is told the extra of ddrecon that brings it.
-"""
+"""Optional packages, imported where they are needed; of an absent one the extra is named."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from types import ModuleType
 
 from ddrecon.errors import FormatError, MissingExtraError
@@ -29,13 +25,8 @@ def advice(package: str) -> str:
     return f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
 
 
-def is_there(package: str) -> bool:
-    """Whether `package` is installed."""
-    return find_spec(package) is not None
-
-
 def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package` for a `purpose`; raises MissingExtraError if it is not installed."""
+    """The module `package` for a `purpose`; raises MissingExtraError without it."""
     try:
         return import_module(package)
     except ImportError as error:
@@ -43,7 +34,7 @@ def load_extra(package: str, purpose: str) -> ModuleType:
 
 
 def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package`, for the file at `path`; raises FormatError if it is not installed."""
+    """The module `package` for the file at `path`; raises FormatError without it."""
     try:
         return import_module(package)
     except ImportError as error:

@@ -7,6 +7,7 @@ file that turns one into the other; inside the physics, vectors are in array ord
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -44,9 +45,8 @@ class Grid:
         resolution: tuple[int, int, int], lower: Triple, upper: Triple, periodic: str = ""
     ) -> Grid:
         """The grid of `resolution` = (nx, ny, nz) cells between world corners (x, y, z)."""
-        (z, y, x), axes = reversed(resolution), tuple(map("zyx".index, sorted(periodic)[::-1]))
-        low, high = (lower[2], lower[1], lower[0]), (upper[2], upper[1], upper[0])
-        return Grid((z, y, x), low, high, periodic=axes)
+        axes = tuple(map("zyx".index, sorted(periodic)[::-1]))
+        return Grid(resolution[::-1], lower[::-1], upper[::-1], periodic=axes)
 
     @property
     def extent(self) -> Triple:
@@ -63,31 +63,28 @@ class Grid:
     @property
     def cells(self) -> int:
         """Number of cells."""
-        return self.shape[0] * self.shape[1] * self.shape[2]
+        return math.prod(self.shape)
 
     @property
     def bounds_xyz(self) -> tuple[Triple, Triple]:
         """The world corners as (x, y, z)."""
-        (lz, ly, lx), (uz, uy, ux) = self.lower, self.upper
-        return (lx, ly, lz), (ux, uy, uz)
+        return self.lower[::-1], self.upper[::-1]
 
     @property
     def center_xyz(self) -> Triple:
         """The middle of the box as (x, y, z)."""
-        (lx, ly, lz), (ux, uy, uz) = self.bounds_xyz
-        return (lx + ux) / 2, (ly + uy) / 2, (lz + uz) / 2
+        x, y, z = ((low + high) / 2 for low, high in zip(*self.bounds_xyz, strict=True))
+        return x, y, z
 
     def centers(self, like: Tensor) -> list[Tensor]:
         """World coordinates [u] of the cell centers along z, y, x, each for `[z, y, x]`."""
         import torch
 
-        coordinates = []
-        for axis, (cells, low, step) in enumerate(
-            zip(self.shape, self.lower, self.spacing, strict=True)
-        ):
-            line = low + step * (torch.arange(cells, dtype=like.dtype, device=like.device) + 0.5)
-            coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
-        return coordinates
+        lines = [
+            low + step * (torch.arange(cells, dtype=like.dtype, device=like.device) + 0.5)
+            for cells, low, step in zip(self.shape, self.lower, self.spacing, strict=True)
+        ]
+        return [lines[0].view(-1, 1, 1), lines[1].view(1, -1, 1), lines[2].view(1, 1, -1)]
 
     def refine(self, times: int, along: str = "xyz") -> Grid:
         """The same box with so many times as many cells `along` axes that have more than one."""

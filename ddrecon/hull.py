@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import permutations, product
 
 import torch
 from torch import Tensor
@@ -22,25 +21,22 @@ from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS
 
 DARKEST = 0.1
-"""The least part of each picture that is background. Chosen on the capture, as the next three."""
+"""The least share of each picture that is background; chosen on the capture, as the next three."""
 DEVIATIONS = 4.0
 """Deviations of noise above the darkest pixels up to which a pixel is black."""
 TAIL = 0.98
-"""The part of black pixels within two deviations."""
+"""The share of black pixels within two deviations."""
 TOGETHER = 0.3
-"""The part of neighbors that show something around smoke; noise stands alone."""
+"""The share of neighbors that show something around smoke; noise stands alone."""
 MOST_PIXELS = 256
 """Pixels a side of the reduced pictures in which neighbors are counted and boxes found."""
 BOX_CELLS, SHRINKS = 48, 0.97
-"""Cells along each side of a box, which is cut to those that are left, until no side shrinks below
-this part of itself."""
-
-
+"""Cells along each side of a box, which is cut to those that may hold smoke, again and again, until
+no side shrinks below this share of itself."""
 FILLED, HELD, CUT, ALL = 0.01, 0.05, 0.25, 0.75
 """A box is far too large if less than FILLED of it may hold smoke; it is elsewhere or far too small
 if it holds less than HELD of the smoke, cuts off smoke that reaches beyond it by CUT of a side, and
 fits if it holds more than ALL."""
-
 
 OUTSIDE = "no overlap", "hardly any overlap"
 """Beginnings of `doubt_box` where a box is elsewhere."""
@@ -53,9 +49,9 @@ class HullError(SceneError):
 def find_shown(view: View, support: str) -> Tensor:
     """Which pixels of `view`, which has an image, show something: bool [h, w].
 
-    A pixel shows something by the mask, or without one where it is not black, as alpha 0 is. With
-    `auto`, it does where it is brighter than black, or differs from the background, by more than
-    noise, or is masked out. Raises HullError where most of the edges show something.
+    The mask tells, or without one a pixel that is not black, as alpha 0 is. With `auto` a pixel
+    shows something that is brighter than black, or differs from the background, by more than noise,
+    or is masked out. Raises HullError where most of the edges show something.
     """
     assert view.image is not None
     if support == MASKS and view.mask is not None:
@@ -76,8 +72,8 @@ def _tell_from_noise(view: View) -> Tensor:
     """Where the picture of `view` shows more than noise: bool [h, w].
 
     A first guess of its noise (E9.2), which bright smoke may mislead, tells what is surely smoke;
-    what lies away from that is black, and says how far black goes. Noise that is not normal, such
-    as compression leaves, goes beyond; but its pixels stand alone.
+    what lies away from that is black, and says how far black goes. Artifacts of compression go
+    beyond, but their pixels stand alone.
     """
     image, behind = view.image, view.background
     assert image is not None
@@ -120,9 +116,8 @@ def _quantile(values: Tensor, share: float) -> Tensor:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    `shown` [h, w] is whether a pixel shows something; a cell may hold medium where a pixel does
-    within `margin` pixels of those that the cell covers. Outside the image the nearest pixel
-    counts.
+    A cell may hold medium where `shown` [h, w] has a pixel within `margin` pixels of those that the
+    cell covers; outside the image the nearest pixel counts.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
@@ -147,8 +142,7 @@ def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[T
 def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
     """Where any pixel of `shown` [h, w] within `reach` rows and columns is true.
 
-    Also so far beyond its edges, [h + 2 reach, w + 2 reach], where it goes on as it ends; unless it
-    `is_cut` there.
+    The result goes as far beyond the edges, [h + 2 reach, w + 2 reach], unless it `is_cut` there.
     """
     pixels, side = shown.float()[None, None], 2 * reach + 1
     beside = reach if is_cut else 0
@@ -161,9 +155,8 @@ def _widen(shown: Tensor, reach: int, is_cut: bool = False) -> Tensor:
 def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margin: float) -> Tensor:
     """The corners [2, 3] (x, y, z) [u] of the box around all that the views of `frames` may show.
 
-    Each view shows the pixels [h, w], single ones left out, widened by `margin`. A frame of
-    which a view shows nothing has no smoke yet. Raises HullError where the views leave no place,
-    or any.
+    Views show the pixels [h, w], without single ones, widened by `margin`. A frame of which a view
+    shows nothing has no smoke yet. Raises HullError where the views leave no place, or any.
     """
     boxes = []
     for views, pixels in frames:
@@ -180,13 +173,13 @@ def bound_smoke(frames: Iterable[tuple[Sequence[View], Sequence[Tensor]]], margi
 
 def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: float) -> Tensor:
     """The box of `bound_smoke` of one frame."""
-    factors = [math.ceil(max(camera.size) / MOST_PIXELS) for camera in cameras]
-    cameras = [camera.resize(factor) for camera, factor in zip(cameras, factors, strict=True)]
-    shown = [
-        adaptive_max_pool2d(mask.float()[None], camera.size)[0] > 0
-        for camera, mask in zip(cameras, shown, strict=True)
-    ]
-    seen = [cast_rays(c).select(mask.flatten()) for c, mask in zip(cameras, shown, strict=True)]
+    views = list[tuple[Camera, Tensor, float]]()
+    for camera, mask in zip(cameras, shown, strict=True):
+        factor = math.ceil(max(camera.size) / MOST_PIXELS)
+        small = camera.resize(factor)
+        reduced = adaptive_max_pool2d(mask.float()[None], small.size)[0] > 0
+        views.append((small, reduced, margin / factor))
+    seen = [cast_rays(camera).select(mask.flatten()) for camera, mask, _ in views]
     origins = array_order(torch.stack([rays.origin.mean(0) for rays in seen])).double().cpu()
     directions = array_order(torch.stack([rays.direction.mean(0) for rays in seen])).double().cpu()
     directions = normalize(directions)
@@ -202,10 +195,7 @@ def _bound_frame(cameras: Sequence[Camera], shown: Sequence[Tensor], margin: flo
     while bool((sides < SHRINKS).any()):
         low, high = box.tolist()
         grid = Grid.from_xyz((BOX_CELLS,) * 3, tuple(low), tuple(high))
-        hulls = [
-            hull_of(camera, mask, grid, margin / factor)[0]
-            for camera, mask, factor in zip(cameras, shown, factors, strict=True)
-        ]
+        hulls = [hull_of(camera, mask, grid, width)[0] for camera, mask, width in views]
         places = array_order(torch.stack(hulls).all(0).nonzero()).cpu()
         if not len(places):
             raise HullError("of each place some view shows nothing; check the cameras")
@@ -232,12 +222,9 @@ def doubt_box(shown: Tensor, box: Tensor, upright: tuple[int, int]) -> str | Non
     held, filled = _share(shown, box)
     lacks = torch.stack([box[0] - shown[0], shown[1] - box[1]]) / (shown[1] - shown[0])
     end, axis = divmod(int(lacks.argmax()), 3)
-    if held < HELD and filled < 0.5:
-        fault = (
-            f"{OUTSIDE[held > 0]}, {100 * held:.2g} % of where the pictures show smoke is in them"
-        )
-    elif held < HELD:
-        fault = f"far too small, {100 * held:.2g} % of where the pictures show smoke is in them"
+    if held < HELD:
+        name = OUTSIDE[held > 0] if filled < 0.5 else "far too small"
+        fault = f"{name}, {100 * held:.2g} % of where the pictures show smoke is in them"
     elif filled < FILLED:
         fault = f"far too large, the pictures show smoke in {100 * filled:.2g} % of them"
     elif float(lacks[end, axis]) > CUT:
@@ -264,32 +251,21 @@ def _share(shown: Tensor, box: Tensor) -> tuple[float, float]:
 
 
 def _explain(shown: Tensor, box: Tensor, old: int, new: int, units: Sequence[float]) -> str:
-    """Which of `units`, and turn of the axis `old` to `new`, have `shown` fill `box`."""
-    for times, (order, signs) in product(units, _turns(old, new)):
-        ends = times * shown[:, list(order)] * shown.new_tensor(signs)
-        held, filled = _share(ends.sort(0).values, box)
+    """Which of `units`, and quarter turn of the axis `old` to `new`, have `shown` fill `box`."""
+    order, signs = [0, 1, 2], [1, 1, 1]
+    if old != new:
+        order[new], order[old], signs[old] = old, new, -1
+    turned = shown[:, order] * shown.new_tensor(signs)
+    for factor in units:
+        held, filled = _share((factor * turned).sort(0).values, box)
         if held < ALL or filled < FILLED:
             continue
         words = list[str]()
         if old != new:
-            turned = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
+            axes = ", ".join("-" * (s < 0) + "xyz"[i] for i, s in zip(order, signs, strict=True))
             up = f"as if {'xyz'[old]} were up in the one and {'xyz'[new]} in the other"
-            words.append(f"({turned}) of the cameras as its (x, y, z), {up}")
-        if times != 1:
-            words.append(f"lengths of the cameras times {times:g}, as of another unit")
+            words.append(f"({axes}) of the cameras as its (x, y, z), {up}")
+        if factor != 1:
+            words.append(f"lengths of the cameras times {factor:g}, as of another unit")
         return f", but would fit with {', and '.join(words)}" if words else ""
     return ""
-
-
-def _turns(old: int, new: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Which axes, with which signs, become x, y and z in turns that take the axis `old` to `new`.
-
-    The turn that moves the fewest axes comes first; none is moved where both are the same.
-    """
-    turns = []
-    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
-        is_even = order[1] == (order[0] + 1) % 3
-        if order[new] == old and signs[new] > 0 and (math.prod(signs) > 0) == is_even:
-            turns.append((order, signs))
-    turns.sort(key=lambda turn: sum(i != axis for i, axis in enumerate(turn[0])) - sum(turn[1]) / 9)
-    return turns[:1] if old == new else turns

@@ -1,8 +1,7 @@
 """Ctrl-C: the program ends with one line and the exit code 130, at every moment.
 
-A module that is being imported must not be interrupted by an exception: extensions in C crash of
-one. There the process ends at once, as it does where the first Ctrl-C has not ended it yet; files
-are replaced whole, so that none is torn.
+An exception in the import of an extension in C crashes it: there the process ends at once, as it
+does where the first Ctrl-C has not ended it yet. Files are replaced whole, so that none is torn.
 """
 
 from __future__ import annotations
@@ -25,10 +24,9 @@ def end_at_once(number: int, frame: FrameType | None) -> None:
     os._exit(INTERRUPTED)
 
 
-def interrupt(number: int, frame: FrameType | None, what: str = "") -> None:
-    """Raises KeyboardInterrupt that says `what`, as a handler of signals, the first time.
-
-    A second signal, or one while a module is imported, ends the process at once.
+def interrupt(number: int, frame: FrameType | None, text: str = "") -> None:
+    """Raises KeyboardInterrupt with `text`, as a handler of signals; ends the process at once where
+    the signal is the second, or a module is imported.
     """
     caller = frame
     while caller is not None:
@@ -36,7 +34,7 @@ def interrupt(number: int, frame: FrameType | None, what: str = "") -> None:
             end_at_once(number, frame)
         caller = caller.f_back
     signal.signal(signal.SIGINT, end_at_once)
-    raise KeyboardInterrupt(what)
+    raise KeyboardInterrupt(text)
 
 
 @contextmanager
@@ -55,19 +53,18 @@ def on_interrupt(handler: Callable[[int, FrameType | None], None]) -> Iterator[N
 def defer_interrupt() -> Iterator[list[int]]:
     """A list that fills when the process is asked to stop, so that no iteration is torn.
 
-    Asked twice, it stops at once. Another thread than the main one is never asked.
+    Asked twice, it stops at once. Other threads than the main one are never asked.
     """
     asked: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
 
     def note(number: int, frame: FrameType | None) -> None:
         if asked:
             interrupt(number, frame, "at once; go on from the last checkpoint with --resume")
         asked.append(number)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    is_main = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGINT, signal.SIGTERM) if is_main else ()
+    before = {number: signal.signal(number, note) for number in numbers}
     try:
         yield asked
     finally:

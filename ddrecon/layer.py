@@ -33,17 +33,17 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
     Raises UsageError where `require_legal` does.
     """
-    _look_at(scene, view)
+    _prepare(scene, view)
     return refuse_batches(picture.render(scene, view, memory))
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:
     """The fluence `[C, z, y, x]`, as `ddrecon.lighting.fluence` has it; raises as `render`."""
-    _look_at(scene, None)
+    _prepare(scene, None)
     return refuse_batches(lighting.fluence(scene, memory))
 
 
-def _look_at(scene: Scene, view: str | None) -> None:
+def _prepare(scene: Scene, view: str | None) -> None:
     """Raises where a `view` of `scene` cannot be rendered, and notices what changed in it."""
     require_plain_autograd()
     require_legal(scene, view)

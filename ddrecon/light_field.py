@@ -64,18 +64,16 @@ class FaceLight:
 class LightField:
     """All light inside a medium.
 
-    `beams` are of directional and point lights (E2.2), not yet scattered; cells `received` some.
+    `beams`: unscattered light of directional and point lights (E2.2), of which cells `received`
+    some. `diffuse` [K, C, z, y, x]: phi of scattered and emitted light (E2.4, E2.10), and of the
+    unscattered light of a ground, of beams that faces have reflected (E5.8), and of skies where
+    light scatters more than once or evenly. It is that at cells' centers; after transport rounds,
+    which know light `at_faces` as well, it is the mean in cells, and rays see it sharpened.
 
-    `diffuse` [K, C, z, y, x] is phi of all other light but that of `skies` and `turned`: light that
-    was scattered or emitted (E2.4, E2.10), and the unscattered light of a ground, of beams that
-    faces have reflected (E5.8), and of skies where light scatters more than once or evenly. It is
-    light at cells' centers; after transport rounds, which know light `at_faces` as well, it is the
-    mean in cells, and rays see it sharpened.
-
-    `skies`: those whose unscattered light `diffuse` lacks. They scatter by the exact phase
-    function, into each camera's rays anew. `turned`: light that backward peaks have turned (E8.11).
-    `leaving` [K, C, z, y, x]: phi of light that is seen at faces that refract, which is not that of
-    beams they have reflected; None without refraction. `ground`: what lies below, None for nothing.
+    `skies`: those whose unscattered light `diffuse` lacks; each camera integrates it by the exact
+    phase function. `turned`: light that backward peaks have turned (E8.11). `leaving`
+    [K, C, z, y, x]: phi of light that is seen at faces that refract, without that of beams they
+    have reflected; None without refraction. `ground`: what lies below, None for nothing.
     """
 
     medium: Medium
@@ -190,10 +188,9 @@ def _scatter_light(
 def _follow_light(
     medium: Medium, cells: Medium, lights: Sequence[Source], unscattered: list[Tensor]
 ) -> LightField:
-    """Light that has not been scattered; `cells` are means of `medium`.
+    """Light that is not scattered twice; arguments are as of `_scatter_light`.
 
-    `unscattered` are phi [K, C, z, y, x] of light besides that of `lights`. Ambient light and skies
-    are followed by quadrature over directions.
+    Ambient light and skies are followed by quadrature over directions.
     """
     beams, received = follow_lights(medium, lights), receive_light(cells, lights, 0)
     skies = tuple(light for light in lights if isinstance(light, Sky))

@@ -158,5 +158,5 @@ def send_down(
     received = torch.tensordot(values, fill(light_field.received.source, degree), 1)
     received = _unpeaked_share(light_field.medium) * received
     diffuse = (diffuse + period.extend(received)).flatten(0, 1)
-    others = replace(light_field, beams=(), at_faces=None)
-    return replace(send(others, bundles[0]), diffuse=diffuse)
+    beamless = replace(light_field, beams=(), at_faces=None)
+    return replace(send(beamless, bundles[0]), diffuse=diffuse)

@@ -13,20 +13,18 @@ from ddrecon.pictures.scales import Scale, scale_of
 from ddrecon.pictures.similarity import structural_similarity
 
 HUBER = 0.05
-"""Errors above this part of the targets' root mean square count linearly in the Huber loss."""
+"""Errors above this share of the target's scale count linearly in the Huber loss."""
 RELATIVE = 0.05
-"""The same part, added to a pixel's target, keeps relative errors finite where targets are black.
-"""
+"""This share of the target's scale keeps relative errors finite where targets are black."""
 SMALL = 1e-3
-"""Errors below this part of the targets' root mean square are as good as none."""
+"""Errors below this share of the target's scale are as good as none."""
 WHITE = 1 - 1e-4
 """A displayed target this bright says only that it is at least white."""
 
 
 def l2(error: Tensor, target: Target) -> Tensor:
-    """The square of each entry of `error`, by the slope of the scale at the target.
-
-    That is 1 but for the loss `photon`, whose errors are in units of the noise there (E9.2).
+    """The square of `error` times the slope of the target's scale: 1, but for the loss `photon`,
+    whose errors are in units of the noise there (E9.2).
     """
     return (error * target.slope) ** 2
 
@@ -47,9 +45,8 @@ def huber(error: Tensor, target: Target) -> Tensor:
 
 
 def relative_l2(error: Tensor, target: Target) -> Tensor:
-    """The square of `error` over the target, so that dark pixels count as much as bright ones.
-
-    The quotient is multiplied by the target's scale, and the target raised by `RELATIVE` of it.
+    """The square of `error` over the target, so that dark pixels count as much as bright ones, in
+    units of the target's scale.
     """
     return (error / (target.image.abs() + RELATIVE * target.scale)) ** 2 * target.scale**2
 
@@ -57,9 +54,8 @@ def relative_l2(error: Tensor, target: Target) -> Tensor:
 def display(error: Tensor, target: Target) -> Tensor:
     """The square of `error` in displayed values, by the slope of sRGB at the target (E9.3).
 
-    So it is quadratic however far off an image is: the curve itself would be steep where an image
-    is still black, and flat where it is too bright. What is brighter than a target that is white
-    does not err.
+    It is quadratic however far off an image is: the curve itself would be steep where an image is
+    still black, and flat where it is too bright. Pixels brighter than a white target do not err.
     """
     return l2(torch.where(target.image >= WHITE, error.clamp(max=0), error), target)
 
@@ -78,10 +74,10 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
 class Target:
     """What images are compared with, `image` [3, h, w] (linear radiance), and how: by a `loss`.
 
-    `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
-    numbers that do; `scale`: the root of their mean square. Quality is told on the scale `on`:
-    `compared` is the image on it, `slope` its derivative there, and `peak` the largest value that
-    counts.
+    `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: how
+    many numbers count; `scale`: the root of their mean square. Quality is measured on the scale
+    `on`: `compared` is the image on it, `slope` its derivative there, and `peak` the largest value
+    that counts.
     """
 
     loss: str

@@ -8,17 +8,21 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import torch
 
-GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-"""Where Linux has its control groups, and says in which this process is."""
-LIMITS = {"memory.max": "anon", "memory.limit_in_bytes": "total_rss"}
-"""The file of a group's limit, by either version, and what its memory.stat calls the memory in use.
+from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.settings import DiffusionSettings
 
-Files that the system keeps in memory count as free.
+GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""The control groups of Linux, and the file that names those of this process."""
+LIMITS = {"memory.max": "anon", "memory.limit_in_bytes": "total_rss"}
+"""The limit of a group, by either version, and the memory in use in its memory.stat, caches apart.
 """
+QUOTAS = (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"])
+"""The files of a group's quota and period of processor time, by either version."""
 OVERHEAD = 1.5
 """How many times as much as is alive the process holds."""
 IN_PIXEL = 18
@@ -26,7 +30,7 @@ IN_PIXEL = 18
 SHORTAGE = "(out of|not enough) memory|(can.t|failed to) allocate|bad.?alloc|alloc_(cpu|failed)"
 """What torch and Warp say, in one place or another, where they get no memory."""
 _latest: list[Needs] = []
-"""Those of the scene that was built last: a shortage may come anywhere later."""
+"""The needs of the scene that was built last: a shortage may come anywhere later."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +58,34 @@ class Needs:
             yield "--dtype float32"
         pixels = replace(self, resolution=(0, 0, 0)).total
         cells = self.total - pixels
-        share = ((limit - pixels) / cells) ** (1 / 3) if limit > pixels else 0.0
-        if (coarser := [int(share * n) for n in self.resolution]) and min(coarser) > 0:
+        share = (max(0, limit - pixels) / cells) ** (1 / 3)
+        coarser = [int(share * cells_along) for cells_along in self.resolution]
+        if min(coarser) > 0:
             yield f"volume.resolution: {coarser}"
         if pixels and cells < limit:
             share = math.sqrt((limit - cells) / pixels)
             yield f"images of {math.floor(100 * share)}% the width and height"
 
 
-def numbers_in_cell(colors: int, varied: int, moments: int, is_limited: bool) -> float:
-    """How many numbers are alive in each cell at the peak, of which so many are `varied`.
+def numbers_in_cell(
+    colors: int, varied: int, is_directed: bool, settings: DiffusionSettings
+) -> float:
+    """How many numbers are alive in each cell of light at the peak, of which so many are `varied`.
 
-    `moments`: of light that transport rounds keep, 0 without rounds; `is_limited`: by flux-limited
-    diffusion. Fitted to arrays that `benchmarks/memory.py --count` finds alive.
+    `is_directed`: whether light scatters unevenly. The coefficients are fitted to what
+    `benchmarks/memory.py --count` finds alive.
     """
-    often = 12 * is_limited + (10 + moments) * (moments > 0)
-    if not varied:
-        return 16 + colors * (8 + often)
-    return 24 + colors * (12 + 2.5 * often) + 10 * varied
+    moments = count_harmonics(settings.angles) if is_directed else 1
+    rendered = 18 + 1.5 * moments
+    if settings.model == "flux_limited":
+        rendered += 12
+    elif settings.rounds:
+        rendered += 13 + 1.2 * moments
+    return colors * rendered * (2 if varied else 1) + 13 * varied
 
 
 def refuse_excess(needs: Needs, device: torch.device) -> str | None:
-    """What to say of a scene that does not fit into the free memory of `device`; None if it does.
-
-    The scene's `needs` are remembered for `explain_shortage`.
-    """
+    """What to say of a scene whose `needs` exceed the free memory of `device`; None if it fits."""
     _latest[:] = [needs]
     free = free_memory(device)
     if free is None or needs.total <= free:
@@ -103,22 +110,19 @@ def explain_shortage(error: BaseException) -> str | None:
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Bytes that this process can still take on `device`, by the system and by the limits of
-    control groups; None if unknown.
-    """
+    """Bytes free on `device`, by the system and by limits of control groups; None if unknown."""
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return int(free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device))
     amounts = []
     with suppress(OSError, ValueError):
-        text = Path("/proc/meminfo").read_text()
-        [kibibytes] = re.findall(r"MemAvailable: *(\d+)", text)
+        [kibibytes] = re.findall(r"MemAvailable: *(\d+)", Path("/proc/meminfo").read_text())
         amounts.append(1024 * int(kibibytes))
-    for limit, used in LIMITS.items():
-        for allowed, text in _group_files(limit, "memory.stat"):
-            with suppress(ValueError, TypeError):  # "max" is no number; `used` may be missing
-                in_use = re.search(rf"^{used} (\d+)$", text, re.MULTILINE)
-                amounts.append(int(allowed) - int(in_use[1]))  # type: ignore[index]
+    for folder, (limit, used) in product(_control_groups(), LIMITS.items()):
+        with suppress(OSError, ValueError):  # "max" is no number
+            statistics = (folder / "memory.stat").read_text()
+            [in_use] = re.findall(rf"^{used} (\d+)$", statistics, re.MULTILINE)
+            amounts.append(int((folder / limit).read_text()) - int(in_use))
     return min(amounts, default=None)
 
 
@@ -126,24 +130,20 @@ def usable_cores() -> int:
     """How many cores this process may use, by its affinity and the quotas of its control groups."""
     has_affinity = hasattr(os, "sched_getaffinity")
     cores = [len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1]
-    for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
-        for texts in _group_files(*names):
-            with suppress(ValueError):  # "max" is no number
-                quota, period = map(int, " ".join(texts).split())
-                cores += [math.ceil(quota / period)] * (quota > 0)
+    for folder, names in product(_control_groups(), QUOTAS):
+        with suppress(OSError, ValueError):  # "max" is no number
+            quota, period = map(int, " ".join((folder / n).read_text() for n in names).split())
+            cores += [math.ceil(quota / period)] * (quota > 0)
     return min(cores)
 
 
-def _group_files(*names: str) -> Iterator[list[str]]:
-    """The contents of the files `names` in each control group that holds this process."""
+def _control_groups() -> Iterator[Path]:
+    """The folders of all control groups that hold this process."""
     lines = OWN_GROUPS.read_text().splitlines() if OWN_GROUPS.exists() else []
     for _, kinds, path in (line.split(":", 2) for line in lines):
         top = GROUPS / kinds  # version 2 has no kinds: all its groups are in one tree
         inner = top / path.lstrip("/")
-        for folder in (inner, *inner.parents):
-            if folder.is_relative_to(top):
-                with suppress(OSError):
-                    yield [(folder / name).read_text() for name in names]
+        yield from (folder for folder in (inner, *inner.parents) if folder.is_relative_to(top))
 
 
 def gibibytes(amount: int) -> str:

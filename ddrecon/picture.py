@@ -93,8 +93,8 @@ def view_image(
     often = diffusing, _without_background(scene), camera, None
     varied, fixed = (single, often) if derivatives == "single" else (often, single)
     with torch.no_grad():
-        rest = _collect(*fixed).detach()
-    return _collect(*varied) + rest
+        constant = _collect(*fixed).detach()
+    return _collect(*varied) + constant
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -122,15 +122,15 @@ def _without_glow(light_field: LightField) -> LightField:
 
 
 def _without_diffuse(light_field: LightField) -> LightField:
-    """What comes in through faces is then what the medium would emit there."""
+    """`light_field` without diffuse light; faces then let in what the medium would emit there."""
     nothing, faces = torch.zeros_like(light_field.diffuse[:1]), light_field.at_faces
     if faces is not None and light_field.medium.emission is not None:
         faces = FaceLight(torch.zeros_like(faces.outside), nothing)
     else:
         faces = None
     leaving = None if light_field.leaving is None else nothing
-    others = replace(light_field, diffuse=nothing, skies=(), turned=())
-    return replace(others, at_faces=faces, leaving=leaving)
+    light_field = replace(light_field, diffuse=nothing, skies=(), turned=())
+    return replace(light_field, at_faces=faces, leaving=leaving)
 
 
 def _collect(

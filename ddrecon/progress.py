@@ -1,4 +1,4 @@
-"""How work that takes long shows how far it is: whoever asks for it hands in what shows it."""
+"""Progress bars: who asks for long work hands in the function that shows its progress."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 IN_A_LOG = 30.0
 """Seconds between two states of a bar in a file, each of which is a line there."""
 LONG = 2.0
-"""After so many seconds it is said what is being done."""
+"""Seconds after which `tell` says what is being done."""
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
-"""A bar beside which there is room for what it says, in 80 columns."""
+"""The format of a bar that leaves room for a postfix in 80 columns."""
 
 
 def bar_settings(is_quiet: bool) -> dict[str, Any]:

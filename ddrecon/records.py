@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import MISSING, Field, field, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
 from types import NoneType, UnionType
@@ -21,6 +21,8 @@ LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
     "below": ("below", operator.lt),
 }
 """What a bound in a field's metadata means."""
+WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+"""What values of plain types are called."""
 Violation = tuple[str, str]
 """The key of a record that breaks a rule, and what is wrong with its value."""
 type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
@@ -29,13 +31,15 @@ type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 class Limits(TypedDict, total=False):
     """Limits of each number of a field; `minimum` and `maximum` are legal, the others are not.
 
-    The manual has `expert` fields on a page of their own: no scene needs these.
+    Of a vector that `is_nonzero` one entry is not 0. The manual has `expert` fields on a page of
+    their own: no scene needs these.
     """
 
     minimum: float
     above: float
     maximum: float
     below: float
+    is_nonzero: bool
     expert: bool
 
 
@@ -49,6 +53,11 @@ def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
     return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
 
 
+def is_required(key: Field[Any]) -> bool:
+    """Whether `key` has no default."""
+    return key.default is key.default_factory is MISSING
+
+
 @cache
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that `hint` allows."""
@@ -58,10 +67,9 @@ def alternatives(hint: Any) -> tuple[Any, ...]:
 def faults_of(
     record: Any, name: str = "", keys: Collection[str] | None = None
 ) -> Iterator[Violation]:
-    """The keys of `record`, a dataclass called `name`, with values that are not of their types or
-    not within their limits, in records within it as well; and what is wrong with each.
+    """What is wrong in `record`, a dataclass called `name`, or in its `keys`, and in those within.
 
-    Of the record itself only `keys` are looked at, None for all.
+    Values are to be of their types and within their limits.
     """
     hints = type_hints(type(record))
     for key in (key for key in fields(record) if keys is None or key.name in keys):
@@ -83,7 +91,8 @@ def _find_faults(
     elif is_dataclass(value):
         yield from faults_of(value, name)
     elif isinstance(value, Real) and not isinstance(value, bool):
-        yield from ((name, what) for what in _excesses(float(value), limits))
+        if fault := find_excess(float(value), limits):
+            yield name, fault
     elif get_args(kind) and isinstance(value, Mapping):
         for key, entry in value.items():
             yield from _find_faults(f"{name}.{key}", entry, get_args(kind)[1], limits)
@@ -91,6 +100,16 @@ def _find_faults(
         for index, entry in enumerate(value):
             key = getattr(entry, "name", index)
             yield from _find_faults(f"{name}.{key}", entry, get_args(kind)[0], limits)
+
+
+def find_excess(number: float, limits: Mapping[str, Any]) -> str:
+    """What is wrong with `number` by `limits`, empty where nothing is."""
+    if not math.isfinite(number):
+        return f"must be finite, found {number:g}"
+    for key, (words, is_within) in LIMITS.items():
+        if limits.get(key) is not None and not is_within(number, limits[key]):
+            return f"must be {words} {limits[key]:g}, found {number:g}"
+    return ""
 
 
 def _is_of(value: Any, kind: Any) -> bool:
@@ -113,16 +132,5 @@ def _describe(kind: Any) -> str:
     """What a value of the type `kind` is, in words."""
     if get_origin(kind) is tuple:
         return f"{'' if Ellipsis in get_args(kind) else len(get_args(kind))} numbers".strip()
-    words = {float: "a number", int: "a whole number", bool: "True or False", str: "text"}
     name = getattr(get_origin(kind) or kind, "__name__", str(kind))
-    return words.get(kind) or ("a tensor" if name == "Tensor" else name)
-
-
-def _excesses(number: float, limits: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with `number` by `limits`."""
-    if not math.isfinite(number):
-        yield f"must be finite, found {number:g}"
-        return
-    for key, (words, is_within) in LIMITS.items():
-        if limits.get(key) is not None and not is_within(number, limits[key]):
-            yield f"must be {words} {limits[key]:g}, found {number:g}"
+    return WORDS.get(kind, "a tensor" if name == "Tensor" else name)

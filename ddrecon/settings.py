@@ -24,10 +24,13 @@ LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2"
 class RenderSettings:
     """How view rays are sampled.
 
-    `steps_per_voxel` is chosen by the medium where it is None. Pixels closer together than half a
-    voxel are interpolated between rays half a voxel apart, unless that may change a pixel by more
-    than `tolerance` of the image's root mean square; 0 gives every pixel a ray of its own.
-    `background`: ambient light and environment maps are also seen directly.
+    samples_per_pixel: Rays a pixel, over its area; one goes through its center.
+    steps_per_voxel: Samples a cell along a ray. Left out: 2 where a cell is thicker than 0.75
+        optical depths in the scene as its file has it, else 1.
+    tolerance: Pixels finer than half a cell are interpolated between rays, but where they may
+        change by more than this part of the image's root mean square. 0: every pixel has a ray of
+        its own.
+    background: Whether ambient light and environment maps are seen behind the volume.
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
@@ -43,15 +46,24 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How multiply scattered light is computed.
+    """How light that is scattered more than once is found. [Settings](settings.md) says how to
+    choose.
 
-    `tolerance` is the relative residual of each linear solve; a reconstruction solves less closely
-    where its gradient needs no more. The scheme `printed` is the paper's own, always with the
-    closure `smooth`, whose empty space has the optical thickness `floor`; the model `flux_limited`
-    has no closure. `transport_rounds` of sweeps take P1 towards transport, with angles up to
-    `degree`; with a `transport_tolerance` rounds end where one changes light by less of it
-    (docs/theory.md, section 7). Cells of light are `refine` times as narrow along `refine_along`.
-    What is None is chosen by the medium.
+    model: `none` leaves such light out; `flux_limited` is the paper's for thin smoke.
+    scheme: `printed` is the paper's own discretization, for comparison.
+    closure: What the diffusion coefficient becomes in empty space.
+    floor: Of the smooth closure.
+    tolerance: Relative residual of a solve.
+    warm_start: Whether a solve begins at the last one's solution.
+    transport_rounds: Sweeps along rays that take diffusion towards the transport equation. Left
+        out: 1 to 5, by the medium ([settings](settings.md#what-the-medium-chooses)).
+    transport_tolerance: Rounds end where one changes light by less of it, at most
+        `transport_rounds` of them, left out 16. `render.json` has how many there were, and their
+        residual.
+    degree: Degree to which such sweeps keep light's angles, along 44 directions, 86 for 7; of a
+        single round 18 for 1, 26 for 3. Left out: by the medium.
+    refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
+    refine_along: The axes along which cells are divided.
     """
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
@@ -102,7 +114,11 @@ class DiffusionSettings:
 
 @dataclass(frozen=True)
 class FieldFile:
-    """Values per cell from a volume file, which calls them `name` (None: as the scene does)."""
+    """A field from a volume file, in one of these [formats](formats.md).
+
+    file: Relative to the scene file.
+    name: The field's name in the file, where that is not its name here.
+    """
 
     file: Path
     name: str | None = None
@@ -121,13 +137,19 @@ MARGIN = 2.0
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """How one parameter is optimized.
+    """Settings of one parameter; all may be left out, `{}`.
 
-    It starts from `init` (None: the scene's own value) and stays within [`min`, `max`]. `field`:
-    whether it differs from cell to cell (None: if its start does; density always does). `tv` weighs
-    its total variation, of density by E11.3; 1 weighs it as much as the whole brightness of the
-    targets. `support`: density is 0 outside what pictures show, by `masks` or, `auto`, by what is
-    brighter than black, widened by `support_margin` pixels, or `MARGIN`; None allows it anywhere.
+    init: Where it starts; at the scene's own value unless given.
+    min: Its smallest value.
+    max: Its largest value.
+    tv: Weight of its total variation, which smooths a field. 1 would weigh as much as the whole
+        brightness of the pictures. Unless given, 0.003 for density and emission, of whose logarithm
+        it is (E11.3), three times that for an emission that is the only field, and 0 for others.
+    field: Whether it differs from cell to cell, as density always does; left out: as its start.
+    support: For density: where it may be above 0. `masks`: nowhere that a view sees and its mask,
+        or alpha, says is empty; `auto`: nor where it is as dark as it is away from smoke, within
+        noise. Left out: anywhere.
+    support_margin: Pixels by which that is widened, as many as cameras may be off; 2 unless given.
     """
 
     init: Start | None = None
@@ -156,9 +178,10 @@ class ParameterSettings:
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """How pictures err: `read`, the standard deviation at black, and `shot`, variance by radiance.
+    """In units of linear values, of which 1 is white in an sRGB file.
 
-    Both are in units of a picture's linear values, of which 1 is white.
+    read: Standard deviation of black.
+    shot: Variance by radiance, of the photons that are counted.
     """
 
     read: float = bounded(0.0, minimum=0)
@@ -171,13 +194,15 @@ class NoiseSettings:
 
 @dataclass(frozen=True)
 class OptimizeSettings:
-    """What is optimized, and how.
+    """What `ddrecon optimize` finds, and how.
 
-    `iterations`: the most; with `auto` a run ends when it is done, see `reconstruct.schedule`.
-    `loss`: None is chosen by the kind of pictures. `noise`: of all pictures without their own, for
-    the loss `photon` and to know when only noise is left. `derivatives`: the radiance that passes
-    derivatives on: all of it, that scattered once, or that of the diffusion (the paper's Fig. 9).
-    `keep_start`: the share of the fields' start that is mixed into them in the end.
+    parameters: What to find: names, as in the last table, with their settings.
+    iterations: The most. With `auto` a run ends by itself: [when to stop](settings.md#when-to-stop).
+    loss: What is made small, as a mean over pixels. Unless given, `display` where pictures are sRGB
+        files, `l2` where they are linear. [Settings](settings.md) says more.
+    noise: How pictures err, for `loss: photon` and `ddrecon uncertainty`; estimated unless given.
+    derivatives: Light that passes derivatives on: all, that scattered once, or the diffusion's.
+    keep_start: The share of the fields' start that is mixed into the result, as in a film's frames.
     """
 
     parameters: Mapping[str, ParameterSettings]

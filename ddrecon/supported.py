@@ -29,44 +29,45 @@ def require_above(scene: Scene) -> None:
 
 
 def _unsupported(scene: Scene) -> Iterator[str]:
-    settings, grid = scene.diffusion, scene.volume.grid
+    settings, grid, ground = scene.diffusion, scene.volume.grid, scene.ground
+    is_printed, is_limited = settings.scheme == "printed", settings.model == "flux_limited"
     if settings.model != "none":  # whose rounds nobody makes
-        yield from (f"diffusion.{key}: {what}" for key, what in settings.violations())
-    if scene.ground is not None and settings.scheme == "printed":
-        yield "ground: the printed scheme has none; leave diffusion.scheme out"
-    if scene.ground is not None and scene.ground.plane.height > grid.lower[scene.ground.plane.axis]:
-        plane, bottom = scene.ground.plane, grid.lower[scene.ground.plane.axis]
-        yield (
-            f"ground.height: {plane.height:g} is above the bottom of the box, {bottom:g} along "
-            f"{'zyx'[plane.axis]}; a ground lies there or below"
-        )
+        yield from (f"diffusion.{key}: {problem}" for key, problem in settings.violations())
+    if ground is not None:
+        if is_printed:
+            yield "ground: the printed scheme has none; leave diffusion.scheme out"
+        axis, height = ground.plane.axis, ground.plane.height
+        if height > grid.lower[axis]:
+            yield (
+                f"ground.height: {height:g} is above the bottom of the box, {grid.lower[axis]:g} "
+                f"along {'zyx'[axis]}; a ground lies there or below"
+            )
     if grid.periodic:
-        yield from _cannot_repeat(scene)
-    has_points = any(isinstance(light, PointLight) for light in scene.lights)
+        if is_printed or is_limited:
+            yield "diffusion: volume.periodic is for model p1 with scheme conservative, or none"
+        yield from _unrepeated(scene)
     refracted = {
-        "ground": scene.ground is not None,
-        "diffusion.scheme: printed": settings.scheme == "printed",
-        "diffusion.model: flux_limited": settings.model == "flux_limited",
-        "point lights": has_points,
+        "ground": ground is not None,
+        "diffusion.scheme: printed": is_printed,
+        "diffusion.model: flux_limited": is_limited,
+        "point lights": any(isinstance(light, PointLight) for light in scene.lights),
     }
-    for what in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
-        yield f"volume.index: there is none with {what}"
+    for name in [name for name, is_so in refracted.items() if is_so and scene.volume.index != 1]:
+        yield f"volume.index: there is none with {name}"
 
 
-def _cannot_repeat(scene: Scene) -> Iterator[str]:
+def _unrepeated(scene: Scene) -> Iterator[str]:
     """What there is not in a volume that is periodic."""
-    settings, axes = scene.diffusion, scene.volume.grid.periodic
-    if settings.scheme == "printed" or settings.model == "flux_limited":
-        yield "diffusion: volume.periodic is for model p1 with scheme conservative, or none"
-    for index, light in enumerate(scene.lights):
+    for number, light in enumerate(scene.lights):
         if isinstance(light, PointLight | BeamLight):
-            kind, what = type(light).__name__, "does not repeat as the volume does"
-            yield f"lights.{index}: a {kind} {what}; leave volume.periodic out"
-    if scene.ground is not None and scene.ground.plane.axis in axes:
-        name = "zyx"[scene.ground.plane.axis]
-        yield f"ground: lies across {name}, along which the volume is periodic"
-    if scene.ground is not None and scene.ground.albedo.ndim > 1:
-        yield "ground.albedo: a map does not repeat as the volume does: give a number"
+            problem = f"a {type(light).__name__} does not repeat as the volume does"
+            yield f"lights.{number}: {problem}; leave volume.periodic out"
+    if scene.ground is not None:
+        axis = scene.ground.plane.axis
+        if axis in scene.volume.grid.periodic:
+            yield f"ground: lies across {'zyx'[axis]}, along which the volume is periodic"
+        if scene.ground.albedo.ndim > 1:
+            yield "ground.albedo: a map does not repeat as the volume does: give a number"
     if scene.volume.index != 1:
         yield "volume.index: faces that repeat refract nothing: leave index or periodic out"
     for name, parameter in scene.optimize.parameters.items() if scene.optimize else ():

@@ -15,7 +15,7 @@ from ddrecon.scene import Scene, View
 def upright_axis(scene: Scene) -> int:
     """Which of x, y, z (0, 1, 2) points up in `scene`.
 
-    Where it does not say, it is the one nearest to the sum of its cameras' up vectors.
+    A scene that does not say has the one nearest to the sum of its cameras' up vectors.
     """
     if scene.up is not None:
         return scene.up
@@ -37,8 +37,6 @@ def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
     They are called `ring_000`, which is that of `view`, `ring_001` and so on.
     """
     axis, center = upright_axis(scene), scene.volume.grid.center_xyz
-    turned = (
-        turn_camera(view.camera, axis, 2 * math.pi * index / count, center)
-        for index in range(count)
-    )
-    return [View(f"ring_{index:03d}", camera) for index, camera in enumerate(turned)]
+    angles = (2 * math.pi * number / count for number in range(count))
+    cameras = (turn_camera(view.camera, axis, angle, center) for angle in angles)
+    return [View(f"ring_{number:03d}", camera) for number, camera in enumerate(cameras)]

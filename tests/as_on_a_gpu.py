@@ -37,9 +37,9 @@ def as_on_a_gpu(order: str = "forward") -> Iterator[Collection[Any]]:
     """
     kernels: dict[Any, None] = {}
 
-    def launch(kernel: Any, count: int, arguments: Any, _: Tensor, threads: Any = None) -> None:
+    def launch(kernel: Any, count: int, records: Any, _: Tensor, threads: Any = None) -> None:
         assert threads in (None, 1), "a GPU has no shares"
-        (record,) = arguments(0) if callable(arguments) else arguments
+        (record,) = records
         kernels[kernel] = None
         wp.launch(_reordered(kernel), count, [ORDERS[order](count), count, record], device="cpu")
 

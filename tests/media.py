@@ -1,7 +1,7 @@
 """Small random media, operators, cameras and scenes."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
-from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight
 from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
@@ -19,12 +19,12 @@ from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
-from ddrecon.picture import view_picture
+from ddrecon.picture import render, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.tangents import varied
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import value_of, with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -64,6 +64,14 @@ def make_camera(
     origin = torch.tensor(eye, dtype=kind.get("dtype", torch.float64))
     pose = look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0]))
     return Camera(pose, size, half_width, is_perspective)
+
+
+def light_of(
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48, up: str = "y"
+) -> EnvironmentLight:
+    """The light of a map `radiance` [C, h, w]."""
+    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
+    return EnvironmentLight(radiance, *numbers, directions, up)
 
 
 def make_scene(
@@ -109,7 +117,8 @@ def march_rays(
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid), grid.periodic)
+    loss = absorption + boundary_loss(diffusion, grid)
+    return Operator((z, y, x), loss, grid.periodic, grid.spacing)
 
 
 def solve_by_gradients(operator: Operator, source: Tensor, tolerance: float) -> tuple[Tensor, int]:
@@ -189,6 +198,21 @@ def assert_derivatives(
     assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
 
 
+def weights_of(image: Tensor) -> Tensor:
+    """Those of a functional of `image` that asks nothing of its first two rows."""
+    weights = random_values(*image.shape, seed=3).to(image)
+    weights[..., :2, :] = 0
+    return weights
+
+
+def image_gradients(scene: Scene, names: Sequence[str]) -> tuple[Tensor, list[Tensor]]:
+    """The images of `scene`, and the derivatives of a functional of them by variables."""
+    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
+    images = render(with_values(scene, leaves))
+    loss = (images * weights_of(images)).sum()
+    return images.detach(), list(torch.autograd.grad(loss, list(leaves.values())))
+
+
 def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
     """J^T W J times `vector` (E11.1): by a tangent and an adjoint."""
     changes, weighted = curvature.split(vector), {}
@@ -205,5 +229,8 @@ def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
     """S(x, w) of E8.7, [C, ...], term by term, at `depth` x [C or 1, ...] and `cosine`."""
+    if has_cells := seen.phase.cells is not None:
+        depth, cosine = depth[..., None], cosine[..., None]
     weights = peaked_series(seen.phase, seen.degree, depth[..., None])
-    return (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)
+    total = (weights * legendre(cosine, weights.shape[-1])).sum(-1).clamp(min=0)
+    return total[..., 0] if has_cells else total

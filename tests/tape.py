@@ -66,13 +66,14 @@ def record(computation: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
     computation()
     tape, call = Tape(), launch._call
 
-    def call_again(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
-        # What a kernel is given may be changed for its next launch.
-        first, *records = given
-        copies = [type(one).from_buffer_copy(one) for one in records]
-        tape.alive.append(given)
-        tape.steps.append(lambda: call(kernel, device, items, [first, *copies], stream))
-        call(kernel, device, items, given, stream)
+    def call_again(
+        kernel: Any, device: Any, first: int, items: int, record: Any, stream: Any
+    ) -> None:
+        # A kernel's record may be changed for its next launch.
+        copy = type(record).from_buffer_copy(record)
+        tape.alive.append(record)
+        tape.steps.append(lambda: call(kernel, device, first, items, copy, stream))
+        call(kernel, device, first, items, record, stream)
 
     with tape, patch.object(launch, "_call", call_again):
         result = computation()

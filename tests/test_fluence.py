@@ -79,9 +79,12 @@ def test_what_a_beam_loses_is_absorbed_and_the_rest_leaves_by_the_other_face() -
         assert tensor(*record["defect_percent"]).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("sigma_a", [(0.0,), (0.5, 1.0, 2.0)], ids=["no absorption", "absorption"])
-@pytest.mark.parametrize("g", [0.0, 0.8, -0.6])
-@pytest.mark.parametrize("light", [DOWN, WIDE, PENCIL], ids=["sun", "beam", "pencil"])
+WHITE, COLORED = (0.0,), (0.5, 1.0, 2.0)
+SUNLIT = [(DOWN, g, sigma_a) for g in (0.0, 0.8, -0.6) for sigma_a in (WHITE, COLORED)]
+BEAMED = [(WIDE, 0.8, COLORED), (WIDE, -0.6, WHITE), (PENCIL, 0.8, WHITE), (PENCIL, -0.6, COLORED)]
+
+
+@pytest.mark.parametrize(("light", "g", "sigma_a"), [*SUNLIT, *BEAMED])
 def test_what_enters_is_absorbed_or_leaves(
     light: Light, g: float, sigma_a: tuple[float, ...]
 ) -> None:

@@ -164,8 +164,8 @@ def test_light_through_what_is_no_number_is_none(engine: str):
 def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
     like, started, done = torch.zeros(1), threading.Event(), threading.Event()
 
-    def fake(_kernel: object, _size: int, given: list[int], **_: object) -> None:
-        if given[0] == 0:
+    def fake(_kernel: object, _size: int, arguments: list[int], **_: object) -> None:
+        if arguments[0] == 0:
             started.wait(10)
             raise ValueError("no")
         started.set()
@@ -175,7 +175,7 @@ def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(launch.wp, "launch", fake)
     monkeypatch.setattr(launch, "load", lambda *_: None)
     with pytest.raises(ValueError, match="no"):
-        launch.launch(None, 2, [], like, threads=2)
+        launch.launch(None, 2, [None], like, threads=2)
     assert done.is_set()
 
 

@@ -46,7 +46,7 @@ WRONG: list[tuple[dict[str, Any], str, str]] = [
     ({"size": (0, 2)}, "size.0", "must be at least 1, found 0"),
     ({"steps": (0.1, math.nan)}, "steps.1", "must be finite, found nan"),
     ({"kind": "c"}, "kind", "expected one of a, b, found 'c'"),
-    ({"is_on": None}, "is_on", "expected True or False, found None"),
+    ({"is_on": None}, "is_on", "expected true or false, found None"),
     ({"leaves": [None]}, "leaves.0", "expected Leaf, found None"),
     ({"leaves": [Leaf("x", 0.0)]}, "leaves.x.share", "must be above 0, found 0"),
     ({"named": {"y": Leaf("x", "z")}}, "named.y.share", "expected a number, found 'z'"),  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import pytest
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.losses import LOSSES
-from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
+from ddrecon.scene_file.view_schema import FisheyeSection, OpencvSection
 from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
 from ddrecon.transport.sweep import DIRECTIONS
 

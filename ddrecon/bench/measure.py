@@ -54,10 +54,9 @@ class Row:
     """One variant, or path tracing; errors are relative RMS, None where nothing is to compare with.
 
     Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
-    `gradient_numerical` are against the same model solved exactly. `image_error` is against path
+    `gradient_numerical` are against the same model solved exactly; `image_error` is against path
     tracing, whose `image_noise` is subtracted in quadrature. `iterations` are the first solve's, or
-    samples a pixel. `is_best`: no other row is faster and as close to the truth, as far as that can
-    be told.
+    samples a pixel. `is_best`: no other row is known to be faster and as close to the truth.
     """
 
     name: str
@@ -72,9 +71,8 @@ class Row:
 
     @property
     def error(self) -> float:
-        """The error against path tracing, or else against the exact solution; or else infinity.
-
-        What path tracing cannot tell from none counts as the least that it can.
+        """The error against path tracing, at least what that can tell from none, or else against
+        the exact solution, or else infinity.
         """
         if self.image_error is not None:
             return max(self.image_error, least_error(self.image_noise))
@@ -150,8 +148,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 place = seconds, max(error, LEAST_DRAWN)
                 axis.plot(*place, "o", color=f"C{number % 10}", label=f"{number}  {row.name}")
                 axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
-    for axis, what in zip(axes, ("an image", "an image and its gradient"), strict=True):
-        axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")
+    for axis, timed in zip(axes, ("an image", "an image and its gradient"), strict=True):
+        axis.set(xscale="log", yscale="log", xlabel=f"seconds of {timed}", ylabel="relative error")
         axis.grid(which="major", alpha=0.3)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     with replace_file(path) as temporary:
@@ -161,16 +159,14 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 def variants_of(scene: Scene, is_quick: bool) -> dict[str, Change]:
     """What makes the variants of `scene`, by name: itself first, then all that differ from it."""
-    base, settings = {"base": lambda scene: scene}, _settings(scene)
-    return base | {
-        name: change for name, change in _changes(is_quick) if _settings(change(scene)) != settings
-    }
+    settings = _settings(scene)
+    changes = (item for item in _changes(is_quick) if _settings(item[1](scene)) != settings)
+    return {"base": lambda scene: scene, **dict(changes)}
 
 
 def exact_scene(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows.
-
-    It is marched in finer steps, ray by ray.
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
+    marched in finer steps, ray by ray.
     """
     steps = max(EXACT_STEPS, scene.render.steps)
     render = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
@@ -218,10 +214,8 @@ def _settings(scene: Scene) -> tuple[object, ...]:
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean.
-
-    `gradient` is by density; None of path tracing. `iterations` are the first solve's, or samples a
-    pixel.
+    """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean by
+    density, None of path tracing. `iterations` are the first solve's, or samples a pixel.
     """
 
     image: Tensor
@@ -258,18 +252,16 @@ def run_bench(
 
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
-    variants = variants_of(scene, is_quick)
-    exact = dict[str, Shot]()
+    contestants, exact = dict[str, Callable[[], Shot]](), dict[str, Shot]()
     solved = dict[tuple[object, ...], Shot]()  # alike models are solved once
+    variants = variants_of(scene, is_quick)
     for name, change in progress(list(variants.items()), "exact solutions"):
+        contestants[name] = partial(shoot, change(scene))
         reference = exact_scene(change(double))
         shape, _, diffusion = _settings(reference)
         if (shape, diffusion) not in solved:
             solved[shape, diffusion] = shoot(reference)
         exact[name] = solved[shape, diffusion]
-    contestants: dict[str, Callable[[], Shot]] = {
-        name: partial(shoot, change(scene)) for name, change in variants.items()
-    }
     truth = None
     if tracer is not None:
         paths = QUICK_PATHS if is_quick else PATHS
@@ -278,7 +270,8 @@ def run_bench(
         for samples in paths:
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
-    return with_best([row_of(name, each, exact.get(name), truth) for name, each in shots.items()])
+    rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
+    return with_best(rows)
 
 
 def measure(
@@ -286,8 +279,8 @@ def measure(
 ) -> dict[str, list[Shot]]:
     """The shots by name of all `contestants` that can be solved.
 
-    Each runs once in every turn, so that what else runs slows all alike. The first turn is not
-    counted: kernels are compiled in it.
+    All run once in every turn, so that other work on the machine slows all alike. The first turn,
+    in which kernels are compiled, is not counted.
     """
     shots: dict[str, list[Shot]] = {name: [] for name in contestants}
     schedule = [(turn, name) for turn in range(turns + 1) for name in contestants]
@@ -295,7 +288,7 @@ def measure(
         if turn == len(shots[name]):
             with suppress(SolveError):
                 shots[name].append(contestants[name]())
-    return {name: each[1:] for name, each in shots.items() if each}
+    return {name: series[1:] for name, series in shots.items() if series}
 
 
 def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced | None) -> Row:
@@ -307,8 +300,8 @@ def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced |
     if truth is not None:
         errors["image_error"] = truth.error(shot.image.numpy())
         errors["image_noise"] = truth.noise
-    image_seconds = median(each.image_seconds for each in shots)
-    both_seconds = median(each.image_seconds + each.gradient_seconds for each in shots)
+    image_seconds = median(shot.image_seconds for shot in shots)
+    both_seconds = median(shot.image_seconds + shot.gradient_seconds for shot in shots)
     return Row(name, image_seconds, both_seconds, shot.iterations, **errors)
 
 

@@ -29,10 +29,6 @@ def average_cells(medium: Medium) -> Medium:
 
 def average(field: Tensor) -> Tensor:
     """The mean in each cell of `field`, linear between centers and even beyond the outermost."""
-    if is_fused():
-        from ddrecon.diffusion.fused.around import means_fused
-
-        return means_fused(field)
     for axis in AXES:
         field = field + recompute(second_difference, field, axis) / 8
     return field
@@ -50,9 +46,8 @@ def sharpen(medium: Medium, means: Tensor) -> Tensor:
 
         numbers = (mean_width(grid) / THIN * extinction.scale).view(1, -1)
         numbers = for_channels(numbers.T, len(means)).T
-        given = "diffusion/fused/sharp.h", "Sharp", 1, numbers
-        bends = apply_around(bend, means, grid)
-        (light,) = apply_cell(*given, means, bends, extinction.field)
+        fields = means, apply_around(bend, means, grid), extinction.field
+        (light,) = apply_cell("diffusion/fused/sharp.h", "Sharp", 1, numbers, *fields)
         return light
 
     def find() -> Tensor:

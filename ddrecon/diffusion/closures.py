@@ -30,21 +30,14 @@ COARSE_CELLS = 32
 
 16, 32 and 64 render alike.
 """
-
-
 GAP = 1.0
 """In a box that repeats light spreads in gaps of so many times its thickness."""
 
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
     """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
-    least = least_extinction(grid, floor)
+    least = floor / min(grid.extent)
     return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
-
-
-def least_extinction(grid: Grid, floor: float) -> float:
-    """kappa_tr [1/u] that `smooth` gives empty space."""
-    return floor / min(grid.extent)
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -55,8 +48,8 @@ def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) ->
     continued to second order and stays positive.
     """
     # D = 1 / (spreading (1 + ratio)), with spreading = 4 / distance
-    weight = Coefficient(transport_extinction.new_ones(()), transport_extinction)
-    spreading = 4 * inverse_distance([weight], grid)
+    unit = transport_extinction.new_ones(())
+    spreading = 4 * inverse_distance([Coefficient(unit, transport_extinction)], grid)
     ratio = 3 * transport_extinction / spreading
     inverse = torch.where(ratio < 0, 1 - ratio + ratio**2, 1 / (1 + ratio.clamp(min=0)))
     return inverse / spreading
@@ -73,7 +66,9 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     if grid.periodic:
         sides = (side for axis, side in enumerate(grid.extent) if axis not in grid.periodic)
         return weight[0].field.new_full((1, *grid.shape), 1 / (GAP * min(sides)))
-    coarse, even = coarse_grid(grid), haze(grid)
+    coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
+    # The haze, kappa_tr [1/u] that cells have besides their own.
+    even = 3 * BACKGROUND / sum(grid.extent)
     masses = [(term.scale, adaptive_avg_pool3d(term.field, coarse.shape)) for term in weight]
     like = masses[0][1]
     potentials = even * _even_potential(coarse, like.dtype, like.device)
@@ -93,16 +88,6 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
 def _weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     unit = torch.eye(few, dtype=torch.float64)[None]
     return interpolate(unit, size=cells, mode="linear")[0].mT.to(device, dtype)
-
-
-def coarse_grid(grid: Grid) -> Grid:
-    """The grid on which distances in `grid` are computed."""
-    return grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
-
-
-def haze(grid: Grid) -> float:
-    """kappa_tr [1/u] that cells have besides their own, in distances only."""
-    return 3 * BACKGROUND / sum(grid.extent)
 
 
 def potential(mass: Tensor, grid: Grid) -> Tensor:
@@ -136,9 +121,9 @@ def _spectrum(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
     z, y, x = (_along(line, axis) for axis, line in enumerate(corners))
     radius = (z * z + y * y + x * x).sqrt()
     terms = torch.zeros_like(radius)
-    for one, two, three in ((z, y, x), (y, x, z), (x, z, y)):
-        terms += one * two * torch.asinh(three / torch.hypot(one, two))
-        terms -= one**2 / 2 * torch.atan(two * three / (one * radius))
+    for a, b, c in ((z, y, x), (y, x, z), (x, z, y)):
+        terms += a * b * torch.asinh(c / torch.hypot(a, b))
+        terms -= a**2 / 2 * torch.atan(b * c / (a * radius))
     kernel = -terms.diff(1, 0).diff(1, 2).diff(1, 4).squeeze((0, 2, 4)) / math.prod(grid.spacing)
     return torch.fft.rfftn(kernel.to(device, dtype))
 

@@ -19,8 +19,8 @@ from ddrecon.diffusion.operator import (
     AXES,
     Operator,
     boundary_loss,
-    cell_average,
     conductance,
+    face_average,
     face_fluxes,
 )
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
@@ -53,10 +53,10 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        if is_fused() and isinstance(self.closure, Closure):
+        if is_fused() and isinstance(self.closure, Closure) and self.closure.name == "geometric":
             from ddrecon.diffusion.fused.closure import close_medium
 
-            return close_medium(self.medium, self.closure)
+            return close_medium(self.medium)
         return recompute(lambda: self.closure(self.medium.transport_extinction))
 
     @property
@@ -67,52 +67,44 @@ class DiffusionProblem:
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E2.7."""
+        medium, diffusion, (mean, first) = self.medium, self.diffusion, self._source
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import assemble_system
 
-            z, y, x, loss, right = assemble_system(
-                self.medium, self.diffusion, self._source, self.outside
-            )
-            return self._operator(z, y, x, loss), self._with_emission(right)
-        z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
-        loss, right = recompute(
-            _loss_and_source, self.medium, self.diffusion, self._source[0], self.outside
-        )
-        if self._source[1] is not None:
-            right = right - self._spread(self._source[1])
-        return self._operator(z, y, x, loss), self._with_emission(right)
-
-    def _operator(self, z: Tensor, y: Tensor, x: Tensor, loss: Tensor) -> Operator:
-        return Operator((z, y, x), loss, self.medium.grid.periodic)
-
-    def _with_emission(self, right: Tensor) -> Tensor:
-        return right if self.medium.emission is None else right + self.medium.emission
+            *matrix, right = assemble_system(medium, diffusion, mean, first, self.outside)
+        else:
+            loss, right = recompute(_loss_and_source, medium, diffusion, mean, self.outside)
+            faces = (recompute(conductance, diffusion, medium.grid, axis) for axis in AXES)
+            matrix = [loss, *faces]
+            right = right if first is None else right - self._spread(first)
+        right = right if medium.emission is None else right + medium.emission
+        return Operator.of(medium.grid.periodic, medium.grid.spacing, {}, *matrix), right
 
     def flux(
-        self, mean: Tensor, more: Tensor | None = None, begun: Tensor | None = None, sign: int = 1
+        self, mean: Tensor, more: Tensor | None = None, before: Tensor | None = None
     ) -> Tensor | None:
-        """L1 of L0 = `mean`, with `more` flux in the source; None without directions.
+        """`before` + L1 of L0 = `mean`, with `more` flux in the source; None without directions.
 
-        Times the `sign`, and added to a flux that is `begun`. All three fluxes are given by their
-        moments of degree 1, [3, C, z, y, x].
+        All three fluxes are given by their moments of degree 1, [3, C, z, y, x].
         """
         if not self.has_flux:
             return None
+        fluxes = [moments for moments in (self._source[1], more) if moments is not None]
+        first = reduce(torch.add, fluxes) if fluxes else None
         if self._is_fused:
             from ddrecon.diffusion.fused.faces import find_flux
 
-            return find_flux(
-                self.medium, self.diffusion, self._source[1], self.outside, mean, more, begun, sign
-            )
-        sources = [one for one in (self._source[1], more) if one is not None]
-        fluxes = flux_along_axes(reduce(torch.add, sources)) if sources else [None] * 3
-        first = moments_of_flux(
+            return find_flux(self.medium, self.diffusion, mean, first, self.outside, before)
+        along_axes = [None] * 3 if first is None else flux_along_axes(first)
+        moments = moments_of_flux(
             [
-                recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
-                for axis, flux in zip(AXES, fluxes, strict=True)
+                recompute(
+                    _average_flux, self.medium, self.diffusion, flux, self.outside, mean, axis
+                )
+                for axis, flux in zip(AXES, along_axes, strict=True)
             ]
         )
-        return sign * first if begun is None else begun + sign * first
+        return moments if before is None else before + moments
 
     def right_side(self, source: Tensor, flux: Tensor | None) -> Tensor:
         """The right side of E2.7 with more in it: a `source`, and - div(D kappa_s times a flux).
@@ -163,13 +155,11 @@ def _loss_and_source(
 
 def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
     """The part along `axis` of div(D kappa_s Q1)."""
-    scattered = medium.remaining_scattering * source_flux
-    resistance = face_resistance(medium.index)
-    faces = face_fluxes(None, scattered, diffusion, medium.grid, axis, resistance=resistance)
+    faces = _find_flow(medium, diffusion, source_flux, None, None, axis)
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
-def axis_flux(
+def _average_flux(
     medium: Medium,
     diffusion: Tensor,
     source_flux: Tensor | None,
@@ -178,6 +168,19 @@ def axis_flux(
     axis: int,
 ) -> Tensor:
     """L1 = 3 F along `axis` (E2.5), averaged over each cell's two faces."""
-    source = None if source_flux is None else medium.remaining_scattering * source_flux
-    given = diffusion, medium.grid, axis, outside, face_resistance(medium.index)
-    return 3 * cell_average(face_fluxes(mean, source, *given), axis)
+    faces = _find_flow(medium, diffusion, source_flux, outside, mean, axis)
+    return 3 * face_average(faces, axis)
+
+
+def _find_flow(
+    medium: Medium,
+    diffusion: Tensor,
+    source_flux: Tensor | None,
+    outside: Tensor | None,
+    mean: Tensor | None,
+    axis: int,
+) -> Tensor:
+    """F along `axis` on all faces, for Q1 = `source_flux` and L0 = `mean`."""
+    scattered = None if source_flux is None else medium.remaining_scattering * source_flux
+    resistance = face_resistance(medium.index)
+    return face_fluxes(mean, scattered, diffusion, medium.grid, axis, outside, resistance)

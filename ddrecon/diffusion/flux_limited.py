@@ -21,8 +21,8 @@ from ddrecon.diffusion.operator import (
     AXES,
     Operator,
     boundary_loss,
-    cell_average,
     conductance,
+    face_average,
     face_fluxes,
 )
 from ddrecon.diffusion.solve import Solution, solve_by_multigrid
@@ -53,7 +53,7 @@ def limit_diffusion(u: Tensor, extinction: Tensor, grid: Grid) -> Tensor:
         if u.shape[axis] > 1:
             slopes = u.diff(dim=axis) / step
             ends = slopes.narrow(axis, 0, 1), slopes.narrow(axis, slopes.shape[axis] - 1, 1)
-            slopes = cell_average(torch.cat([ends[0], slopes, ends[1]], axis), axis)
+            slopes = face_average(torch.cat([ends[0], slopes, ends[1]], axis), axis)
             square = square + 4 * slopes**2 / light
     return 1 / square.sqrt()
 
@@ -74,7 +74,7 @@ class LimitedOperator(AutodiffOperator):
         diffusion = limit_diffusion(u, extinction, self.grid)
         escape = boundary_loss(diffusion, self.grid)
         z, y, x = (conductance(diffusion, self.grid, axis) for axis in AXES)
-        operator = Operator((z, y, x), absorption + escape)
+        operator = Operator((z, y, x), absorption + escape, spacing=self.grid.spacing)
         product = operator.apply(u) - escape * outside
         for axis, component in zip(AXES, flux, strict=bool(flux)):
             faces = face_fluxes(None, component, diffusion, self.grid, axis)
@@ -118,7 +118,7 @@ def solve_flux_limited(
     diffusion = limit_diffusion(mean, extinction, grid)
     moments = moments_of_flux(
         [
-            3 * cell_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
+            3 * face_average(face_fluxes(mean, component, diffusion, grid, axis, outside), axis)
             for axis, component in zip(AXES, flux or (None, None, None), strict=True)
         ]
     )
@@ -139,7 +139,7 @@ def iterate_picard(
         matrix, product = operator.with_matrix(u)
         step = DAMPING * solve_by_multigrid(matrix, source - product, None, INNER_TOLERANCE).value
         u, iteration = u + step, iteration + 1
-        size, length = (torch.linalg.vector_norm(each, dim=(1, 2, 3)) for each in (u, step))
+        size, length = (torch.linalg.vector_norm(field, dim=(1, 2, 3)) for field in (u, step))
         change = float((length / size.clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
         message = "flux-limited diffusion did not reach its tolerance"

@@ -6,7 +6,7 @@ transpose of that before it, restriction that of interpolation, and each relaxat
 error smaller.
 
 Each coarser grid has half the cells along an axis, one axis after another. Conductances are read as
-a network of resistors, so that no spacing is needed and cells may be of any form. Along the axis a
+a network of resistors: cells may be of any form. Along the axis a
 coarse face is half of either pair's inner resistor in series with the one between the pairs; across
 the axis conductances are in parallel. Light between two coarse cells changes from resistor to
 resistor as a current's voltage does, which is how corrections are interpolated: where the medium
@@ -29,7 +29,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
-from ddrecon.numerics.reads import may_read
 
 FEW_CELLS = 128
 """So many cells are solved directly."""
@@ -49,8 +48,6 @@ STEPS = (1 / (CENTER - REACH), 1 / (CENTER + REACH))
 
 No eigenvalue of an M-matrix over its diagonal is above 2.
 """
-_usual_axes: dict[tuple[int, ...], list[list[int]]] = {}
-"""The axes that were coarsened last of each shape: a first guess, which changes no result."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class Coarsening:
 class Level:
     """A grid that is relaxed on, and the `coarsenings` to the next one, axis by axis.
 
-    `inverse` [u]: 1 / diagonal. `kept`: the part of the diagonal that a cell exchanges with its
+    `inverse` [u]: 1 / diagonal. `coupling`: the part of the diagonal that a cell exchanges with its
     neighbors. Corrections from the coarser grid are multiplied by it: by 1 where nothing is lost,
     by nearly nothing where light is absorbed before it gets to the next cell. Else they would carry
     errors of bright cells into dark ones, where light then falls below zero.
@@ -80,21 +77,17 @@ class Level:
 
     operator: Operator
     inverse: Tensor
-    kept: Tensor
+    coupling: Tensor
     coarsenings: tuple[Coarsening, ...]
 
 
 class Passes:
     """What multigrid computes, each a pass over the cells of a grid, by torch's operations."""
 
-    def scale(self, operator: Operator) -> tuple[Tensor, Tensor, Tensor]:
-        """`inverse` and `kept` of a `Level`, and the tie of cells along each axis, [3, any number].
-
-        The tie is the part of the diagonal that a cell exchanges along the axis, to be summed.
-        """
+    def scale(self, operator: Operator) -> tuple[Tensor, Tensor]:
+        """`inverse` and `coupling` of a `Level`."""
         inverse = 1 / operator.diagonal
-        ties = [((c + c.roll(1, axis)) * inverse).flatten() for axis, c in operator.along_axes]
-        return inverse, operator.exchanged * inverse, torch.stack(ties)
+        return inverse, operator.exchanged * inverse
 
     def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
         """`operator` on half as many cells along `axis`, and the way there and back."""
@@ -111,24 +104,11 @@ class Passes:
         coarsening = Coarsening(axis, cells, below, above)
         coarse = [torch.add(*_pairs(c, axis)) for c in operator.conductances]
         coarse[axis - 1] = 1 / resistance + _stiffness(coarsening, operator)
-        z, y, x = coarse
         loss = torch.add(*_pairs(operator.loss, axis))
-        return coarsening, Operator((z, y, x), loss, operator.periodic)
-
-    def matrix(self, operator: Operator) -> Tensor:
-        """The matrix [C, n, n] of few cells, in double: else differences are not exact enough."""
-        numbers = [tensor.double() for tensor in (operator.loss, *operator.conductances)]
-        double, shape = Operator.of((), {}, *numbers), operator.loss.shape[1:]
-        matrix = torch.diag_embed(double.diagonal.flatten(1))
-        place = torch.arange(math.prod(shape), device=matrix.device).view(1, *shape)
-        for axis, c in double.along_axes:
-            cell, beyond = place.flatten(), place.roll(-1, axis).flatten()
-            matrix[:, cell, beyond] -= c.flatten(1)
-            matrix[:, beyond, cell] -= c.flatten(1)
-        return matrix
+        return coarsening, pair_cells(operator, axis, coarse, loss)
 
     def run(self) -> None:
-        """Does what was asked for: kernels are first told of all."""
+        """Computes what was asked for: kernels first list it."""
 
     def smooth(self, level: Level, source: Any) -> Any:
         """Two relaxations of u = 0."""
@@ -139,8 +119,8 @@ class Passes:
         return u + step * level.inverse * (source - level.operator.apply(u))
 
     def residual(self, level: Level, u: Any, source: Any) -> Any:
-        """`source` - A u, times what is `kept`."""
-        return level.kept * (source - level.operator.apply(u))
+        """`coupling` times (`source` - A u)."""
+        return level.coupling * (source - level.operator.apply(u))
 
     def restrict(self, level: Level, residual: Any) -> Any:
         """The residual of the coarser grid's cells, by the transpose of `prolong`."""
@@ -153,10 +133,10 @@ class Passes:
         return (inverse @ source.flatten(1).unsqueeze(-1)).view_as(source)
 
     def correct(self, level: Level, u: Any, coarse: Any) -> Any:
-        """u plus what is `kept` of the `coarse` grid's solution, interpolated."""
+        """u plus `coupling` times the `coarse` grid's solution, interpolated."""
         for coarsening in reversed(level.coarsenings):
             coarse = prolong(coarsening, coarse)
-        return u + level.kept * coarse
+        return u + level.coupling * coarse
 
 
 def restrict(coarsening: Coarsening, residual: Tensor) -> Tensor:
@@ -218,34 +198,20 @@ class Hierarchy:
 
     @staticmethod
     def of(operator: Operator, passes: Passes) -> Hierarchy:
-        """All grids of `operator`.
-
-        Which axes are strong is read once all grids are there, of axes that were strong the last
-        time: reading makes a processor wait for a GPU. Where nothing may be read, these are taken.
-        """
-        shape = tuple(operator.loss.shape[1:])
-        guess = _usual_axes.get(shape, [])
-        while True:
-            levels, ties, grid = list[Level](), list[Tensor](), operator
-            while _is_level(grid, is_finest=not levels):
-                inverse, kept, tie = passes.scale(grid)
-                axes = guess[len(levels)] if len(levels) < len(guess) else _long_axes(grid)
-                coarse, coarsenings = grid, []
-                for axis in axes:
-                    coarsening, coarse = passes.coarsen(coarse, axis)
-                    coarsenings.append(coarsening)
-                levels.append(Level(grid, inverse, kept, tuple(coarsenings)))
-                ties.append(tie)
-                grid = coarse
-            matrix = passes.matrix(grid)
-            passes.run()
-            if may_read():
-                guess = _strong_axes_of(levels, ties)
-            if not may_read() or guess == [[c.axis for c in level.coarsenings] for level in levels]:
-                _usual_axes[shape] = guess
-                # Of no medium it is not finite; no error.
-                inverse = torch.linalg.inv_ex(matrix).inverse.to(operator.loss.dtype)
-                return Hierarchy(tuple(levels), inverse)
+        """All grids of `operator`."""
+        levels, grid = list[Level](), operator
+        # One cell is solved directly, and so are few on a coarser grid.
+        while grid.loss[0].numel() > (FEW_CELLS if levels else 1):
+            coarse, coarsenings = grid, list[Coarsening]()
+            for axis in strong_axes(grid):
+                coarsening, coarse = passes.coarsen(coarse, axis)
+                coarsenings.append(coarsening)
+            levels.append(Level(grid, *passes.scale(grid), tuple(coarsenings)))
+            grid = coarse
+        passes.run()
+        # The inverse for a medium of no finite numbers is not finite; that is no error.
+        inverse = torch.linalg.inv_ex(matrix_of(grid)).inverse.to(operator.loss.dtype)
+        return Hierarchy(tuple(levels), inverse)
 
     @property
     def inverse_diagonal(self) -> Tensor:
@@ -267,30 +233,29 @@ class Hierarchy:
         return u
 
 
-def _is_level(grid: Operator, *, is_finest: bool) -> bool:
-    """Whether this `grid` is relaxed on, and not solved directly."""
-    return grid.loss[0].numel() > (1 if is_finest else FEW_CELLS)
+def strong_axes(operator: Operator) -> list[int]:
+    """The axes along which cells become pairs: conductances go as 1 / h^2."""
+    shape, spacing = operator.loss.shape, operator.spacing
+    steps = {axis: spacing[axis - 1] for axis in AXES if shape[axis] > 1}
+    return [axis for axis in steps if STRONG * steps[axis] ** 2 <= min(steps.values()) ** 2]
 
 
-def _long_axes(grid: Operator) -> list[int]:
-    return [axis for axis in AXES if grid.loss.shape[axis] > 1]
+def pair_cells(
+    operator: Operator, axis: int, conductances: Sequence[Tensor], loss: Tensor
+) -> Operator:
+    """The operator of these numbers, whose cells are pairs of those of `operator` along `axis`."""
+    z, y, x = (h * (2 if a == axis else 1) for a, h in zip(AXES, operator.spacing, strict=True))
+    return Operator.of(operator.periodic, (z, y, x), {}, loss, *conductances)
 
 
-def _strong_axes_of(levels: Sequence[Level], ties: Sequence[Tensor]) -> list[list[int]]:
-    """The strong axes of the `levels`, as far as these were coarsened along them."""
-    sums = torch.stack([tie.sum(1, dtype=torch.float64) for tie in ties]).tolist() if ties else []
-    axes = list[list[int]]()
-    for level, strengths in zip(levels, sums, strict=True):
-        axes.append(strong_axes(level.operator.loss.shape, strengths))
-        if axes[-1] != [coarsening.axis for coarsening in level.coarsenings]:
-            break
-    return axes
-
-
-def strong_axes(shape: Sequence[int], sums: Sequence[float]) -> list[int]:
-    """The axes to coarsen of a grid of this `shape` [C, z, y, x], by the sum of its ties.
-
-    All that have more than one cell and are not weak. A tie counts by faces: n cells have n - 1.
-    """
-    strengths = {a: sums[a - 1] * shape[a] / (shape[a] - 1) for a in AXES if shape[a] > 1}
-    return [axis for axis in strengths if not strengths[axis] < STRONG * max(strengths.values())]
+def matrix_of(operator: Operator) -> Tensor:
+    """The matrix [C, n, n] of few cells, in double: else differences are not exact enough."""
+    colors, *shape = operator.loss.shape
+    unit = torch.eye(math.prod(shape), dtype=torch.float64, device=operator.loss.device)
+    # Each color comes as often as there are unit vectors.
+    tensors = (
+        tensor.double().expand(colors, *shape).repeat_interleave(len(unit), 0)
+        for tensor in (operator.loss, *operator.conductances)
+    )
+    columns = unit.repeat(colors, 1).view(-1, *shape)
+    return Operator.of((), (1, 1, 1), {}, *tensors).apply(columns).view(colors, *unit.shape)

@@ -11,7 +11,7 @@ scheme. `AutodiffOperator` leaves them to torch, for any function of u.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from time import perf_counter
@@ -43,9 +43,8 @@ class SolveRecord:
 class SolveMemory:
     """What solves remember between renders: last solutions, to start from, and a record of each.
 
-    `last` is by kind and transport round. With `is_warm` False every solve starts from zero.
-    `iterations` are those of the last solve, likewise; where nothing may be read, a solve makes so
-    many.
+    `last` is by kind and transport round, and so are `iterations`, those of the last solve: where
+    nothing may be read, a solve makes so many. With `is_warm` False every solve starts from zero.
     `tolerance_floor`: by kind, the tolerance below which nothing is gained; no solve goes below it,
     whatever it is asked for.
     """
@@ -63,7 +62,8 @@ class SolverWithMemory:
 
     `round_index` tells the solves of one render apart: 0 is diffusion's own, transport rounds count
     from 1. Forward solves that remember nothing begin at `start`, or at zero; adjoint ones at the
-    negative of the next round's, since a round takes away what it begins with (E2.10).
+    negative of the next round's, since a round takes away what it begins with (E2.10). Tangents,
+    whose directions have nothing in common, begin at zero.
     """
 
     solver: Callable[..., Solution]
@@ -74,42 +74,29 @@ class SolverWithMemory:
 
     def __call__(self, kind: str, operator: Any, source: Tensor) -> Tensor:
         """u with `operator` u = `source` [C, z, y, x]."""
-        began = perf_counter()
-        guess = self.last_solution(kind)
-        if guess is None and kind == "forward":
-            guess = self.start
-        if guess is None and kind == "adjoint":
-            next_one = self.last_solution(kind, later=1)
-            guess = None if next_one is None else -next_one
-        memory, key = self.memory, (kind, self.round_index)
+        began, memory, key = perf_counter(), self.memory, (kind, self.round_index)
+        tolerance = max(self.tolerance, memory.tolerance_floor.get(kind, 0.0))
         count = [] if may_read() else [memory.iterations[key]]
-        solution = self.solver(operator, source, guess, self.tolerance_of(kind), *count)
-        self.remember(kind, solution, began)
-        return solution.value
-
-    def tolerance_of(self, kind: str) -> float:
-        """How exactly to solve."""
-        return max(self.tolerance, self.memory.tolerance_floor.get(kind, 0.0))
-
-    def last_solution(self, kind: str, later: int = 0) -> Tensor | None:
-        """What was found, in this round or one `later`.
-
-        None for tangents, whose directions have nothing in common.
-        """
-        if not self.memory.is_warm or kind == "tangent":
-            return None
-        return self.memory.last.get((kind, self.round_index + later))
-
-    def remember(self, kind: str, solution: Solution, began: float) -> None:
-        """Keeps `solution` and the record of the solve that `began` at that time."""
+        solution = self.solver(operator, source, self._guess(kind), tolerance, *count)
         seconds = perf_counter() - began
         record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
-        self.memory.records.append(record)
+        memory.records.append(record)
         if may_read():
-            self.memory.iterations[kind, self.round_index] = solution.iterations
-        if self.memory.is_warm:
+            memory.iterations[key] = solution.iterations
+        if memory.is_warm and kind != "tangent":
             # Without the graph that the solution is about to get.
-            self.memory.last[kind, self.round_index] = solution.value.detach()
+            memory.last[key] = solution.value.detach()
+        return solution.value
+
+    def _guess(self, kind: str) -> Tensor | None:
+        """Where a solve begins, None for zero."""
+        last = self.memory.last if self.memory.is_warm else {}
+        later = self.round_index + 1
+        if (kind, self.round_index) in last:
+            return last[kind, self.round_index]
+        if kind == "adjoint" and (kind, later) in last:
+            return -last[kind, later]
+        return self.start if kind == "forward" else None
 
 
 class ImplicitSolve(torch.autograd.Function):
@@ -118,7 +105,7 @@ class ImplicitSolve(torch.autograd.Function):
     `prepared` is what solvers keep about A from one solve to the next. A has its derivative
     `linearized(u)`, which is A itself unless A depends on u. That has its `transposed()`;
     `cotangents(lambda, u)`, those of `tensors` for A_bar = -lambda u^T (E3.2); and, for their
-    changes or None, `change_terms(d_tensors, u)`, of which dA u is the sum (E3.1).
+    changes or None, `change(d_tensors, u)`, which is dA u (E3.1).
     """
 
     @staticmethod
@@ -164,9 +151,8 @@ class ImplicitSolve(torch.autograd.Function):
         u, *tensors = ctx.saved_tensors
         operator = ctx.assemble(ctx.prepared, *tensors).linearized(u)
         # E3.1: A du = dS - dA u.
-        right = torch.zeros_like(u) if d_source is None else d_source.clone()
-        for term in operator.change_terms(d_tensors, u):
-            right -= term
+        right = -operator.change(d_tensors, u)
+        right = right if d_source is None else right + d_source
 
         def solve(right: Tensor, u: Tensor, *tensors: Tensor) -> Tensor:
             return ctx.solve("tangent", ctx.assemble(ctx.prepared, *tensors).linearized(u), right)
@@ -223,11 +209,11 @@ class AutodiffOperator:
         """-(dN/dp)^T lambda of each of p (E3.2)."""
         return self._pull(-adjoint)[1:]
 
-    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
+    def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
         """dN/dp dp of all p together (E3.1)."""
-        both = zip(self.tensors, d_tensors, strict=True)
-        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in both)
-        yield self._push((torch.zeros_like(u), *changes))[0]
+        pairs = zip(self.tensors, d_tensors, strict=True)
+        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs)
+        return self._push((torch.zeros_like(u), *changes))[0]
 
 
 def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor) -> Tensor:
@@ -236,6 +222,6 @@ def solve_diffusion(solve: SolverWithMemory, operator: Operator, source: Tensor)
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.
     """
+    assemble = partial(Operator.of, operator.periodic, operator.spacing)
     tensors = source, operator.loss, *operator.conductances
-    assemble = partial(Operator.of, operator.periodic)
     return ImplicitSolve.apply(solve, assemble, operator.prepared, *tensors)

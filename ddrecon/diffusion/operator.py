@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid
+from ddrecon.grid import Grid, Triple
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -35,13 +35,15 @@ class Operator:
     `conductances`: c [1/u] on the faces above cells along z, y, x, `[C, z, y, x]`; zero on the box
     and along axes of a single cell. `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0.
     Conductances that all colors share may be given once. `periodic`: the axes, 0 to 2, along which
-    the last face may conduct: kernels do not look past the ends of others. `prepared`: what solvers
-    have computed from these numbers; to be handed on with them only.
+    the last face may conduct: kernels do not look past the ends of others. `spacing`: that of cells
+    along z, y, x, up to a factor. `prepared`: what solvers have computed from these numbers; to be
+    handed on with them only.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
     loss: Tensor
     periodic: tuple[int, ...] = ()
+    spacing: Triple = (1.0, 1.0, 1.0)
     prepared: dict[Callable[[Operator], Any], Any] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -49,13 +51,14 @@ class Operator:
     @staticmethod
     def of(
         periodic: tuple[int, ...],
+        spacing: Triple,
         prepared: dict[Callable[[Operator], Any], Any],
         loss: Tensor,
         *conductances: Tensor,
     ) -> Operator:
         """The operator of `loss` and three conductances, in the order of its derivatives."""
         z, y, x = conductances
-        return Operator((z, y, x), loss, periodic, prepared)
+        return Operator((z, y, x), loss, periodic, spacing, prepared)
 
     @property
     def along_axes(self) -> Iterator[tuple[int, Tensor]]:
@@ -100,14 +103,12 @@ class Operator:
         )
         return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
 
-    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
-        """dA u = dloss u + G^T (dc G u), term by term (E3.1)."""
-        d_loss, *d_conductances = d_tensors
-        if d_loss is not None:
-            yield d_loss * u
-        for axis, d_conductance in zip(AXES, d_conductances, strict=True):
-            if d_conductance is not None:
-                yield accumulate(d_conductance * difference(u, axis), axis)
+    def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
+        """dA u = dloss u + G^T (dc G u) of each axis (E3.1)."""
+        tensors = self.loss, *self.conductances
+        pairs = zip(tensors, d_tensors, strict=True)
+        changes = (torch.zeros_like(p) if d_p is None else d_p for p, d_p in pairs)
+        return Operator.of(self.periodic, self.spacing, {}, *changes).apply(u)
 
 
 def difference(u: Tensor, axis: int) -> Tensor:
@@ -120,26 +121,16 @@ def accumulate(faces: Tensor, axis: int) -> Tensor:
     return faces.roll(1, axis) - faces
 
 
-def lower_cells(u: Tensor, axis: int) -> Tensor:
-    """The cells below every interior face along `axis`: all but the last (a view)."""
-    return u.narrow(axis, 0, u.shape[axis] - 1)
-
-
-def upper_cells(u: Tensor, axis: int) -> Tensor:
-    """The cells above every interior face along `axis`: all but the first (a view)."""
-    return u.narrow(axis, 1, u.shape[axis] - 1)
-
-
 def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
     """c = (harmonic mean of D) / h^2 [1/u] on the faces above cells along `axis` (E2.7).
 
     `diffusion`: D [u], `[C, z, y, x]`, > 0.
     """
     is_periodic = axis - 1 in grid.periodic and diffusion.shape[axis] > 1
-    extended = torch.cat([diffusion, _first(diffusion, axis)], axis) if is_periodic else diffusion
-    faces = harmonic_mean(extended, axis) / grid.spacing[axis - 1] ** 2
-    on_box = torch.zeros_like(_first(diffusion, axis))
-    return faces if is_periodic else torch.cat([faces, on_box], axis)
+    low, high = _ends(diffusion, axis)
+    cells = torch.cat([diffusion, low], axis) if is_periodic else diffusion
+    faces = harmonic_mean(cells, axis) / grid.spacing[axis - 1] ** 2
+    return faces if is_periodic else torch.cat([faces, torch.zeros_like(high)], axis)
 
 
 def harmonic_mean(u: Tensor, axis: int) -> Tensor:
@@ -149,7 +140,7 @@ def harmonic_mean(u: Tensor, axis: int) -> Tensor:
     `axis`.
     """
     # Not by reciprocals: the derivative of 1 / a overflows where u is small, and opaque cells are.
-    a, b = lower_cells(u, axis), upper_cells(u, axis)
+    a, b = _neighbors(u, axis)
     return 2 * a * (b / (a + b))
 
 
@@ -161,10 +152,9 @@ def boundary_loss(diffusion: Tensor, grid: Grid, resistance: float = 2.0) -> Ten
     """
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        if axis - 1 in grid.periodic:
-            continue
-        for end in (_first, _last):
-            end(loss, axis).add_(escape(end(diffusion, axis), step, resistance) / step)
+        for end in (0, 1) if axis - 1 not in grid.periodic else ():
+            lost = escape(_ends(diffusion, axis)[end], step, resistance) / step
+            _ends(loss, axis)[end].add_(lost)
     return loss
 
 
@@ -187,38 +177,33 @@ def face_fluxes(
     and last, or twice that between a period's ends. Fluxes are positive towards higher indices.
     """
     step, is_periodic = grid.spacing[axis - 1], axis - 1 in grid.periodic
-    if is_periodic:
-        radiance, source_flux = (
-            None if u is None else _wrap(u, axis) for u in (radiance, source_flux)
-        )
-        diffusion = _wrap(diffusion, axis)
-    # What drives F: through the box's first face, the interior faces, and the box's last face.
-    low = inside = high = diffusion.new_zeros(())
+    drive = diffusion.new_zeros(())
     if radiance is not None:
-        # inside -grad L0; on the box the cell's own L0, which flows outwards (down at the low end)
-        low = -_first(radiance, axis)
-        inside = radiance.diff(dim=axis) / -step
-        high = _last(radiance, axis)
+        drive = add_ghosts(radiance, axis, is_periodic, outside).diff(dim=axis) / -step
     if source_flux is not None:
-        # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E2.6's numerator
-        low, high = (
-            side + step / 2 * end(source_flux, axis) for side, end in ((low, _first), (high, _last))
-        )
-        inside = inside + 0.5 * (lower_cells(source_flux, axis) + upper_cells(source_flux, axis))
-    if outside is not None:
-        # E2.6 for L0 - outside in place of L0
-        low, high = low + outside, high - outside
-    # inside, the drive is times the harmonic mean of D (E2.7); E2.6 divides by 2 + h / (2 D)
-    inside = harmonic_mean(diffusion, axis) * inside
+        drive = drive + face_average(add_ghosts(source_flux, axis, is_periodic), axis)
+    inside = harmonic_mean(add_ghosts(diffusion, axis, True) if is_periodic else diffusion, axis)
     if is_periodic:
-        return inside
-    into, out = (escape(end(diffusion, axis), step, resistance) for end in (_first, _last))
-    return torch.cat([into * low, inside, out * high], axis)
+        return inside * drive
+    # On the box F = (L0 - outside + (h/2) kappa_s Q1) / (2 + h / (2 D)): with ghost cells that hold
+    # what is outside, and no Q1, it is h / (2 + h / (2 D)) times what drives light there.
+    into, out = (step * escape(end, step, resistance) for end in _ends(diffusion, axis))
+    return torch.cat([into, inside, out], axis) * drive
 
 
-def cell_average(faces: Tensor, axis: int) -> Tensor:
-    """The mean of each cell's two faces along `axis`, where `faces` has one entry more."""
-    return 0.5 * (lower_cells(faces, axis) + upper_cells(faces, axis))
+def add_ghosts(u: Tensor, axis: int, is_periodic: bool, outside: Tensor | None = None) -> Tensor:
+    """`u` with a cell more at each end of `axis`: of the other end, or what is `outside`, or 0."""
+    low, high = _ends(u, axis)
+    if is_periodic:
+        return torch.cat([high, u, low], axis)
+    ghost = torch.zeros_like(low) if outside is None else outside.expand_as(low)
+    return torch.cat([ghost, u, ghost], axis)
+
+
+def face_average(u: Tensor, axis: int) -> Tensor:
+    """The mean of neighbors along `axis`, one entry less: of cells on faces, or the reverse."""
+    lower, upper = _neighbors(u, axis)
+    return 0.5 * (lower + upper)
 
 
 def escape(diffusion: Tensor, step: float, resistance: float) -> Tensor:
@@ -229,14 +214,12 @@ def escape(diffusion: Tensor, step: float, resistance: float) -> Tensor:
     return diffusion / (resistance * diffusion + step / 2)
 
 
-def _first(u: Tensor, axis: int) -> Tensor:
-    return u.narrow(axis, 0, 1)
+def _neighbors(u: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """The cells below and above every interior face along `axis` (views)."""
+    count = u.shape[axis] - 1
+    return u.narrow(axis, 0, count), u.narrow(axis, 1, count)
 
 
-def _last(u: Tensor, axis: int) -> Tensor:
-    return u.narrow(axis, u.shape[axis] - 1, 1)
-
-
-def _wrap(u: Tensor, axis: int) -> Tensor:
-    """`u` of a period along `axis`, with the cell before it and the cell behind it."""
-    return torch.cat([_last(u, axis), u, _first(u, axis)], axis)
+def _ends(u: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """The first and the last cells along `axis` (views)."""
+    return u.narrow(axis, 0, 1), u.narrow(axis, u.shape[axis] - 1, 1)

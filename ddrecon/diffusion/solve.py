@@ -66,21 +66,35 @@ def name_kernels(like: Tensor) -> None:
         passes.name_kernels(like)
 
 
-class TensorCycle:
-    """Products and V-cycles of an operator, of vectors like `source`, by torch's operations."""
+class TensorSteps:
+    """The steps of an iteration by torch's operations: each returns a sum over cells [C, 1, 1, 1].
+
+    Vectors are as `source`; the `solution` begins as zero. `inverse`: 1 / diagonal.
+    """
 
     def __init__(self, operator: Operator, source: Tensor):
-        self._operator, self.hierarchy = operator, operator.once(prepare)
+        self._operator, self._hierarchy = operator, operator.once(prepare)
+        self.inverse = self._hierarchy.inverse_diagonal
+        self.solution, self.direction = (torch.zeros_like(source) for _ in range(2))
         vectors = (torch.empty_like(source) for _ in range(3))
-        self.direction, self.residual, self.room = vectors
+        self.residual, self.preconditioned, self.product = vectors
 
-    def product(self) -> Tensor:
-        """A times the direction."""
-        return self._operator.apply(self.direction)
+    def precondition(self) -> Tensor:
+        """z, roughly A^-1 r of the residual r; its product with that."""
+        self.preconditioned = self._hierarchy.cycle(Passes(), self.residual)
+        return sum_cells(self.residual * self.preconditioned)
 
-    def cycle(self) -> Tensor:
-        """Roughly A^-1 times the residual."""
-        return self.hierarchy.cycle(Passes(), self.residual)
+    def turn(self, factor: Tensor) -> Tensor:
+        """The direction d becomes z + `factor` d, and the product A d; the product with that."""
+        torch.addcmul(self.preconditioned, self.direction, factor, out=self.direction)
+        self.product = self._operator.apply(self.direction)
+        return sum_cells(self.direction * self.product)
+
+    def advance(self, factor: Tensor) -> Tensor:
+        """The solution gains `factor` d, the residual loses `factor` A d; its square norm."""
+        self.solution.addcmul_(factor, self.direction)
+        self.residual.addcmul_(factor, self.product, value=-1)
+        return sum_cells(self.residual.square().mul_(self.inverse))
 
 
 def prepare(operator: Operator) -> Hierarchy:
@@ -89,13 +103,13 @@ def prepare(operator: Operator) -> Hierarchy:
     return Hierarchy.of(replace(operator, prepared={}), Passes())
 
 
-def _cycle_of(operator: Operator, source: Tensor) -> Any:
-    """What multiplies and preconditions, on the engine at hand."""
+def _steps_of(operator: Operator, source: Tensor) -> Any:
+    """The steps of an iteration, by the engine at hand."""
     if not is_fused():
-        return TensorCycle(operator, source)
-    from ddrecon.diffusion.fused.passes import KernelCycle  # imports Warp
+        return TensorSteps(operator, source)
+    from ddrecon.diffusion.fused.passes import KernelSteps  # imports Warp
 
-    return KernelCycle(operator, source)
+    return KernelSteps(operator, source)
 
 
 def _iterate(
@@ -106,47 +120,38 @@ def _iterate(
     count: int | None,
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
-    cycle, tiny = _cycle_of(operator, source), torch.finfo(source.dtype).tiny
-    inverse, u = cycle.hierarchy.inverse_diagonal, torch.zeros_like(source)
-    direction, residual, room = cycle.direction, cycle.residual, cycle.room
-
-    def square_norm(a: Tensor) -> Tensor:
-        return _sum_cells(torch.mul(a, a, out=room).mul_(inverse))
-
-    source_square = square_norm(source).clamp(min=tiny)
-    if guess is None or guess.shape != source.shape:
-        residual.copy_(source)
-    else:
-        direction.copy_(guess)
-        torch.sub(source, cycle.product(), out=residual)
+    steps, tiny, iteration = _steps_of(operator, source), torch.finfo(source.dtype).tiny, 0
+    own_square = sum_cells(torch.mul(source, source, out=steps.product).mul_(steps.inverse))
+    square, source_square = own_square, own_square.clamp(min=tiny)
+    steps.residual.copy_(source)
+    steps.direction.zero_()
+    power = torch.ones_like(square)
+    if guess is not None and guess.shape == source.shape:
+        steps.preconditioned.copy_(guess)
+        steps.turn(power)
+        square = steps.advance(power)
         # A guess that is worse than zero is not used.
-        helps = square_norm(residual) <= source_square
-        torch.where(helps, guess, u, out=u)
-        torch.where(helps, residual, source, out=residual)
-    direction.zero_()
-    power, iteration = torch.ones_like(source_square), 0
+        helps = square <= source_square
+        square = torch.where(helps, square, own_square)
+        steps.solution.copy_(torch.where(helps, steps.solution, 0))
+        steps.residual.copy_(torch.where(helps, steps.residual, source))
+        steps.direction.zero_()
     while True:
-        relative = square_norm(residual).div_(source_square).double()
+        relative = (square / source_square).double()
         if iteration == count:
-            return Solution(u, iteration, relative.max().sqrt())
+            return Solution(steps.solution, iteration, relative.max().sqrt())
         if count is None:
             worst = float(relative.max())
             if not worst > tolerance**2 or iteration == MAX_ITERATIONS:
-                return Solution(u, iteration, math.sqrt(worst))
+                return Solution(steps.solution, iteration, math.sqrt(worst))
+        previous, power = power, steps.precondition().clamp_(min=tiny)
+        curvature = steps.turn(power / previous).clamp_(min=tiny)
         # A color that is exact enough is left as it is, whatever the others need.
         is_open = relative > tolerance**2
-        preconditioned = cycle.cycle()
-        weighed = torch.mul(residual, preconditioned, out=room)
-        previous, power = power, _sum_cells(weighed).clamp_(min=tiny)
-        torch.addcmul(preconditioned, direction, power / previous, out=direction)
-        product = cycle.product()
-        curved = torch.mul(direction, product, out=preconditioned)
-        step = is_open * power / _sum_cells(curved).clamp_(min=tiny)
-        u.addcmul_(step, direction)
-        residual.addcmul_(step, product, value=-1)
+        square = steps.advance(is_open * power / curvature)
         iteration += 1
 
 
-def _sum_cells(u: Tensor) -> Tensor:
+def sum_cells(u: Tensor) -> Tensor:
     """The sum of each color, [C, 1, 1, 1]."""
     return u.sum((1, 2, 3), keepdim=True)

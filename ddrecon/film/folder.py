@@ -34,7 +34,8 @@ from ddrecon.scene_file.load import (
     read_scene,
     referenced_files,
 )
-from ddrecon.scene_file.schema import FramesSection
+from ddrecon.scene_file.maker import Maker
+from ddrecon.scene_file.view_schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 
 MIXED = 0.2
@@ -74,7 +75,7 @@ class Film:
     @cached_property
     def grid(self) -> Grid:
         """The grid of all frames."""
-        media = build_media(self.scene_file, torch.float32, torch.device("cpu"))
+        media = build_media(Maker(self.scene_file))
         return next(iter(media.values())).grid
 
     def claim(

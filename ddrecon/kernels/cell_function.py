@@ -26,7 +26,7 @@ Tensors = tuple[Tensor, ...]
 
 
 def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tensor) -> Tensors:
-    """What the `cell` of a `header` finds of `fields` [C, z, y, x]: `outs` of them, [C, ...].
+    """The `outs` outputs [C, ...] of the `cell` of a `header`, for `fields` [C, z, y, x].
 
     Fields of fewer colors, C divided by a whole number, come again and again. `numbers` [N, C or
     1], N > 0, are the same in all cells of a color. All of it is differentiated, in both modes.
@@ -39,12 +39,11 @@ def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tens
 
 @dataclass(frozen=True)
 class RowFunction:
-    """What finds arrays of these `shapes`, in rows of so many cells: a `name` in a `header`.
+    """A function `name` of a `header`, with outputs of these `shapes`, in rows of `width` cells.
 
-    `find_values` and its like are given the row, then what stands in `place`: made of `more`,
-    which C++ has as it is `declared`. The last fields, as many as are `added`, are but added to
-    what is found, one after another. As many before them as are `alike` have the same cotangents as
-    those before these.
+    `find_values` and its like have the row, then the C++ expressions in `place`, made of `more`,
+    which is `declared`. The last fields, as many as are `added`, are but added to the outputs, one
+    after another.
     """
 
     header: str
@@ -55,64 +54,55 @@ class RowFunction:
     declared: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
-    alike: int = 0
 
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
-        """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
+        """The outputs for `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
 
-        A field may be several, [n, C or 1, z, y, x], and so may what is found.
+        A field may be several, [n, C or 1, z, y, x], and so may an output.
         """
-        found: Tensors = _Found.apply(self, numbers, *fields)
-        return found
+        outputs: Tensors = _Applied.apply(self, numbers, *fields)
+        return outputs
 
     def run(
-        self, kind: str, numbers: Tensor, fields: Sequence[Tensor], **given: Any
+        self, kind: str, numbers: Tensor, fields: Sequence[Tensor], **more: Any
     ) -> tuple[Tensors, Tensor]:
-        """What the kernel of that `kind` makes in all cells, and sums of cotangents [N, C * rows].
+        """The outputs of the kernel of that `kind`, and sums of cotangents [N, C * rows].
 
-        "values"; "tangents" of what is `given`, `d_numbers` and `d_fields`; or "cotangents" from
-        `bars`, those of what was found.
+        "values"; "tangents" along `d_numbers` and `d_fields`; or "cotangents" from `bars`.
         """
         like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[-3:]
         width = 1 if like.is_cuda else self.width
-        items = colors * math.prod(shape) // width
-        made: dict[str, Any]
-        found: list[Tensor]
-        if kind == "cotangents":
-            count = len(fields) - self.alike
-            found = [like.new_empty(*each.shape[:-4], colors, *shape) for each in fields[:count]]
-            found += found[count - self.alike :]
-            made = {"made": _one_by_one(found), "sums": like.new_empty(len(numbers), items)}
-        else:
-            found = [like.new_empty(each) for each in self.shapes]
-            made = {"made": _one_by_one(found)}
+        items, has_sums = colors * math.prod(shape) // width, kind == "cotangents"
+        of_fields = ((*field.shape[:-4], colors, *shape) for field in fields)
+        outputs = [like.new_empty(of) for of in (of_fields if has_sums else self.shapes)]
+        sums = like.new_empty(len(numbers), items if has_sums else 0)
         fields = _one_by_one(fields)
-        own = {
+        inputs: dict[str, Any] = {
             "width": width,
             "rows": items // colors,
             "colors": colors,
             "numbers": numbers,
             "fields": fields,
             "channels": [len(field) for field in fields],
+            **self.more,
+            **more,
         }
-        self.kernel(kind, len(fields), 8 * like.element_size()).launch(
-            items, {**own, **self.more, **given}, made
-        )
-        return tuple(found), made.get("sums", like)
+        written = {"results": _one_by_one(outputs)} | ({"sums": sums} if has_sums else {})
+        self.kernel(kind, len(fields), 8 * like.element_size()).launch(items, inputs, written)
+        return tuple(outputs), sums
 
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
         """The kernel of "values", "tangents" or "cotangents", for so many fields."""
         outs = sum(math.prod(shape[:-4]) for shape in self.shapes)
-        code = self.header, self.name, self.place, self.declared, outs
-        return _kernel(kind, ins, bits, code)
+        return _kernel(kind, self.header, self.name, self.place, self.declared, ins, outs, bits)
 
 
-class _Found(torch.autograd.Function):
-    """What a function finds in all cells."""
+class _Applied(torch.autograd.Function):
+    """A function applied to all cells."""
 
     @staticmethod
     def forward(function: RowFunction, numbers: Tensor, *fields: Tensor) -> Tensors:
-        if numbers.requires_grad or any(one.requires_grad for one in fields):
+        if any(tensor.requires_grad for tensor in (numbers, *fields)):
             varied = _one_by_one(fields[: len(fields) - function.added])
             kernel = function.kernel("cotangents", len(varied), 8 * numbers.itemsize)
             launch_later(kernel.kernel, numbers)
@@ -128,30 +118,29 @@ class _Found(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
-        each = _one_by_one(bars)
-        found, sums = ctx.function.run("cotangents", numbers, fields, bars=each)
+        field_bars, sums = ctx.function.run("cotangents", numbers, fields, bars=_one_by_one(bars))
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
         field_bars = (
-            _sum_colors(bar, one.shape[-4]) for bar, one in zip(found, fields, strict=True)
+            _sum_colors(bar, field.shape[-4]) for bar, field in zip(field_bars, fields, strict=True)
         )
         return None, numbers_bar, *field_bars, *(bars * added)[:added]
 
     @staticmethod
     def jvp(ctx: Any, _: None, *changes: Tensor | None) -> Tensors:
         def change(*tensors: Any) -> Tensors:
-            kept = len(tensors) - len(changes)
-            d_values = tensors[kept:]
+            saved = len(tensors) - len(changes)
+            d_values = tensors[saved:]
             # The change stands for what something is added to, as well.
-            values = *tensors[:kept], *d_values[kept:]
+            values = *tensors[:saved], *d_values[saved:]
             d_numbers, *d_fields = (
                 torch.zeros_like(value) if d_value is None else d_value.expand_as(value)
                 for value, d_value in zip(values, d_values, strict=True)
             )
-            given = {"d_numbers": d_numbers, "d_fields": _one_by_one(d_fields)}
-            return ctx.function.run("tangents", values[0], values[1:], **given)[0]
+            more = {"d_numbers": d_numbers, "d_fields": _one_by_one(d_fields)}
+            return ctx.function.run("tangents", values[0], values[1:], **more)[0]
 
-        found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes)
-        return found
+        tangents: Tensors = run_plainly(change, *ctx.saved_tensors, *changes)
+        return tangents
 
 
 def _sum_colors(bar: Tensor, channels: int) -> Tensor:
@@ -161,25 +150,26 @@ def _sum_colors(bar: Tensor, channels: int) -> Tensor:
 
 def _one_by_one(fields: Sequence[Tensor]) -> list[Tensor]:
     """`fields` as kernels have them."""
-    return [one for field in fields for one in (field if field.ndim > 4 else [field])]
+    return [entry for field in fields for entry in (field if field.ndim > 4 else [field])]
 
 
 @functools.cache
-def _kernel(kind: str, ins: int, bits: int, code: tuple[str, str, str, str, int]) -> TextKernel:
-    header, name, place, declared, outs = code
-    title = f"{name.split('<')[0].lower()}_{kind}"
-    at, made = f"row, {place}channels, fields", "made"
+def _kernel(
+    kind: str, header: str, name: str, place: str, declared: str, ins: int, outs: int, bits: int
+) -> TextKernel:
+    at, written = f"row, {place}channels, fields", "results"
     if kind == "values":
-        more = f"*made[{outs}]"
-        call = f"find_values<{name}, F, F>({at}, nullptr, numbers, nullptr, made);"
+        more = f"*results[{outs}]"
+        call = f"find_values<{name}, F, F>({at}, nullptr, numbers, nullptr, results);"
     elif kind == "tangents":
-        more = f"*d_fields[{ins}], *d_numbers, *made[{outs}]"
-        call = f"find_values<{name}, Dual<F>, F>({at}, d_fields, numbers, d_numbers, made);"
+        more = f"*d_fields[{ins}], *d_numbers, *results[{outs}]"
+        call = f"find_values<{name}, Dual<F>, F>({at}, d_fields, numbers, d_numbers, results);"
     else:
-        more, made = f"*bars[{outs}], *made[{ins}], *sums", "made sums"
-        call = f"find_cotangents<{name}>({at}, numbers, bars, made, sums);"
+        more, written = f"*bars[{outs}], *results[{ins}], *sums", "results sums"
+        call = f"find_cotangents<{name}>({at}, numbers, bars, results, sums);"
     text = "const Row row(item, width, rows, colors);" + call
-    given = (
+    all_declared = (
         f"int width, rows, colors, channels[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"
     )
-    return TextKernel(title, bits, text, given, made, header)
+    title = f"{name.split('<')[0].lower()}_{kind}"
+    return TextKernel(title, bits, text, all_declared, written, header)

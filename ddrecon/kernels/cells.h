@@ -22,19 +22,21 @@ struct Row {
           size((long long)rows * width),
           start((long long)(item % rows) * width),
           at((long long)item * width) {}
-    // The row in each of COUNT arrays; those of fewer colors, `channels`, come again and again.
-    template <int COUNT, class P> INLINE void in_all(P* const* arrays, P** found) const {
+    // Where the row begins in an array of so many colors, `channels`, which come again and again.
+    INLINE long long begin(int channels) const { return color % channels * size + start; }
+    // The row in each of COUNT arrays, of all colors or of `channels`.
+    template <int COUNT, class P> INLINE void in_all(P* const* arrays, P** rows) const {
         UNROLLED
-        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + at;
+        for (int k = 0; k < COUNT; ++k) rows[k] = arrays[k] + at;
     }
     template <int COUNT, class P>
-    INLINE void in_all(P* const* arrays, const int* channels, P** found) const {
+    INLINE void in_all(P* const* arrays, const int* channels, P** rows) const {
         UNROLLED
-        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + (color % channels[k] * size + start);
+        for (int k = 0; k < COUNT; ++k) rows[k] = arrays[k] + begin(channels[k]);
     }
-    template <int COUNT, class F> INLINE void of_color(const F* numbers, F* found) const {
+    template <int COUNT, class F> INLINE void of_color(const F* numbers, F* values) const {
         UNROLLED
-        for (int k = 0; k < COUNT; ++k) found[k] = numbers[k * colors + color];
+        for (int k = 0; k < COUNT; ++k) values[k] = numbers[k * colors + color];
     }
 };
 
@@ -47,53 +49,54 @@ template <class N, int INS, int NUMBERS, class F> struct Inputs {
         const F* numbers, const F* d_numbers) {
         UNROLLED
         for (int k = 0; k < INS; ++k)
-            in[k] = readable<N>(fields[k], IS_DUAL<N> ? d_fields[k] : nullptr) +
-                    (row.color % channels[k] * row.size + row.start);
+            in[k] =
+                readable<N>(fields[k], IS_DUAL<N> ? d_fields[k] : nullptr) + row.begin(channels[k]);
         UNROLLED
         for (int k = 0; k < NUMBERS; ++k)
             number[k] = readable<N>(numbers, d_numbers)[k * row.colors + row.color];
     }
 };
 
-// What is found in a row; where N are dual numbers, its change.
+// The values of a row's cells; where N are dual numbers, their changes.
 template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const int* channels, const F* const* fields, const F* const* d_fields,
-    const F* numbers, const F* d_numbers, F* const* made) {
-    const Inputs<N, Cell::INS, Cell::NUMBERS, F> given(
+    const F* numbers, const F* d_numbers, F* const* outputs) {
+    const Inputs<N, Cell::INS, Cell::NUMBERS, F> inputs(
         row, channels, fields, d_fields, numbers, d_numbers);
     F* out[Cell::OUTS];
-    row.in_all<Cell::OUTS>(made, out);
+    row.in_all<Cell::OUTS>(outputs, out);
     INDEPENDENT
     for (int i = 0; i < row.width; ++i) {
         N x[Cell::INS], y[Cell::OUTS];
         UNROLLED
-        for (int k = 0; k < Cell::INS; ++k) x[k] = given.in[k][i];
-        Cell::find(x, given.number, y);
+        for (int k = 0; k < Cell::INS; ++k) x[k] = inputs.in[k][i];
+        Cell::find(x, inputs.number, y);
         UNROLLED
         for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = change_of(y[k]);
     }
 }
 
-// Dual numbers with a direction for all that is given have the slopes by which cotangents `bars` of
-// what was found become those of what was given: of fields `made`, of numbers `sums` over a row.
+// Dual numbers with a direction for each input have the slopes by which cotangents `bars` of the
+// outputs become those of inputs: of fields `outputs`, of numbers `sums` over a row.
 template <class Cell, class F> INLINE void find_cotangents(
     const Row& row, const int* channels, const F* const* fields, const F* numbers,
-    const F* const* bars, F* const* made, F* sums) {
+    const F* const* bars, F* const* outputs, F* sums) {
     REORDERED
-    constexpr int GIVEN = Cell::INS + Cell::NUMBERS;
-    typedef Dual<F, GIVEN> N;
+    constexpr int INPUTS = Cell::INS + Cell::NUMBERS;
+    typedef Dual<F, INPUTS> N;
     const F *in[Cell::INS], *bar[Cell::OUTS];
-    F number[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS];
+    F of_row[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS];
     row.in_all<Cell::INS>(fields, channels, in);
-    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.of_color<Cell::NUMBERS>(numbers, of_row);
     row.in_all<Cell::OUTS>(bars, bar);
-    row.in_all<Cell::INS>(made, out);
+    row.in_all<Cell::INS>(outputs, out);
     UNROLLED
     for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] = F(0);
     INDEPENDENT
     for (int i = 0; i < row.width; ++i) {
-        N x[Cell::INS], own[Cell::NUMBERS], y[Cell::OUTS];
-        F found[GIVEN];
+        // With one array for fields and numbers the loop would not become vector code.
+        N x[Cell::INS], number[Cell::NUMBERS], y[Cell::OUTS];
+        F x_bar[INPUTS];
         UNROLLED
         for (int k = 0; k < Cell::INS; ++k) {
             x[k] = N(in[k][i]);
@@ -101,20 +104,20 @@ template <class Cell, class F> INLINE void find_cotangents(
         }
         UNROLLED
         for (int k = 0; k < Cell::NUMBERS; ++k) {
-            own[k] = N(number[k]);
-            own[k].by[Cell::INS + k] = F(1);
+            number[k] = N(of_row[k]);
+            number[k].by[Cell::INS + k] = F(1);
         }
-        Cell::find(x, own, y);
+        Cell::find(x, number, y);
         UNROLLED
-        for (int k = 0; k < GIVEN; ++k) {
-            found[k] = F(0);
+        for (int k = 0; k < INPUTS; ++k) {
+            x_bar[k] = F(0);
             UNROLLED
-            for (int o = 0; o < Cell::OUTS; ++o) found[k] += bar[o][i] * y[o].by[k];
+            for (int o = 0; o < Cell::OUTS; ++o) x_bar[k] += bar[o][i] * y[o].by[k];
         }
         UNROLLED
-        for (int k = 0; k < Cell::INS; ++k) out[k][i] = found[k];
+        for (int k = 0; k < Cell::INS; ++k) out[k][i] = x_bar[k];
         UNROLLED
-        for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] += found[Cell::INS + k];
+        for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] += x_bar[Cell::INS + k];
     }
     UNROLLED
     for (int k = 0; k < Cell::NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];

@@ -1,7 +1,6 @@
 """Kernels are compiled once, then come from Warp's cache.
 
-Whoever launches a kernel names its adjoint as well, long before that is needed: it is compiled
-meanwhile, by another thread.
+Whoever launches a kernel names its adjoint as well: another thread compiles it meanwhile.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Timer
-from time import perf_counter
 from typing import Any
 
 import torch
@@ -22,21 +20,17 @@ from ddrecon import engine
 LOG = logging.getLogger(engine.LOG)
 COMPILED = 0.5
 """A kernel that takes longer to load [s] is being compiled; others come from Warp's cache."""
-PAUSE = 5.0
-"""A line says how far that is, no more often than this [s]."""
 _loaded: set[tuple[Any, str]] = set()
 """Kernels that this process has, by their devices."""
 _named: dict[tuple[Any, str], Future[None]] = {}
-"""Those that other threads were asked for."""
-_last_line = -PAUSE
-"""When the last line was written."""
+"""Kernels that other threads were asked for."""
 
 
 def name_kernel(kernel: Any, device: str) -> None:
     """Has another thread load a `kernel` that is needed later, where there may be several."""
-    key, others = (kernel, device), torch.get_num_threads() - 1
-    if others > 0 and key not in _loaded and key not in _named:
-        _named[key] = _pool(others).submit(_load, kernel, device)
+    key, threads = (kernel, device), torch.get_num_threads() - 1
+    if threads > 0 and key not in _loaded and key not in _named:
+        _named[key] = _pool(threads).submit(_load, kernel, device)
 
 
 def load(kernel: Any, device: str) -> None:
@@ -51,7 +45,7 @@ def load(kernel: Any, device: str) -> None:
 
 
 def _load(kernel: Any, device: str) -> None:
-    line = Timer(COMPILED, _tell, (kernel.key,))
+    line = Timer(COMPILED, _announce)
     line.daemon = True
     line.start()
     try:
@@ -61,20 +55,10 @@ def _load(kernel: Any, device: str) -> None:
     _loaded.add((kernel, device))
 
 
-def _tell(name: str) -> None:
-    """Writes a line while the kernel `name` is compiled, unless there was one just now."""
-    global _last_line
-    if perf_counter() - _last_line < PAUSE:
-        return
-    is_first, _last_line = _last_line < 0, perf_counter()
-    if is_first:
-        where = f"they stay in {wp.config.kernel_cache_dir}"
-        LOG.warning("compiling kernels, which takes a minute or two, once: %s", where)
-    else:
-        more = max(1, len(_named.keys() - _loaded))  # that one, if no other is known
-        LOG.warning(
-            "compiling kernels: %d done, %d or more to do, now %s", len(_loaded), more, name
-        )
+@functools.cache
+def _announce() -> None:
+    where = wp.config.kernel_cache_dir
+    LOG.warning("compiling kernels, which takes up to a minute, once: they stay in %s", where)
 
 
 @functools.cache

@@ -31,17 +31,17 @@ template <class F, int COUNT = 1> struct Dual {
         for (int k = 0; k < COUNT; ++k) by[k] = o.by[k];
         return *this;
     }
-    // What is `found`, with the slopes of that along this and another number.
-    INLINE Dual chain(F found, F by_this) const {
+    // A function's `value`, from its slopes by this number and by another one.
+    INLINE Dual chain(F value, F by_this) const {
         Dual r;
-        r.value = found;
+        r.value = value;
         UNROLLED
         for (int k = 0; k < COUNT; ++k) r.by[k] = by_this * by[k];
         return r;
     }
-    INLINE Dual chain(F found, F by_this, const Dual& o, F by_other) const {
+    INLINE Dual chain(F value, F by_this, const Dual& o, F by_other) const {
         Dual r;
-        r.value = found;
+        r.value = value;
         UNROLLED
         for (int k = 0; k < COUNT; ++k) r.by[k] = by_this * by[k] + by_other * o.by[k];
         return r;
@@ -64,6 +64,7 @@ template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(A a, Dual
     b.value = a + b.value;
     return b;
 }
+// A copy that changes: of a sum the other way around, loops do not become vector code.
 template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(Dual<F, COUNT> a, A b) {
     a.value = a.value + b;
     return a;
@@ -97,20 +98,20 @@ INLINE Dual<F, COUNT> operator/(const Dual<F, COUNT>& a, A b) {
 // The value of a number of either kind, for comparisons; and a choice by one.
 template <class F> INLINE F value_of(F x) { return x; }
 template <class F, int COUNT> INLINE F value_of(const Dual<F, COUNT>& x) { return x.value; }
-template <class N> INLINE N pick(bool is, const N& one, const N& other) { return is ? one : other; }
+template <class N> INLINE N pick(bool is, const N& a, const N& b) { return is ? a : b; }
 template <class F, int COUNT>
-INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COUNT>& other) {
+INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& a, const Dual<F, COUNT>& b) {
     Dual<F, COUNT> r;
-    r.value = is ? one.value : other.value;
+    r.value = is ? a.value : b.value;
     UNROLLED
-    for (int k = 0; k < COUNT; ++k) r.by[k] = is ? one.by[k] : other.by[k];
+    for (int k = 0; k < COUNT; ++k) r.by[k] = is ? a.by[k] : b.by[k];
     return r;
 }
 
 // The root of a number > 0, or 0, where the slope counts as 0.
 template <class F, int COUNT> INLINE Dual<F, COUNT> root(const Dual<F, COUNT>& x) {
-    const F found = root(x.value);
-    return x.chain(found, found > F(0) ? F(0.5) / found : F(0));
+    const F value = root(x.value);
+    return x.chain(value, value > F(0) ? F(0.5) / value : F(0));
 }
 
 // Arrays of values and of their changes, which are read as dual numbers.
@@ -119,16 +120,16 @@ template <class F> struct Changing {
     INLINE Dual<F> operator[](long long i) const { return {value[i], change[i]}; }
     INLINE Changing operator+(long long i) const { return {value + i, change + i}; }
 };
-// What is written of a number found: itself, or of a dual number its change.
+// What is written of a number: itself, or of a dual number its change.
 template <class F> INLINE F change_of(F x) { return x; }
 template <class F> INLINE F change_of(const Dual<F>& x) { return x.by[0]; }
 
 // One type or another.
-template <bool IS, class One, class Other> struct If {
-    typedef One type;
+template <bool IS, class A, class B> struct If {
+    typedef A type;
 };
-template <class One, class Other> struct If<false, One, Other> {
-    typedef Other type;
+template <class A, class B> struct If<false, A, B> {
+    typedef B type;
 };
 
 // Whether numbers N have derivatives.
@@ -143,11 +144,11 @@ template <class N, class F> INLINE auto readable(const F* value, const F* change
         return value;
 }
 
-// What a function of one number, `found` with its slope at the value of `x`, is of x itself.
-template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }
+// A function `f` of one number, known at the value of `x`, as a function of x itself.
+template <class F> INLINE F along(F, const Sloped<F>& f) { return f.value; }
 template <class F, int COUNT>
-INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& found) {
-    return x.chain(found.value, found.slope);
+INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& f) {
+    return x.chain(f.value, f.slope);
 }
 
 } // namespace ddrecon

@@ -36,10 +36,10 @@ Numbers of rays differ from view to view: the table stays small.
 """
 
 
-def too_many(what: str, count: int) -> UsageError:
-    """What to say of so many items, or numbers, that kernels do not count so far."""
+def too_many(name: str, count: int) -> UsageError:
+    """The error for so many items, or numbers, that kernels do not count so far."""
     return UsageError(
-        f"{what}: {count} is too many for fused kernels, which count to 2^31; "
+        f"{name}: {count} is too many for fused kernels, which count to 2^31; "
         "take fewer cells or pixels, or --engine torch"
     )
 
@@ -55,66 +55,59 @@ def thread_count(like: Tensor) -> int:
 
 
 def launch(
-    kernel: Any,
-    count: int,
-    arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
-    like: Tensor,
-    threads: int | None = None,
+    kernel: Any, count: int, records: Sequence[Any], like: Tensor, threads: int | None = None
 ) -> None:
     """Runs `kernel` for `count` items where tensor `like` lies.
 
     On a processor the items are cut into so many shares as there are `threads` (None: as many as
-    torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
-    share is left to chance, and changes no result: the one that asks does those that no other has
-    begun by the time it has done its own. It does all where that was quick last time and no
-    `threads` are given: how long it takes is then told by the number of items.
+    torch has), which have a record each, or all the same one. Which thread does a share is left to
+    chance, and changes no result: the one that asks does those that no other has begun by the time
+    it has done its own. It does all where that was quick last time and no `threads` are given.
     """
     if not count:
         return
     if count >= MOST:
         raise too_many(kernel.key, count)
-    goes_by_time = threads is None
-    threads = thread_count(like) if threads is None else threads
+    shares = thread_count(like) if threads is None else threads
     device = _device(like.device)
     load(kernel, device.alias)
-    bounds = [i * count // threads for i in range(threads + 1)]
+    bounds = [i * count // shares for i in range(shares + 1)]
     stream = _stream(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
-        given = arguments(i) if callable(arguments) else arguments
-        _call(kernel, device, bounds[i + 1] - bounds[i], [bounds[i], *given], stream)
+        first, items = bounds[i], bounds[i + 1] - bounds[i]
+        _call(kernel, device, first, items, records[min(i, len(records) - 1)], stream)
 
     # What was seen to be quick is not worth another thread.
     size = kernel, count.bit_length()
-    if threads == 1:
+    if shares == 1:
         run(0)
-    elif goes_by_time and _seconds.get(size, math.inf) < QUICK:
+    elif threads is None and _seconds.get(size, math.inf) < QUICK:
         start = perf_counter()
-        for i in range(threads):
-            run(i)
+        _call(kernel, device, 0, count, records[0], stream)
         _seconds[size] = perf_counter() - start
     else:
-        _seconds[size] = threads * _share(run, threads)
+        _seconds[size] = shares * _share(run, shares)
 
 
 def _share(run: Callable[[int], None], threads: int) -> float:
-    """Has shares 0 to `threads` run by as many threads; how long this one took for its own [s]."""
-    others = [_pool(threads).submit(run, i) for i in range(1, threads)]
+    """Has a share run by each of `threads`; returns how long this one took for its own [s]."""
+    futures = [_pool(threads).submit(run, i) for i in range(1, threads)]
     start = perf_counter()
     try:
         # The thread that asks takes the first share itself.
         run(0)
         seconds = perf_counter() - start
         # And those not begun by now: other programs may have the processor's other cores.
-        for i, other in enumerate(others, 1):
-            if other.cancel():
+        for i, future in enumerate(futures, 1):
+            if future.cancel():
                 run(i)
     finally:
         # No memory is given up that others still write to, whatever went wrong here.
-        wait([other for other in others if not other.cancel()])
-    for other in others:
-        if not other.cancelled():
-            other.result()
+        wait([future for future in futures if not future.cancel()])
+    for future in futures:
+        if not future.cancelled():
+            future.result()
     return seconds
 
 
@@ -130,14 +123,14 @@ def _start() -> None:
     It does so past Python, to the process's error stream, on every machine without a GPU.
     """
     sys.stderr.flush()
-    kept = os.dup(2)
+    errors = os.dup(2)
     try:
         with open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), 2)
         wp.init()
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(errors, 2)
+        os.close(errors)
 
 
 @functools.cache
@@ -146,19 +139,18 @@ def _device(device: torch.device) -> Any:
     return wp.device_from_torch(device)
 
 
-def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
+def _call(kernel: Any, device: Any, first: int, items: int, record: Any, stream: Any) -> None:
     if not items:
         return
     calls = _calls(kernel, device.alias)
     try:
         call = calls.pop()
     except IndexError:
-        call = wp.launch(kernel, items, given, device=device, record_cmd=True)
+        call = wp.launch(kernel, items, [first, record], device=device, record_cmd=True)
     if call.bounds.size != items:
         call.set_dim(items)
-    for place, value in enumerate(given):
-        one = value.__ctype__() if hasattr(value, "__ctype__") else value
-        call.set_param_at_index_from_ctype(place, one)
+    call.set_param_at_index_from_ctype(0, first)
+    call.set_param_at_index_from_ctype(1, record)
     call.launch(stream)
     calls.append(call)
 

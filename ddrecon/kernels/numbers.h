@@ -73,34 +73,26 @@ template <> struct Format<double> {
 // (`numerics/third_order.py`).
 template <class F> constexpr F NEARLY = F(16 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23));
 
-template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
-template <> inline constexpr double FACTORIAL<0> = 1.0;
+constexpr INLINE double factorial(int n) {
+    double product = 1.0;
+    for (int k = 2; k <= n; ++k) product *= k;
+    return product;
+}
 // Coefficients of exp(x), of psi(-x), of eta(-x), of its slope eta'(-x), and of
 // log((1 + s) / (1 - s)) / (2 s) in s^2.
-template <int K> struct OfExp {
-    static constexpr double value = 1.0 / FACTORIAL<K>;
-};
-template <int K> struct OfPsi {
-    static constexpr double value = 1.0 / FACTORIAL<K + 2>;
-};
-template <int K> struct OfEta {
-    static constexpr double value = (K + 1) / (2 * FACTORIAL<K + 3>);
-};
-template <int K> struct OfEtaSlope {
-    static constexpr double value = -(K + 1) * (K + 2) / (2 * FACTORIAL<K + 4>);
-};
-template <int K> struct OfLog {
-    static constexpr double value = 1.0 / (2 * K + 1);
-};
+constexpr INLINE double of_exp(int k) { return 1 / factorial(k); }
+constexpr INLINE double of_psi(int k) { return 1 / factorial(k + 2); }
+constexpr INLINE double of_eta(int k) { return (k + 1) / (2 * factorial(k + 3)); }
+constexpr INLINE double of_eta_slope(int k) { return -(k + 1) * (k + 2) / (2 * factorial(k + 4)); }
+constexpr INLINE double of_log(int k) { return 1.0 / (2 * k + 1); }
 
 // TERMS of a series at x, a number or a vector of them, by Horner's rule.
-template <template <int> class Coefficient, class F, int TERMS, int K = 0, class N>
-INLINE N series(N x) {
-    constexpr F own = F(Coefficient<K>::value);
+template <double (&COEFFICIENT)(int), class F, int TERMS, int K = 0, class N> INLINE N series(N x) {
+    constexpr F coefficient = F(COEFFICIENT(K));
     if constexpr (K + 1 == TERMS) {
-        return N{} + own;
+        return N{} + coefficient;
     } else {
-        return series<Coefficient, F, TERMS, K + 1>(x) * x + own;
+        return series<COEFFICIENT, F, TERMS, K + 1>(x) * x + coefficient;
     }
 }
 
@@ -117,7 +109,7 @@ template <class F, class Bits, class N> INLINE N decay_of(N depth) {
     const N end = Own::most - N{}, x = depth > end ? -end : (depth < -end ? end : -depth);
     const N shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
     const N r = (x - n * Own::log2_high) - n * Own::log2_low;
-    const Bits p = __builtin_bit_cast(Bits, series<OfExp, F, Own::terms>(r));
+    const Bits p = __builtin_bit_cast(Bits, series<of_exp, F, Own::terms>(r));
     return __builtin_bit_cast(N, p + (__builtin_bit_cast(Bits, shifted) << Own::digits));
 #endif
 }
@@ -135,13 +127,13 @@ template <class F> INLINE F root(F x) {
 // psi, eta (`numerics/decay.py`) and its derivative, for depths from 0 to 1/2; that of psi is -2
 // eta.
 template <class F> INLINE F psi_series(F depth) {
-    return series<OfPsi, F, Format<F>::terms>(-depth);
+    return series<of_psi, F, Format<F>::terms>(-depth);
 }
 template <class F> INLINE F eta_series(F depth) {
-    return series<OfEta, F, Format<F>::terms>(-depth);
+    return series<of_eta, F, Format<F>::terms>(-depth);
 }
 template <class F> INLINE F eta_slope_series(F depth) {
-    return series<OfEtaSlope, F, Format<F>::terms>(-depth);
+    return series<of_eta_slope, F, Format<F>::terms>(-depth);
 }
 
 // phi, psi and eta (`numerics/decay.py`) of a depth of at least 0, of which `kept` is the decay;

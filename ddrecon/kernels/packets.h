@@ -35,12 +35,12 @@ template <class F> struct Packets {
     typedef I IM;
     typedef bool Bits __attribute__((ext_vector_type(LANES)));
 #endif
-    static INLINE V pick(M is, V one, V other) { return is ? one : other; }
-    static INLINE I pick(IM is, I one, I other) { return is ? one : other; }
+    static INLINE V all(F x) { return x - V{}; }
+    static INLINE V pick(M is, V a, V b) { return is ? a : b; }
+    static INLINE I pick(IM is, I a, I b) { return is ? a : b; }
     static INLINE V least(V a, V b) { return a < b ? a : b; }
     static INLINE V most(V a, V b) { return a > b ? a : b; }
 #if IS_GPU
-    static INLINE V all(F x) { return x; }
     static INLINE I whole(V x) { return (int)x; }
     static INLINE V real(I x) { return F(x); }
     static INLINE W wide(V x) { return (double)x; }
@@ -60,7 +60,6 @@ template <class F> struct Packets {
     static INLINE V log(V x) { return ::log(x); }
     static INLINE V decay(V depth) { return ddrecon::decay(depth); }
 #else
-    static INLINE V all(F x) { return x - V{}; }
     static INLINE I whole(V x) { return __builtin_convertvector(x, I); }
     static INLINE V real(I x) { return __builtin_convertvector(x, V); }
     static INLINE W wide(V x) { return __builtin_convertvector(x, W); }
@@ -109,7 +108,7 @@ template <class F> struct Packets {
         const M bits = __builtin_bit_cast(M, x), n = (bits - Own::root_bits) >> Own::digits;
         const V m = __builtin_bit_cast(V, bits - (n << Own::digits));
         const V s = (m - F(1)) / (m + F(1));
-        const V p = series<OfLog, F, Own::log_terms>(s * s);
+        const V p = series<of_log, F, Own::log_terms>(s * s);
         return F(2) * s * p + __builtin_convertvector(n, V) * F(0.69314718055994530942);
     }
 #endif
@@ -127,7 +126,7 @@ template <class F> struct Packets {
         return x;
     }
     // psi of depths from 0 to 1/2.
-    static INLINE V psi_series(V depth) { return series<OfPsi, F, Own::terms>(-depth); }
+    static INLINE V psi_series(V depth) { return series<of_psi, F, Own::terms>(-depth); }
 };
 
 } // namespace ddrecon

@@ -1,4 +1,4 @@
-"""Kernels whose items do a text in C++, which finds all it is given by name.
+"""Kernels whose items do a text in C++, which has its arguments by name.
 
     text = "out[item] = factor * x[item];"
     scale = TextKernel("scale", bits, text, "F *x, *out; F factor", "out")
@@ -9,10 +9,10 @@ numbers beside each other become vector instructions, and for GPUs, where a thre
 What is more than a call stands in a `header` of the package, in the namespace `ddrecon`: at least
 `numbers.h` and `packets.h` can be called.
 
-What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
-`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. Those that are named as made
-it writes; others point to constants. It all goes into one record: a launch takes the same few
-microseconds, however much that is.
+Arguments are declared as in C: pointers and numbers of type `F` (the kernel's own), `double`,
+`int`, `long` or `bool`; `F *fields[3]` are three pointers. Pointers that are no outputs are to
+constants. All arguments go into one record: a launch takes the same few microseconds, however many
+they are.
 """
 
 import functools
@@ -43,8 +43,8 @@ _INCLUDE = re.compile(r'#include "ddrecon/(.*)"')
 class TextKernel:
     """The kernel `name` that does `text` for each `item`, in numbers of so many `bits`.
 
-    `given` declares what the text has besides, and `made` names the arrays of that which it writes,
-    whether it reads them or not.
+    `declared` says what the text has besides, and `outputs` names the arrays of that which it
+    writes, whether it reads them or not.
     """
 
     def __init__(
@@ -52,43 +52,44 @@ class TextKernel:
         name: str,
         bits: int,
         text: str,
-        given: str,
-        made: str,
+        declared: str,
+        outputs: str,
         header: str = "kernels/packets.h",
     ):
         F = wp.float64 if bits == 64 else wp.float32
         types = _TYPES | {"F": ("F", F, torch.float64 if bits == 64 else torch.float32)}
-        members, locals_, self.arrays = {}, [], {}
+        members, variables = dict[str, Any](), list[str]()
+        self.arrays: dict[str, torch.dtype] = {}
         self.lists: dict[str, list[str]] = {}
-        self.made = set(made.split())
-        for word, is_array, one, count in declarations(given):
-            written, number, dtype = types[word]
-            entries = [f"{one}_{k}" for k in range(count)] or [one]
+        self.written = set(outputs.split())
+        for word, is_array, variable, count in declarations(declared):
+            c_type, number, dtype = types[word]
+            entries = [f"{variable}_{k}" for k in range(count)] or [variable]
+            # Pointers go as numbers: their addresses.
             members |= dict.fromkeys(entries, wp.uint64 if is_array else number)
             if is_array:
-                written = f"{written}*" if one in self.made else f"const {written}*"
+                c_type = f"{c_type}*" if variable in self.written else f"const {c_type}*"
                 self.arrays |= dict.fromkeys(entries, dtype)
-            casts = ", ".join(f"({written})given.{entry}" for entry in entries)
+            values = ", ".join(f"({c_type})record.{entry}" for entry in entries)
             if count:
-                self.lists[one] = entries
-                locals_.append(f"{written} const {one}[] = {{{casts}}};\n")
+                self.lists[variable] = entries
+                variables.append(f"{c_type} const {variable}[] = {{{values}}};\n")
             else:
-                locals_.append(f"{written} const {one} = {casts};\n")
-        # Pointers go as numbers: their addresses.
+                variables.append(f"{c_type} const {variable} = {values};\n")
         Record = wp.struct(type("Record", (), {"__annotations__": members, "__module__": __name__}))
 
-        number = f"using namespace ddrecon;\ntypedef {'double' if bits == 64 else 'float'} F;\n"
+        begin = f"using namespace ddrecon;\ntypedef {'double' if bits == 64 else 'float'} F;\n"
         options = {"extra_build_options": include(header)}
 
-        @wp.func_native(number + "".join(locals_) + text)
-        def do_item(item: int, given: Record): ...
+        @wp.func_native(begin + "".join(variables) + text)
+        def do_item(item: int, record: Record): ...
 
         @wp.kernel(enable_backward=False, module="unique", name=name, module_options=options)
-        def do_items(first: int, given: Record):
-            do_item(first + wp.tid(), given)
+        def do_items(first: int, record: Record):
+            do_item(first + wp.tid(), record)
 
-        self.name, self.bits, self.text, self.given = name, bits, text, given
-        self.names, self.kernel, self.module = set(members), do_items, do_items.module
+        self.name, self.names = name, set(members)
+        self.kernel, self.module = do_items, do_items.module
         # Warp's own records check each value that they are given, which takes longer than the rest.
         plain = type(Record().__ctype__())
         self.new_record: Any = type("Record", (plain,), {"__ctype__": lambda self: self})
@@ -96,51 +97,52 @@ class TextKernel:
     def launch(
         self,
         count: int,
-        given: Mapping[str, Any],
-        made: Mapping[str, Any],
+        inputs: Mapping[str, Any],
+        outputs: Mapping[str, Any],
         threads: int | None = None,
         shares: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
+        """Does `count` items with arrays and numbers `inputs`, and writes to arrays `outputs`.
 
-        Those that are made are contiguous. A thread has what is in its own of `shares` as well.
+        Outputs are contiguous. With `shares` a thread writes to the outputs in its own of these.
         """
-        bound = self.bind(given, made)
+        bound = self.bind(inputs, outputs)
         if not shares:
             bound.launch(count, threads)
             return
-        own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
-        for record, share in zip(own, shares, strict=True):
-            for name, value in share.items():
-                assert name in self.made, name
-                self.write(record, name, value)
-        launch(self.kernel, count, lambda i: [own[i]], bound.like, len(own))
+        records = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
+        for record, share in zip(records, shares, strict=True):
+            assert share.keys() <= self.written, share.keys() - self.written
+            self._write_all(record, share)
+        launch(self.kernel, count, records, bound.arrays[0], len(records))
 
-    def bind(self, given: Mapping[str, Any], made: Mapping[str, Any]) -> "Bound":
+    def bind(self, inputs: Mapping[str, Any], outputs: Mapping[str, Any]) -> "Bound":
         """The kernel with all that `launch` is given, for many launches.
 
-        Raises ValueError for an array that it writes and that is not `made`: of a copy of that
-        nobody would see what is written. And for one that is, and that it does not write.
+        Raises ValueError for an array that it writes and that is not among `outputs`: of a copy of
+        that nobody would see what is written. And for one that is, and that it does not write.
         """
-        record, kept = self.new_record(), []
-        if wrong := (self.made & given.keys()) | (made.keys() - self.made):
-            raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
-        for name, value in given.items():
-            if name in self.lists:
-                value = [self._ready(*each) for each in zip(self.lists[name], value, strict=True)]
-            else:
-                value = self._ready(name, value)
-            self.write(record, name, value)
-            kept.append(value)
-        for name, value in made.items():
-            self.write(record, name, value)
-        lists = (value if isinstance(value, list) else [value] for value in made.values())
-        arrays = [array for each in lists for array in each if isinstance(array, Tensor)]
-        return Bound(self, record, [kept, made], arrays[0])
+        if wrong := (self.written & inputs.keys()) | (outputs.keys() - self.written):
+            raise ValueError(
+                f"{self.name} writes {self.written}: {wrong} are handed over as others"
+            )
+        record = self.new_record()
+        arrays = self._write_all(record, inputs) + self._write_all(record, outputs)
+        return Bound(self, record, arrays)
 
-    def _ready(self, name: str, value: Any) -> Any:
-        is_array = isinstance(value, Tensor)
-        return value.to(self.arrays.get(name)).contiguous() if is_array else value
+    def _write_all(self, record: Any, values: Mapping[str, Any]) -> list[Tensor]:
+        """Writes `values` by their names, lists of them as well; returns the arrays among them."""
+        arrays = list[Tensor]()
+        for name, value in values.items():
+            is_list = name in self.lists
+            entries = zip(self.lists[name], value, strict=True) if is_list else [(name, value)]
+            for entry, number in entries:
+                if isinstance(number, Tensor):
+                    if name not in self.written:
+                        number = number.to(self.arrays.get(entry)).contiguous()
+                    arrays.append(number)
+                self.write(record, entry, number)
+        return arrays
 
     def write(self, record: Any, name: str, value: Any) -> None:
         """Writes a number into `record`, or the address of an array; 0 of one that is None."""
@@ -149,9 +151,6 @@ class TextKernel:
             if value.dtype is not expected or not value.is_contiguous():
                 raise ValueError(f"{name} is declared as {expected}, and is to be contiguous")
             setattr(record, name, value.data_ptr())
-        elif name in self.lists:
-            for entry, each in zip(self.lists[name], value, strict=True):
-                self.write(record, entry, each)
         elif name in self.names:
             setattr(record, name, 0 if value is None else value)
             if isinstance(value, int) and value >= MOST and getattr(record, name) != value:
@@ -173,43 +172,42 @@ def include(header: str) -> Any:
 def _texts(header: str) -> dict[str, str]:
     """The text of a `header` after those of what it includes, by path.
 
-    Given by text, not by path, a kernel is the same wherever the package lies.
+    By texts, not paths, a kernel is the same wherever the package lies.
     """
-    text, found = (Path(__file__).parents[1] / header).read_text(encoding="utf-8"), {}
+    text, texts = (Path(__file__).parents[1] / header).read_text(encoding="utf-8"), {}
     for included in _INCLUDE.findall(text):
-        found |= _texts(included)
+        texts |= _texts(included)
     text = _INCLUDE.sub("", text.removeprefix("#pragma once"))
-    return found | {header: f'#line 1 "ddrecon/{header}"\n{text}'}
+    return texts | {header: f'#line 1 "ddrecon/{header}"\n{text}'}
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A kernel with the `record` it is given; `kept` is what this points to."""
+    """A kernel with its `record`; `arrays` is what this points to."""
 
     kernel: TextKernel
     record: Any
-    kept: Any
-    like: Tensor
+    arrays: list[Tensor]
 
     def launch(self, count: int, threads: int | None = None, **changed: Any) -> None:
         """Does `count` items, with numbers and contiguous arrays `changed`."""
         for name, value in changed.items():
             self.kernel.write(self.record, name, value)
-        launch(self.kernel.kernel, count, [self.record], self.like, threads)
+        launch(self.kernel.kernel, count, [self.record], self.arrays[0], threads)
 
 
-def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
+def declarations(declared: str) -> Iterator[tuple[str, bool, str, int]]:
     """Of each name: its type's word, whether it is an array, of how many in a list (0: none)."""
-    for declaration in filter(str.strip, given.split(";")):
+    for declaration in filter(str.strip, declared.split(";")):
         word, names = declaration.split(maxsplit=1)
         for name in names.split(","):
-            star, one, count = re.fullmatch(r"(\*?)(\w+)(?:\[(\d+)\])?", name.strip()).groups()
-            yield word, bool(star), one, int(count or 0)
+            star, variable, count = re.fullmatch(r"(\*?)(\w+)(?:\[(\d+)\])?", name.strip()).groups()
+            yield word, bool(star), variable, int(count or 0)
 
 
-def names_of(given: str) -> str:
-    """The names that `given` declares, in order: arguments of a function, or a record of C++."""
-    return ", ".join(name for _, _, name, _ in declarations(given))
+def names_of(declared: str) -> str:
+    """The names that are `declared`, in order: arguments of a function, or a record of C++."""
+    return ", ".join(name for _, _, name, _ in declarations(declared))
 
 
 def cut(total: int, length: int, like: Tensor) -> tuple[int, int]:

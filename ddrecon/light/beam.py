@@ -23,9 +23,11 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.remember import remember
 
 MOST_NUMBERS = 1 << 23
-"""So many numbers of masses are held at once, or a quarter of the moments' where that is more:
-cells then receive the light of several beams in one pass. torch's operations hold more of each.
+"""Numbers of masses held at once, or a quarter of the moments' where that is more: cells then
+receive the light of several beams in one pass. torch's operations hold more of each.
 """
+MOST_BEAMS = 48
+"""Beams that kernels receive at once, at most."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,8 @@ class Beam:
     """A directional light inside the volume.
 
     `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
-    `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside.
-    With a `profile` [1, z, y, x] irradiance is that many times as much in each cell.
+    `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside,
+    in cells times the `profile` [1, z, y, x], if any.
     """
 
     mass: Tensor
@@ -47,8 +49,8 @@ class Beam:
     ) -> Tensor:
         """The integral of `scattering` p over each segment of view rays, `[N - 1, K or C, R]`.
 
-        That is what E2.2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s per
-        unit of its scale, at the `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
+        E2.2 without E tau / (4 pi). `scattering` [N, K, R]: kappa_s per unit of its scale, at the
+        `nodes`; `peak` [N, C, R]: the forward peak's depth there (E8.7).
         """
         cosine = -(nodes.direction @ self.direction)
         return nodes.integral(scattering * seen.along(peak, cosine))
@@ -78,11 +80,12 @@ def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int
     These moments are the sum of p_l Y_k(w) E tau / (4 pi).
     """
     directions, *_ = unit_directions(*(light.direction for light in lights))
-    irradiances, factors = (light.irradiance for light in lights), remaining_moments(cells)
-    same = None if cells.is_cellwise else factors
-    weights = _beam_weights(directions, degree, same, *irradiances)
-    phi = attenuate(cells, directions, weights, is_kept=True)
-    return weigh(phi, factors) if cells.is_cellwise else phi
+    weights = _beam_weights(directions, degree, *(light.irradiance for light in lights))
+    factors = remaining_moments(cells)
+    if cells.is_cellwise:
+        return weigh(attenuate(cells, directions, weights, is_kept=True), factors)
+    weights = weights * by_harmonic(factors, degree).flatten(1)
+    return attenuate(cells, directions, weights, is_kept=True)
 
 
 @remember
@@ -99,13 +102,10 @@ def split_directions(directions: Tensor, count: int) -> tuple[Tensor, ...]:
 
 
 @remember
-def _beam_weights(
-    directions: Tensor, degree: int, factors: Tensor | None, *irradiances: Tensor
-) -> Tensor:
-    """What `attenuate` is to weight beams by: Y_k(w) E / (4 pi), times `factors`, which are p_l."""
-    weights = harmonics(directions, degree).T[..., None]
-    weights = weights * torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
-    return weights if factors is None else weights * by_harmonic(factors, degree).flatten(1)
+def _beam_weights(directions: Tensor, degree: int, *irradiances: Tensor) -> Tensor:
+    """The moments Y_k(w) E / (4 pi) of beams outside, [L, K, C]."""
+    irradiance = torch.stack(torch.broadcast_tensors(*irradiances))
+    return harmonics(directions, degree).T[..., None] * irradiance[:, None] / (4 * math.pi)
 
 
 def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False) -> Tensor:
@@ -118,30 +118,26 @@ def attenuate(cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool 
     field, (_, moments, colors) = cells.extinction.field, weights.shape
     quarter = moments * colors // (4 * len(field))
     if is_fused(directions):
-        from ddrecon.light.fused.receive import MOST_BEAMS
-
         count = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), quarter))
     else:
         count = max(1, quarter // 8)
-    parts = zip(split_directions(directions, count), weights.split(count), strict=True)
-    return reduce(torch.add, (attenuate_few(cells, *some, is_kept) for some in parts))
+    groups = zip(split_directions(directions, count), weights.split(count), strict=True)
+    return reduce(torch.add, (attenuate_few(cells, *group, is_kept) for group in groups))
 
 
 def attenuate_few(
     cells: Medium, directions: Tensor, weights: Tensor, is_kept: bool = False
 ) -> Tensor:
-    """What is received of a few beams, [moments, C, z, y, x]."""
+    """What `attenuate` returns of at most `MOST_BEAMS`."""
     extinction, has_kernel = cells.extinction, is_fused(directions)
-    field, scale = extinction.field, extinction.scale
 
     def receive() -> Tensor:
+        field = extinction.field
         entered, steps = sum_masses(field, cells.grid, directions, extinction.mass_bound)
         if has_kernel:
             from ddrecon.light.fused.receive import receive
 
-            colors = max(weights.shape[2], len(scale))
-            scales = scale.flatten().expand(colors)
-            return receive(field, scales, entered, steps, weights.expand(-1, -1, colors))
+            return receive(field, extinction.scale, entered, steps, weights)
         tau = extinction.mean_transmittance(entered, steps[:, None, None, None, None])
         return torch.einsum("lmc,lczyx->mczyx", weights, tau)
 

@@ -55,8 +55,7 @@ def rotate_directions(vector: Tensor, light: EnvironmentLight) -> Tensor:
 def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
     """The same function of direction as the map `radiance` [C, h, w], with at least so many pixels.
 
-    Rows lie on the poles, so `times_down` nodes for each step between two; sectors are cut into an
-    odd number, so that one of them keeps the center.
+    Sectors are cut into an odd number, so that one of them keeps the center.
     """
     height, width = radiance.shape[1:]
     times_down = math.ceil((rows - 1) / (height - 1))
@@ -74,24 +73,23 @@ def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
 def pixel_moments(height: int, width: int) -> np.ndarray:
     """Integrals over the sphere of each pixel's weight times 1, x, y, z: `[4, h, w]`, float64.
 
-    The weight is the pixel's share in the bilinear map, so the integrals of 1 sum to 4 pi. Each is
-    one of the polar angle, by rows, times one of the azimuth a, by columns: with the weight falling
-    linearly to 0 over one `step` on both sides, those of sin a and cos a are `chord` times the
-    middle's.
+    The weight is the pixel's share in the bilinear map, so the integrals of 1 sum to 4 pi. It falls
+    linearly to 0 over one `step` on both sides: integrals of sin a and cos a over the azimuth a are
+    `chord` times the middle's.
     """
-    ones, sines, cosines = _row_moments(height)
+    area, sine, cosine = _row_moments(height)
     step = 2 * math.pi / width
     azimuth = step * (np.arange(width) + 0.5)
     chord = 2 * (1 - math.cos(step)) / step
-    whole, x, z = np.full(width, step), chord * np.sin(azimuth), -chord * np.cos(azimuth)
-    factors = (ones, whole), (sines, x), (cosines, whole), (sines, z)
+    even, x, z = np.full(width, step), chord * np.sin(azimuth), -chord * np.cos(azimuth)
+    factors = (area, even), (sine, x), (cosine, even), (sine, z)
     return np.stack([np.outer(row, column) for row, column in factors])
 
 
 def _row_moments(height: int) -> tuple[np.ndarray, ...]:
     """Integrals over the angle t from +y of each row's weight times sin t, sin^2 t, sin t cos t.
 
-    The weight is 1 on the row, falling linearly to 0 on the next. By Gauss's rule between rows.
+    The weight is 1 on the row and falls linearly to 0 on the next.
     """
     nodes, weights = np.polynomial.legendre.leggauss(16)
     fraction, step = (nodes + 1) / 2, math.pi / (height - 1)

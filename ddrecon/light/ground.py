@@ -1,8 +1,7 @@
 """A ground: an unbounded Lambertian plane under the box, and the light that it sends into that.
 
-The plane is divided into texels, which cover all of it (E5.2): even ones under the box, and beyond
-it ever wider ones. Light from the ground reaches cells along the directions of a quadrature, each
-cell along each from where its ray leaves the ground (E5.3).
+Texels cover all of the plane (E5.2): even ones under the box, and beyond it ever wider ones. The
+ground's light reaches cells along the directions of a quadrature (E5.3).
 """
 
 from __future__ import annotations
@@ -53,8 +52,8 @@ class Ground:
     """What reflects the part `albedo` [C], from 0 to 1, of the light that falls on a `plane`.
 
     It does so evenly into all directions. The plane lies at the box's bottom or below. A map of
-    albedo [C, rows, columns] covers what is straight under the box, along both axes from low to
-    high; beyond it is the map's mean.
+    albedo [C, rows, columns] lies under the box, along both axes from low to high; beyond that is
+    its mean.
     """
 
     albedo: Tensor
@@ -153,20 +152,15 @@ def _place(points: Tensor, grid: Grid, axis: int) -> Tensor:
 def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
     """Unit directions [N, 3] towards higher indices along `axis`, and their solid angles [N].
 
-    They lie on a spiral, each turned by the golden angle, as dense everywhere for a `power` of 1,
-    and as the cosine to the axis for 1/2. Even light's irradiance is exact.
+    They lie on a spiral of the golden angle, as dense everywhere for a `power` of 1, and as the
+    cosine to the axis for 1/2. Even light's irradiance is exact.
     """
     number = torch.arange(count, dtype=torch.float64)
     share, azimuth = 1 - (number + 0.5) / count, number * math.pi * (3 - math.sqrt(5))
     cosine = share**power
     sine = (1 - cosine**2).sqrt()
-    along = {
-        axis: cosine,
-        (axis + 1) % 3: sine * azimuth.cos(),
-        (axis + 2) % 3: sine * azimuth.sin(),
-    }
-    directions = torch.stack([along[k] for k in range(3)], -1)
-    return directions, 2 * math.pi / count * power * share ** (power - 1)
+    directions = torch.stack([cosine, sine * azimuth.cos(), sine * azimuth.sin()], -1)
+    return directions.roll(axis, -1), 2 * math.pi / count * power * share ** (power - 1)
 
 
 def light_from_below(
@@ -174,8 +168,8 @@ def light_from_below(
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """phi of what a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
 
-    It is given the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much more
-    that is. What it returns is less the light that is `ambient` [C] from everywhere.
+    Its arguments are the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much
+    more that is. It returns phi less that of light that is `ambient` [C] from everywhere.
     """
     directions, angles = (field.to(ambient) for field in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])

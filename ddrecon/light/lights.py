@@ -72,14 +72,9 @@ class BeamLight:
     power: Tensor
     radius: Tensor
 
-    @property
-    def unconfined(self) -> DirectionalLight:
-        """Light of an irradiance equal to its power, everywhere."""
-        return DirectionalLight(self.direction, self.power)
 
-
-Given = DirectionalLight | AmbientLight | PointLight | BeamLight
+PlainLight = DirectionalLight | AmbientLight | PointLight | BeamLight
 """Lights that are not decomposed into others."""
-Light = Given | EnvironmentLight
+Light = PlainLight | EnvironmentLight
 BRIGHTNESS = ("irradiance", "radiance", "intensity", "power", "scale")
 """Their numbers that multiply the light they send."""

@@ -64,11 +64,11 @@ def fill(phi: Tensor, degree: int) -> Tensor:
     return torch.cat([phi, phi.new_zeros(missing, *phi.shape[1:])]) if missing > 0 else phi
 
 
-def add(phi: Tensor, other: Tensor) -> Tensor:
+def add(phi: Tensor, more: Tensor) -> Tensor:
     """The light of both; moments that one of them lacks are zero there."""
-    few, many = sorted((phi, other), key=len)
+    few, many = sorted((phi, more), key=len)
     if len(few) == len(many):
-        return phi + other
+        return phi + more
     low, high = many.split([len(few), len(many) - len(few)])
     total = low + few
     return torch.cat([total, high.expand(-1, *total.shape[1:])])
@@ -102,13 +102,13 @@ def radiance_along(phi: Tensor, direction: Sequence[Tensor], more: Tensor | None
 
     `direction`: unit, its components along z, y and x broadcast to `[C, z, y, x]`.
     """
-    (mean, *others), (z, y, x) = phi.unbind(), direction
-    radiance = mean if more is None else mean + more
-    if others:
-        for k, value in each_harmonic(z, y, x, math.isqrt(len(phi)) - 1):
-            if k > 0:
-                radiance = torch.addcmul(radiance, others[k - 1], value)
-    return floored(radiance, mean, bool(others))
+    # Cut, not indexed: on the way back this is put together once.
+    moments, (z, y, x) = phi.unbind(), direction
+    radiance = moments[0] if more is None else moments[0] + more
+    for k, value in each_harmonic(z, y, x, math.isqrt(len(phi)) - 1):
+        if k > 0:
+            radiance = torch.addcmul(radiance, moments[k], value)
+    return floored(radiance, moments[0], is_directed=len(phi) > 1)
 
 
 def floored(radiance: Tensor, mean: Tensor, is_directed: bool) -> Tensor:

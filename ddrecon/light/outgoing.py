@@ -15,7 +15,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
@@ -28,14 +27,8 @@ def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
 
 def _factors(medium: Medium) -> Tensor:
     """(1 - f) p_l, or p_l, by the degree l."""
-    if medium.is_cellwise:
-        return remaining_moments(medium)
-    return _weigh(medium.forward_fraction, remaining_moments(medium))
-
-
-@remember
-def _weigh(fraction: Tensor, moments: Tensor) -> Tensor:
-    return (1 - fraction) * moments
+    moments = remaining_moments(medium)
+    return moments if medium.is_cellwise else (1 - medium.forward_fraction) * moments
 
 
 def scatter_towards(
@@ -47,8 +40,7 @@ def scatter_towards(
 ) -> Tensor:
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
 
-    With what the `turned` beams scatter (E8.12), or with `more` of skies, of which `light` may say
-    what a ground hides. It is floored as `radiance_along` says.
+    What the `turned` beams scatter (E8.12), or `more` of skies, is added; the sum is `floored`.
     """
     more = recompute(sum_turned, medium, rays, turned) if turned else more
     if is_fused() and len(light) > 1 and not medium.is_cellwise and rays.pane is None:
@@ -84,10 +76,7 @@ def sum_turned(medium: Medium, rays: Rays, turned: Sequence[ReversedBeam]) -> Te
 
 
 def _scatter_turned(medium: Medium, beam: ReversedBeam, towards: Sequence[Tensor]) -> Tensor:
-    """What light of `beam` scatters `towards` a camera: its phase function is that of E8.12.
-
-    It is per unit of what `scatter_once_more` is.
-    """
+    """What light of `beam` scatters `towards` a camera (E8.12), per unit of `scatter_once_more`."""
     z, y, x = (a * b for a, b in zip(beam.direction, towards, strict=True))
     cosine = torch.atleast_3d(z + y + x)
     if medium.is_cellwise:

@@ -1,9 +1,8 @@
 """Beams that a backward peak turns back and forth: pairs of beams against each other (E8.11).
 
-The part b of scattering turns light exactly back. So light of a directional light goes on as two
-beams, F along its direction and G against it. Each slice that rays cross is a layer that lets light
-pass and turns light back (E8.13): what layers turn back is added up from the far end, and light is
-followed from the near one.
+The part b of scattering turns light exactly back: a directional light goes on as F along its
+direction and G against it. Each slice that rays cross is a layer that passes and turns light
+(E8.13).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import add, beam_moments, weigh
-from ddrecon.light.shear import Shear, cross_grid, sum_masses
+from ddrecon.light.shear import Shear, sum_masses
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
@@ -46,7 +45,7 @@ class ReversedBeam:
 
 @dataclass(frozen=True)
 class BeamPair:
-    """The beams `along` a light's `direction` [3] and `against` it, E / (4 pi) times F and G.
+    """E / (4 pi) times F `along` a light's `direction` [3], and times G `against` it.
 
     Both are [C, z, y, x], averaged over each cell; `received` is the part of F never scattered.
     """
@@ -93,16 +92,15 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> BeamPair:
 
 def turn_in_cells(
     extinction: Tensor, turned: Tensor, grid: Grid, direction: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """F and G over what was never scattered, averaged over cells, [C, z, y, x] (E8.13).
 
     `extinction` and `turned`, b kappa_s, are [C, z, y, x] [1/u]; `direction` [3]: unit, array
     order, the way that F goes.
     """
-    slicing, slope, step = cross_grid(grid, direction)
-    fields = [slicing.lay(field) for field in (extinction, turned)]
-    shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
-    path = step * shear.inside(fields[0])
+    shear = Shear.along(grid, direction)
+    fields = [shear.slicing.lay(field) for field in (extinction, turned)]
+    path = shear.step * shear.inside(fields[0])
     depth, back = (shear.to_rays(field, 0.0) * path for field in fields)
 
     # Each layer: what it lets pass and what it turns back, of light from either side. Hyperbolic
@@ -120,9 +118,9 @@ def turn_in_cells(
 
     # From the near end, F over exp(-t): exp(depth) more than what a layer lets pass.
     leaving = passing / (1 - turning * behind)
-    kept = torch.exp(depth - rate) * norm / (1 - turning * behind)
+    growth = torch.exp(depth - rate) * norm / (1 - turning * behind)
     entering = [torch.ones_like(depth[0])]
-    for factor in kept[:-1]:
+    for factor in growth[:-1]:
         entering.append((entering[-1] * factor).clamp(max=MOST))
 
     # Means over a layer, of what enters it from either side: of its own way, and turned back.
@@ -132,5 +130,4 @@ def turn_in_cells(
     share = torch.stack(entering) * norm / decay_mean(depth)
     along = (onward + turned_back * incoming) * share
     against = (onward * incoming + turned_back) * share
-    forth, back = (slicing.lift(shear.to_cells(values)) for values in (along, against))
-    return forth, back
+    return tuple(shear.slicing.lift(shear.to_cells(values)) for values in (along, against))

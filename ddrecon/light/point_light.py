@@ -5,11 +5,9 @@ At x, seen from the light at p, the irradiance and the direction of travel are
     I tau / s,    (x - p) / sqrt(s),    s = max(|x - p|^2, R^2 / 3),
 
 where R is the radius of a sphere of one cell's volume: the mean of 1 / r^2 over such a sphere
-around the light is 3 / R^2. Nearer than that 1 / r^2 grows no more and the direction fades to none,
-so all is finite, with finite derivatives, also for a light in a cell's center.
+around the light is 3 / R^2. So all is finite, with finite derivatives, in its own cell as well.
 
-Every cell is reached by a straight march through the field, from the light or from where its ray
-enters the box, to where it enters the cell; within the cell the field is constant.
+Light goes straight through the field to where it enters a cell; in that the field is constant.
 """
 
 from __future__ import annotations
@@ -42,8 +40,8 @@ class PointBeam:
     """A point light inside the volume.
 
     `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
-    `position` [3]: in array order; `irradiance` [C, 1, 1, 1]: at a distance of 1 u;
-    `least_square` [u^2]: what squared distances count as at least, R^2 / 3.
+    `position` [3]: in array order; `irradiance` [C, 1, 1, 1]: at a distance of 1 u; `least_square`
+    [u^2]: R^2 / 3, the least that squared distances count as.
     """
 
     mass: Tensor
@@ -71,10 +69,10 @@ class PointBeam:
         return nodes.integral(scattering * phase, angle / distance)
 
     def passing(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """How view rays pass the light: from `origin` [R, 3] along unit `direction` [R, 3].
+        """How view rays from `origin` along unit `direction` [R, 3] pass the light.
 
-        The way [R] [u] from where a ray is nearest to its origin, and the square [R] [u^2] of its
-        distance there, bounded as all squared distances are.
+        The way [R] [u] to the origin from where a ray is nearest to the light, and the square [R]
+        [u^2] of its distance there, bounded as all are.
         """
         offset = origin - self.position
         foot = (offset * direction).sum(-1)
@@ -106,9 +104,8 @@ def _least_square(grid: Grid) -> float:
 
 
 def _go_to_cells(medium: Medium, position: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The mass from `position` to where its light enters each cell, and the path through that [u].
-
-    And the square of the distance to the center [u^2], and the direction there [z, y, x, 3].
+    """The mass from `position` to where its light enters each cell, the path through that [u], the
+    squared distance to the center [u^2], and the direction there [z, y, x, 3].
     """
     grid, extinction = medium.grid, medium.extinction
 
@@ -118,24 +115,17 @@ def _go_to_cells(medium: Medium, position: Tensor) -> tuple[Tensor, Tensor, Tens
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
 
-    # The ray's path through a cell is one over its speed [cells/u] along the axis on which it is
-    # fastest, as for beams. Beside the light, where the direction fades and that would grow without
-    # bound, half the path is at most the distance: no ray begins behind its light.
-    speed = torch.linalg.vector_norm(
-        direction / direction.new_tensor(grid.spacing), ord=NORM_ORDER, dim=-1
-    )
+    # The path through a cell is one over the largest speed [cells/u] along an axis, as for beams.
+    # Half of it is at most the distance: no ray begins behind its light.
+    cells = direction / direction.new_tensor(grid.spacing)
+    speed = torch.linalg.vector_norm(cells, ord=NORM_ORDER, dim=-1)
     step = 1 / torch.maximum(speed, 0.5 / distance)
 
     # Mass from the light to where the ray enters the cell, and from there to the center.
-    entries = centers - 0.5 * step[..., None] * direction
-    entered = _mass_to(
-        extinction.field,
-        grid,
-        position,
-        entries.flatten(0, 2),
-        (distance - 0.5 * step).flatten(),
-    ).unflatten(1, grid.shape)
-    return entered, step, square, direction
+    entries = (centers - 0.5 * step[..., None] * direction).flatten(0, 2)
+    lengths = (distance - 0.5 * step).flatten()
+    entered = _mass_to(extinction.field, grid, position, entries, lengths)
+    return entered.unflatten(1, grid.shape), step, square, direction
 
 
 def _bounded_square(offset: Tensor, least: float) -> Tensor:
@@ -171,8 +161,8 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
 def _part_inside(grid: Grid, position: Tensor, ends: Tensor) -> Tensor:
     """The fraction [P] of the way from `position` to `ends` [P, 3] that lies in the box.
 
-    It is 1 for a light inside. Along each axis on which the light is outside, the way enters at the
-    face on the light's side: of `offset`, what lies `beyond` that face is inside.
+    Along each axis on which the light is outside, the way enters at the face on the light's side:
+    of `offset`, what lies `beyond` that face is inside.
     """
     low, high = (position.new_tensor(corner) for corner in (grid.lower, grid.upper))
     is_below, is_above = position < low, position > high

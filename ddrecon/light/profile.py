@@ -32,8 +32,8 @@ NORM_ORDER = 8
 def seen_radius(radius: Tensor, width: float | Tensor) -> Tensor:
     """The radius [u] that a beam of `radius` has among cells of `width`."""
     thinnest = torch.as_tensor(THINNEST * width, dtype=radius.dtype, device=radius.device)
-    both = torch.stack(torch.broadcast_tensors(radius, thinnest))
-    return torch.linalg.vector_norm(both, ord=NORM_ORDER, dim=0)
+    radii = torch.stack(torch.broadcast_tensors(radius, thinnest))
+    return torch.linalg.vector_norm(radii, ord=NORM_ORDER, dim=0)
 
 
 @remember
@@ -53,9 +53,8 @@ def mean_profile(
 ) -> Tensor:
     """The mean of E5.5 over boxes of `size` around `centers` (along z, y, x), [z, y, x].
 
-    `radius` may differ from box to box. Where the beam has come through a face across an axis, and
-    gone on by [3] for each unit along that, these are `inside`, and `position` is where it met the
-    face.
+    `radius` may differ from box to box. A refracted beam met a face at `position`; `inside` are the
+    axis across that face, and how far it goes [3] for each unit along that axis.
     """
     travel = normalize(array_order(direction), dim=0)
     offset = [c - p for c, p in zip(centers, array_order(position), strict=True)]
@@ -74,6 +73,6 @@ def mean_profile(
         return torch.exp(-2 / radius**2 * (square + (more + across @ across)))
 
     middles = [(k + 0.5) / POINTS - 0.5 for k in range(POINTS)]
-    shifts = [*product(*([h * part for part in middles] if h else [0.0] for h in size))]
+    shifts = [*product(*([h * middle for middle in middles] if h else [0.0] for h in size))]
     total = reduce(torch.add, (recompute(sample, radius.new_tensor(shift)) for shift in shifts))
     return total * (2 / (math.pi * len(shifts))) / radius**2

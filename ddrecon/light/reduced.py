@@ -32,21 +32,20 @@ from ddrecon.numerics.remember import remember
 
 @dataclass(frozen=True)
 class Received:
-    """What each cell receives of beams, light that is not yet scattered, averaged over the cell.
+    """What each cell receives of light that is not yet scattered, averaged over the cell.
 
-    `source` [K, C, z, y, x]: Q0, Q1 and what follows, to the degree asked for. `mean` [C, z, y, x]:
-    that of the light itself over directions, what peaks have turned among it. `turned`: light that
-    backward peaks have turned back and forth (E8.11).
+    `source` [K, C, z, y, x]: Q0, Q1 and what follows, to a degree. `mean` [C, z, y, x]: the light's
+    mean over directions. `turned`: light that backward peaks have turned (E8.11), part of the mean.
     """
 
     source: Tensor
     mean: Tensor
     turned: tuple[ReversedBeam, ...] = ()
 
-    def plus(self, other: Received) -> Received:
+    def plus(self, more: Received) -> Received:
         """The light of both."""
-        source, turned = add(self.source, other.source), self.turned + other.turned
-        return Received(source, self.mean + other.mean, turned)
+        source, turned = add(self.source, more.source), self.turned + more.turned
+        return Received(source, self.mean + more.mean, turned)
 
     def across(self, profile: Tensor) -> Received:
         """This light of directional lights, its irradiance times `profile` [1, z, y, x]."""
@@ -56,52 +55,47 @@ class Received:
 
 def follow_lights(medium: Medium, lights: Sequence[Source]) -> tuple[Beam | PointBeam, ...]:
     """The beams of directional, point and beam `lights` in `medium`."""
-    parallel = _unconfined(medium, lights)
-    beams: list[Beam | PointBeam] = [*follow_beams(medium, parallel)] if parallel else []
+    even, confined, points = _sort_lights(medium, lights)
+    beams: list[Beam | PointBeam] = [*follow_beams(medium, even)] if even else []
+    for entered in confined:
+        (beam,) = follow_beams(medium, [entered.light])
+        beams.append(replace(beam, profile=entered.profile))
+    return (*beams, *(follow_point_light(medium, light) for light in points))
+
+
+def _sort_lights(
+    medium: Medium, lights: Sequence[Source]
+) -> tuple[list[DirectionalLight], list[RefractedBeam], list[PointLight]]:
+    """Those of `lights` that are the same in all of the box, beams that are not, and points."""
+    even, confined = list[DirectionalLight](), list[RefractedBeam]()
     for light in lights:
-        if isinstance(light, PointLight):
-            beams.append(follow_point_light(medium, light))
-        for confined in _confine(medium, light):
-            (beam,) = follow_beams(medium, [confined.light])
-            beams.append(replace(beam, profile=confined.profile))
-    return tuple(beams)
-
-
-def _confine(medium: Medium, light: Source) -> tuple[RefractedBeam, ...]:
-    """The beams of `light` that shine on a part of the box, or on each cell differently."""
-    if medium.index != 1 and isinstance(light, DirectionalLight | BeamLight):
-        return enter_faces(medium.grid, medium.index, light)
-    if isinstance(light, BeamLight):
-        beam = light.position, light.direction, light.radius
-        return (RefractedBeam(light.unconfined, profile_in(medium.grid, *beam)),)
-    return ()
-
-
-def _unconfined(medium: Medium, lights: Sequence[Source]) -> list[DirectionalLight]:
-    """Those of `lights` that are the same in all of the box."""
-    everywhere = lights if medium.index == 1 else ()
-    return [light for light in everywhere if isinstance(light, DirectionalLight)]
+        if medium.index != 1 and isinstance(light, DirectionalLight | BeamLight):
+            confined += enter_faces(medium.grid, medium.index, light)
+        elif isinstance(light, BeamLight):
+            profile = profile_in(medium.grid, light.position, light.direction, light.radius)
+            power = DirectionalLight(light.direction, light.power)
+            confined.append(RefractedBeam(power, profile))
+        elif isinstance(light, DirectionalLight):
+            even.append(light)
+    return even, confined, [light for light in lights if isinstance(light, PointLight)]
 
 
 def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Received:
     """What `cells` receive of directional, point and beam `lights`.
 
-    Of lights that go along w the source is the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
-    moments of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What
+    The source of lights that go along w is the sum of p_l Y_k(w) E tau / (4 pi), with the moments
+    p_l of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What
     backward peaks turn back belongs to the beams of parallel light (E8.11).
     """
-    lit = list[Received]()
-    if parallel := _unconfined(cells, lights):
-        lit.append(_receive_parallel(cells, parallel, degree))
-    for light in lights:
-        if isinstance(light, PointLight):
-            phi = receive_point_light(cells, light, degree)
-            lit.append(Received(weigh(phi, remaining_moments(cells)), phi[0]))
-        for confined in _confine(cells, light):
-            received = _receive_parallel(cells, [confined.light], degree)
-            lit.append(received.across(confined.profile))
-    nothing = torch.zeros_like(cells.extinction.value)
-    return reduce(Received.plus, lit) if lit else Received(nothing[None], nothing)
+    even, confined, points = _sort_lights(cells, lights)
+    lit = [_receive_parallel(cells, even, degree)] if even else []
+    for beam in confined:
+        lit.append(_receive_parallel(cells, [beam.light], degree).across(beam.profile))
+    for light in points:
+        phi = receive_point_light(cells, light, degree)
+        lit.append(Received(weigh(phi, remaining_moments(cells)), phi[0]))
+    dark = torch.zeros_like(cells.extinction.value)
+    return reduce(Received.plus, lit) if lit else Received(dark[None], dark)
 
 
 def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Received:
@@ -135,22 +129,14 @@ def ambient_sky(radiance: Tensor) -> Sky:
 def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Tensor | None:
     """phi of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
 
-    Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
-    and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
-    as going along its middle (E2.8).
+    Mean and flux are exact; moments of higher degree take all light of a region as going along its
+    middle (E2.8).
     """
-    skies = _lit_skies(lights)
-    if not skies:
-        return None
-    if medium.index != 1:
-        regions = refract_skies(medium.grid, medium.index, skies)
-        lit = (
-            profile * attenuate(medium, region.travel, moment_weights(region, degree))
-            for region, profile in regions
-        )
-        return reduce(torch.add, lit)
-    weights = torch.cat([moment_weights(sky, degree) for sky in skies])
-    return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)
+    lit = []
+    for sky, profile in _lit_skies(medium, lights):
+        phi = attenuate(medium, sky.travel, moment_weights(sky, degree))
+        lit.append(phi if profile is None else profile * phi)
+    return reduce(torch.add, lit) if lit else None
 
 
 def moment_weights(sky: Sky, degree: int) -> Tensor:
@@ -169,8 +155,7 @@ def scatter_sky(
     """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
     That is the inner integral of E2.2, sum over directions of p E tau / (4 pi), with the exact
-    phase function p. `towards`: unit, its components broadcast to cells; these, and the result, are
-    those of a `period` of the medium.
+    phase function p. `towards`: unit; its components and the result are those of a `period`.
     """
 
     def scatter(travel: Tensor, irradiance: Tensor) -> Tensor:
@@ -180,22 +165,25 @@ def scatter_sky(
         return period.extend(visible) * medium.seen.phase.value(torch.atleast_3d(z + y + x))
 
     total = period.extend(torch.zeros_like(medium.extinction.value))
-    if medium.index != 1:
-        for region, profile in refract_skies(medium.grid, medium.index, _lit_skies(skies)):
-            light = recompute(scatter, region.travel[0], region.irradiance[0])
-            total = total + profile * light
-        return total / (4 * math.pi)
-    for sky in _lit_skies(skies):
+    for sky, profile in _lit_skies(medium, skies):
         for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
-            total = total + recompute(scatter, travel, irradiance)
+            light = recompute(scatter, travel, irradiance)
+            total = total + (light if profile is None else profile * light)
     return total / (4 * math.pi)
 
 
-def _lit_skies(lights: Sequence[object]) -> list[Sky]:
-    """The skies that differ from their mean, or may come to do so because they are being varied."""
-    skies = [light for light in lights if isinstance(light, Sky)]
-    return [
+def _lit_skies(medium: Medium, lights: Sequence[object]) -> list[tuple[Sky, Tensor | None]]:
+    """The skies that differ from their mean, or may come to do so because they are being varied.
+
+    Where `medium` refracts light it is that of each region behind each face, with its profile.
+    """
+    skies = [
         sky
-        for sky in skies
-        if len(sky.travel) and (is_varied(sky.irradiance) or bool((sky.irradiance != 0).any()))
+        for sky in lights
+        if isinstance(sky, Sky)
+        and len(sky.travel)
+        and (is_varied(sky.irradiance) or bool((sky.irradiance != 0).any()))
     ]
+    if medium.index != 1:
+        return [*refract_skies(medium.grid, medium.index, skies)]
+    return [(sky, None) for sky in skies]

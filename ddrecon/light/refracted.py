@@ -47,7 +47,7 @@ def enter_faces(
 def _enter(
     grid: Grid, index: float, direction: Tensor, power: Tensor, *beam: Tensor
 ) -> tuple[RefractedBeam, ...]:
-    travel, found = normalize(array_order(direction), dim=0), list[RefractedBeam]()
+    travel, entered_beams = normalize(array_order(direction), dim=0), list[RefractedBeam]()
     for axis in range(3):
         cosine = travel[axis].abs()
         if not cosine > 0:
@@ -58,37 +58,35 @@ def _enter(
         slope, centers, size = inside / inside[axis], grid.centers(travel), list(grid.spacing)
         face = (grid.lower if travel[axis] > 0 else grid.upper)[axis]
         profile = _behind(grid, centers, axis, slope, face)
-        line = list(centers)
-        line[axis], size[axis] = torch.full_like(centers[axis][:1, :1, :1], face), 0.0
-        at_face = 1 + 0 * (line[0] + line[1] + line[2])
+        on_face = list(centers)
+        on_face[axis], size[axis] = torch.full_like(centers[axis][:1, :1, :1], face), 0.0
+        at_face = 1 + 0 * (on_face[0] + on_face[1] + on_face[2])
         if beam:
             position, radius = array_order(beam[0]), seen_radius(beam[1], max(grid.spacing))
-            met = array_order(position + (face - position[axis]) / travel[axis] * travel)
-            given = met, direction, radius, (axis, slope)
-            profile = profile * mean_profile(centers, grid.spacing, *given)
-            at_face = mean_profile(line, size, *given)
+            entry = array_order(position + (face - position[axis]) / travel[axis] * travel)
+            refracted = entry, direction, radius, (axis, slope)
+            profile = profile * mean_profile(centers, grid.spacing, *refracted)
+            at_face = mean_profile(on_face, size, *refracted)
         light = DirectionalLight(array_order(inside), entered)
-        found.append(RefractedBeam(light, profile[None], axis, at_face[None]))
-    return tuple(found)
+        entered_beams.append(RefractedBeam(light, profile[None], axis, at_face[None]))
+    return tuple(entered_beams)
 
 
 def _behind(grid: Grid, centers: list[Tensor], axis: int, slope: Tensor, face: float) -> Tensor:
-    """What part of each cell [z, y, x] light reaches that has come in through a `face`.
+    """The fraction of each cell [z, y, x] that light reaches through a `face` across `axis`.
 
-    That lies across `axis`, along which light goes on by `slope` [3] a unit.
+    Behind the face light goes on by `slope` [3] for each unit along that axis.
     """
     total = slope.new_zeros(())
     for k in range(POINTS):
-        way = centers[axis] - face + grid.spacing[axis] * ((k + 0.5) / POINTS - 0.5)
-        part = torch.ones_like(way)
-        for other in (0, 1, 2):
-            if other != axis:
-                met, width = centers[other] - slope[other] * way, grid.spacing[other]
-                low, high = (
-                    (met - end) / width + 0.5 for end in (grid.lower[other], grid.upper[other])
-                )
-                part = part * (low.clamp(0, 1) - high.clamp(0, 1))
-        total = total + part
+        depth = centers[axis] - face + grid.spacing[axis] * ((k + 0.5) / POINTS - 0.5)
+        fraction = torch.ones_like(depth)
+        for across in {0, 1, 2} - {axis}:
+            entry, width = centers[across] - slope[across] * depth, grid.spacing[across]
+            from_low = (entry - grid.lower[across]) / width + 0.5
+            from_high = (entry - grid.upper[across]) / width + 0.5
+            fraction = fraction * (from_low.clamp(0, 1) - from_high.clamp(0, 1))
+        total = total + fraction
     return total / POINTS
 
 

@@ -7,19 +7,18 @@ back. What is interpolated is the field and its integral, never an exponential o
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.constants import constant
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.periods import unroll_along
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder, nearly
 
@@ -39,40 +38,34 @@ def sum_masses(
     [L, 3], unit, array order, the way light travels. `bound`: 1 over the most by which each of two
     corrections may change a mass, 0 for no limit.
 
-    Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
-    between slices, and its mass is carried back to cells to third order: the two corrections.
-    Slices' sides let it in as faces do (E5.9).
-    Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
+    Along an axis of the grid the sum is exact. The two corrections: a slanted beam is also sampled
+    midway between slices, and its mass is carried back to cells to third order. Slices' sides let
+    it in as faces do (E5.9). Returns `[L, K, z, y, x]` and `[L]`, to be recomputed.
     """
     if grid.periodic:
-        found = list[tuple[Tensor, Tensor]]()
-        for one in directions.split(1):
-            period = unroll_along(grid, one[0])
-            mass, path = sum_masses(period.extend(field), period.wide, one, bound)
-            found.append((period.crop(mass), path))
-        return torch.cat([mass for mass, _ in found]), torch.cat([path for _, path in found])
+        beams = [_sum_period(field, grid, direction, bound) for direction in directions.split(1)]
+        return torch.cat([mass for mass, _ in beams]), torch.cat([step for _, step in beams])
+    bound, shears = torch.as_tensor(bound).to(field), cross_grid(grid, directions)
+    steps = torch.stack([shear.step for shear in shears])
     if is_fused(directions):
-        from ddrecon.light.fused import shear
+        from ddrecon.light.fused import shear as fused
 
-        return shear.sum_masses(field, grid, directions, bound)
-    masses, steps = list[Tensor](), list[Tensor]()
-    for direction in directions:
-        if len(field) == 1:
-            each = [_sum_mass(field, grid, direction, bound)]
-        else:
-            each = [recompute(_sum_mass, one, grid, direction, bound) for one in field.split(1)]
-        masses.append(torch.cat([entered for entered, _ in each]))
-        steps.append(each[0][1])
-    return torch.stack(masses), torch.stack(steps)
+        return fused.sum_masses(field, shears, bound), steps
+    return torch.stack([_sum_mass(field, shear, bound) for shear in shears]), steps
 
 
-def _sum_mass(
+def _sum_period(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
-    """What `sum_masses` returns, of one beam and one field [1, z, y, x]."""
-    slicing, slope, step = cross_grid(grid, direction)
-    slices = slicing.lay(field)
-    shear = Shear.of(len(slices), slices.shape[2:], slope)
+    """What `sum_masses` returns of one `direction` [1, 3], in a `grid` that repeats."""
+    period = unroll_along(grid, direction[0])
+    mass, step = sum_masses(period.extend(field), period.wide, direction, bound)
+    return period.crop(mass), step
+
+
+def _sum_mass(field: Tensor, shear: Shear, bound: Tensor) -> Tensor:
+    """The mass [K, z, y, x] of one beam."""
+    slices = shear.slicing.lay(field)
     on_slices = shear.to_rays(slices, 0.0)
     inside = shear.inside(on_slices)
     within, missing = on_slices * inside, on_slices * (1 - inside)
@@ -85,106 +78,116 @@ def _sum_mass(
     # The mass of all slices passed: step sum over j < k of rho_j.
     passed = within.cumsum(0) - within
     limit = ThirdOrder(0, 1, bound * (1 - 0.5 * (1 - inside)))
-    mass = passed * step + limit.bounded((0.5 * curved - missing) * step)
-    return slicing.lift(shear.to_cells(mass, ThirdOrder(0, 1, bound))), step
+    mass = passed * shear.step + limit.bounded((0.5 * curved - missing) * shear.step)
+    return shear.slicing.lift(shear.to_cells(mass, ThirdOrder(0, mass.shape[1], bound)))
 
 
-def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
-    """How a beam along `direction` goes through `grid`: in which slices, and from one to the next.
-
-    There it goes a `step` [u] and drifts by `slope` [2], in rows and columns.
-    """
-    speed = direction / constant(grid.spacing, direction)
-    slicing = Slicing.of(speed.tolist())
-    slope = (
-        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
-    )
-    return slicing, slope, grid.spacing[slicing.axis] / direction[slicing.axis].abs()
+@remember
+def cross_grid(grid: Grid, directions: Tensor) -> tuple[Shear, ...]:
+    """How beams along `directions` [L, 3] go through `grid`."""
+    return tuple(Shear.along(grid, direction) for direction in directions)
 
 
 @dataclass(frozen=True)
 class Shear:
-    """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
+    """Rays along a beam through `grid`: where they meet slices of `size`, by a `lattice` of them.
 
-    Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell. The `faces` by which light enters lie so far from cell 0.
+    From one slice to the next they drift by `slope` [2], in rows and columns, and go a `step` [u]:
+    `numbers` [3]. Ray r meets slice k at cell r - `first` + k `slope`; with this lattice there is a
+    ray for every cell.
     """
 
-    slope: Tensor
+    grid: Grid
+    slicing: Slicing
+    numbers: Tensor
     size: tuple[int, ...]
     lattice: tuple[int, ...]
     first: tuple[int, ...]
-    faces: tuple[float, ...]
 
     @staticmethod
-    def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
-        """The rays that meet so many `slices` of `size` (height, width), or come near."""
-        slopes = slope.tolist()
-        more = [math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slopes]
-        lattice = tuple(n + own + 3 for n, own in zip(size, more, strict=True))
-        first = tuple(1 + own * (s > 0) for own, s in zip(more, slopes, strict=True))
-        faces = (-0.5 + n * (s < -LEAST_SLOPE) for n, s in zip(size, slopes, strict=True))
-        return Shear(slope, tuple(size), lattice, first, tuple(faces))
+    def along(grid: Grid, direction: Tensor) -> Shear:
+        """The rays along `direction` [3] that meet slices of `grid`, or come near."""
+        slicing, slope, step = slice_along(grid, direction)
+        size = tuple(grid.shape[axis] for axis in across(slicing.axis))
+        count, slopes = grid.shape[slicing.axis], slope.tolist()
+        drifts = [math.floor(abs(s) * (count - 1) + 1e-9) + 1 for s in slopes]
+        lattice = tuple(n + drift + 3 for n, drift in zip(size, drifts, strict=True))
+        first = tuple(1 + drift * (s > 0) for drift, s in zip(drifts, slopes, strict=True))
+        return Shear(grid, slicing, torch.cat([slope, step[None]]), size, lattice, first)
 
-    @functools.cached_property
-    def entries(self) -> Tensor:
-        """On which slice rays enter through a side of the box, [*lattice]."""
+    @property
+    def slope(self) -> Tensor:
+        """By rows and by columns, [2]."""
+        return self.numbers[:2]
+
+    @property
+    def step(self) -> Tensor:
+        """The path from one slice to the next [u], a scalar."""
+        return self.numbers[2]
+
+    def inside(self, on_slices: Tensor) -> Tensor:
+        """Which part of a step around each of N slices rays are in the box for, 0 to 1.
+
+        Returns `[N, 1, *lattice]`.
+        """
+        # On which slice a ray enters through a side of the box; through an edge by rows.
         steep = torch.where(self.slope.abs() > LEAST_SLOPE, self.slope, LEAST_SLOPE)
         rows, columns = (
-            (face + first - torch.arange(count, dtype=s.dtype, device=s.device)) / s
-            for s, count, first, face in zip(
-                steep, self.lattice, self.first, self.faces, strict=True
+            (cells * (s < 0) - 0.5 + first - _count(rays, steep)) / s
+            for s, cells, first, rays in zip(
+                steep, self.size, self.first, self.lattice, strict=True
             )
         )
         rows, columns = torch.broadcast_tensors(rows[:, None], columns)
-        # Through an edge by rows.
-        return torch.where(columns - rows < nearly(rows, sum(self.lattice)), rows, columns)
+        is_by_row = columns - rows < nearly(rows, sum(self.lattice))
+        entries = torch.where(is_by_row, rows, columns)
 
-    def inside(self, like: Tensor) -> Tensor:
-        """Which part of a step around slices rays are in the box for, 0 to 1 [N, 1, *lattice].
-
-        There are as many slices as `like` has.
-        """
-        entered = self._numbers(like, 0.5)[:, None, None] - self.entries
-        near = nearly(entered, len(like) + 1)
+        entered = _count(len(on_slices), on_slices)[:, None, None] + 0.5 - entries
+        near = nearly(entered, len(on_slices) + 1)
         is_between = (entered > -near) & (entered < 1 + near)
         return torch.where(is_between, entered, entered.detach().clamp(0, 1))[:, None]
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
 
-        Beyond them they are as their outermost cells. On a cell's center slopes are those of cells
-        among rays, which move the other way: the sides are swapped.
+        On a cell's center slopes are those of cells among rays, which move the other way: the sides
+        are swapped.
         """
-        points = self._points(slices, shift, self.lattice, self.size, 1)
+        points = self._points(_count(len(slices), slices) + shift, self.lattice, self.size, 1)
         return sample_slices(slices.flip(2, 3), -points).unflatten(-1, self.lattice)
 
     def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
-        points = self._points(values, 0.0, self.size, self.lattice, -1)
+        points = self._points(_count(len(values), values), self.size, self.lattice, -1)
         return sample_slices(values, points, third_order).unflatten(-1, self.size)
 
-    def _numbers(self, like: Tensor, shift: float) -> Tensor:
-        count = torch.arange(like.shape[0], dtype=like.dtype, device=like.device)
-        return count + shift
-
     def _points(
-        self,
-        like: Tensor,
-        shift: float,
-        points: tuple[int, ...],
-        cells: tuple[int, ...],
-        sign: int,
+        self, slices: Tensor, points: tuple[int, ...], cells: tuple[int, ...], sign: int
     ) -> Tensor:
-        """Where `points` fall among `cells`, [N, count, 2] in [-1, 1].
+        """Where `points` fall among `cells` on `slices` [N], [N, count, 2] in [-1, 1].
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
-        index, lines = self._numbers(like, shift), []
-        for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
-            drift = sign * (index * slope - first)
-            position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
-            lines.append((2 * position + 1 - size) / size)
-        row, column = lines
+        row, column = (
+            (2 * ((sign * (slices * slope - first))[:, None] + _count(count, slices)) + 1 - size)
+            / size
+            for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True)
+        )
         pairs = torch.broadcast_tensors(column[:, None], row[:, :, None])
         return torch.stack(pairs, -1).flatten(1, 2)
+
+
+def slice_along(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
+    """The slices in which a beam along `direction` [3] goes through `grid`, its slope and step.
+
+    From one slice to the next it drifts by `slope` [2] rows and columns, and goes a `step` [u].
+    """
+    speed = direction / constant(grid.spacing, direction)
+    slicing = Slicing.of(speed.tolist())
+    row, column = across(slicing.axis)
+    slope = torch.stack([speed[row], speed[column]]) / speed[slicing.axis].abs()
+    return slicing, slope, grid.spacing[slicing.axis] / direction[slicing.axis].abs()
+
+
+def _count(size: int, like: Tensor) -> Tensor:
+    return torch.arange(size, dtype=like.dtype, device=like.device)

@@ -1,10 +1,9 @@
-"""The light of an environment map on a volume, as three kinds of light: suns, a mean and a sky.
+"""The light of an environment map on a volume: suns, ambient light, and a sky.
 
 The sphere is cut into regions around well spread directions, in the map's own frame. A region that
-sends much of all light is a sun, a directional light. The mean of the rest is ambient light. By how
-much each region differs from that mean is the sky. The map's power and its first moment are kept
-exactly, and all but the suns' direction is linear in the map (docs/theory.md section 5,
-"Environment maps").
+sends much of all light is a sun, a directional light. The mean of the rest is ambient light; by how
+much regions differ from it is the sky. The map's power and first moment are exact, and all but the
+suns' direction is linear in the map (docs/theory.md section 5, "Environment maps").
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from ddrecon.grid import array_order
 from ddrecon.light.environment import pixel_moments, refine_map, rotate_directions
-from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Given, Light
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PlainLight
 
 PIXELS_PER_REGION = 2
 """Maps with fewer are refined first. More would smear one bright pixel over several regions."""
@@ -47,7 +46,7 @@ class Sky:
     vector: Tensor
 
 
-Source = Given | Sky
+Source = PlainLight | Sky
 """What light comes from once environment maps are decomposed."""
 
 
@@ -86,8 +85,8 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     mean = left[:, 0].sum(0) / (4 * math.pi)
     ambient = AmbientLight(darkest + mean)
 
-    # The sky is what each region differs by from that mean. Light travels away from where it is
-    # seen: hence the signs.
+    # The sky is what each region differs by from that mean; light travels away from where it is
+    # seen.
     deviation = left - mean * geometry
     middles = torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1)
     travel = array_order(rotate_directions(-middles, light))
@@ -97,17 +96,16 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
 
 def count_suns(light: EnvironmentLight) -> tuple[int, int]:
     """How many regions of `light` are suns, and how many there are in all."""
-    parts = decompose_map(light)
-    regions = sum(len(part.travel) for part in parts if isinstance(part, Sky))
-    return sum(isinstance(part, DirectionalLight) for part in parts), regions
+    sources = decompose_map(light)
+    regions = sum(len(source.travel) for source in sources if isinstance(source, Sky))
+    return sum(isinstance(source, DirectionalLight) for source in sources), regions
 
 
 @lru_cache(maxsize=4)
 def _regions(height: int, width: int, directions: int) -> tuple[Tensor, Tensor]:
-    """How the pixels of a map of this size fall into N regions around so many `directions`.
+    """The region of each pixel [h * w] of a map of this size, of N around so many `directions`.
 
-    The region of each pixel [h * w]; and integrals over each region of 1, x, y and z, [N, 4],
-    float64. Empty ones are left out.
+    And integrals over each region of 1, x, y and z, [N, 4], float64. Empty ones are left out.
     """
     moments = pixel_moments(height, width).reshape(4, -1)
     centers = moments[1:] / np.linalg.norm(moments[1:], axis=0)

@@ -51,9 +51,9 @@ def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
     # Along a slab a ray stays within it for ever, or never enters it.
     is_along = way.abs() < tiny
     direction = torch.where(is_along, torch.full_like(way, tiny), way)
-    one, other = (low - origin) / direction, (high - origin) / direction
-    near = torch.minimum(one, other).amax(-1).clamp(min=0)
-    far = torch.maximum(one, other).amin(-1)
+    at_low, at_high = (low - origin) / direction, (high - origin) / direction
+    near = torch.minimum(at_low, at_high).amax(-1).clamp(min=0)
+    far = torch.maximum(at_low, at_high).amin(-1)
     if grid.periodic:
         far = torch.minimum(far, near + FARTHEST * max(grid.extent))
     return near, far

@@ -57,6 +57,6 @@ def rays_against(grid: Grid, points: Tensor, travel: Tensor) -> Rays:
 
 
 def transmittance(medium: Medium, rays: Rays, settings: RenderSettings) -> Tensor:
-    """What of light [C, R] passes `medium` along all of `rays`."""
-    one = rays.direction.new_ones(1, len(rays.direction))
-    return march(absorb(medium), look_along(medium.grid, rays, settings), settings, one)
+    """The transmittance [C, R] of `medium` along `rays`."""
+    light = rays.direction.new_ones(1, len(rays.direction))
+    return march(absorb(medium), look_along(medium.grid, rays, settings), settings, light)

@@ -76,25 +76,25 @@ class _Shell(NamedTuple):
     outward: Tensor
 
 
-def extend_fields(emission: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
-    """The fields of `emission` with a layer on each side, [channels, z + 2, y + 2, x + 2].
+def extend_fields(outgoing: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
+    """The fields of `outgoing` with a layer on each side, [channels, z + 2, y + 2, x + 2].
 
     Across `axis` it has the values on the face; else those half a cell beyond, of which and of the
     outermost centers' these are the mean. Along an axis of a single cell light stays as it is.
     """
-    grid, field = emission.grid, emission.extinction.field
+    grid, field = outgoing.grid, outgoing.extinction.field
     shell, extended = _surround(grid, axis, field.dtype, field.device), dict[str, Tensor]()
-    for name, field in emission.fields.items():
+    for name, field in outgoing.fields.items():
         if name == "diffuse" or name.startswith("mass "):
-            extended[name] = _extend_light(emission, shell, name, field)
+            extended[name] = _extend_light(outgoing, shell, name, field)
         else:
             extended[name] = pad(field[None], [1] * 6, mode="replicate")[0]
     return extended
 
 
-def _extend_light(emission: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
+def _extend_light(outgoing: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
     """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
-    grid, extinction, cells = emission.grid, emission.extinction, field.flatten(1)
+    grid, extinction, cells = outgoing.grid, outgoing.extinction, field.flatten(1)
     nearest = cells.index_select(1, shell.nearest)
     line = shell.line.add_to(torch.zeros_like(nearest), cells)
     if name == "diffuse":
@@ -102,21 +102,21 @@ def _extend_light(emission: OutgoingLight, shell: _Shell, name: str, field: Tens
         share = thinness(grid, extinction.scale[: len(field)].view(-1, 1) * matter, OPAQUE)
         on_faces = torch.lerp(nearest, line, for_channels(share, len(field)))
     else:
-        lit = shine_through(emission.beams[int(name.split()[1])], grid)
+        lit = shine_through(outgoing.beams[int(name.split()[1])], grid)
         z, y, x = pad(1 - lit, (0, 1), value=1.0).index_select(0, shell.faces.flatten()).chunk(3)
         on_faces = z * y * x * _limit(nearest, line, extinction.mass_bound)
     beyond = shell.inner.add_to(torch.zeros_like(nearest), cells)
     values = torch.cat([on_faces.to(field), beyond], 1)
     longer = shell.around.add_to(pad(field, [1] * 6).flatten(1), values)
-    if name == "diffuse" and emission.inflow is not None and len(shell.outermost):
-        lacks = _find_lacks(emission, emission.inflow, shell)
+    if name == "diffuse" and outgoing.inflow is not None and len(shell.outermost):
+        lacks = _find_lacks(outgoing, outgoing.inflow, shell)
         longer = shell.lacking.add_to(longer, lacks.expand(len(field), -1))
     return longer.view(-1, *(count + 2 for count in grid.shape))
 
 
-def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
+def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
     """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
-    extinction, diffusing, emitted = emission.extinction, emission.diffusing, emission.emitted
+    extinction, diffusing, emitted = outgoing.extinction, outgoing.diffusing, outgoing.emitted
 
     def outermost(field: Tensor) -> Tensor:
         return field.flatten(1).index_select(1, shell.outermost)
@@ -127,26 +127,26 @@ def _find_lacks(emission: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tenso
     if first:
         flux = torch.stack(flux_along_axes(first))
         received = received - 0.5 * (shell.outward[:, None] * flux).sum(0)
-    kept, scale = inflow.kept.view(-1, 1), diffusing.scale.view(-1, 1)
-    light = outermost(emission.diffuse) + kept * received
+    unpeaked, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
+    light = outermost(outgoing.diffuse) + unpeaked * received
     lost = extinction.scale.view(-1, 1) * outermost(extinction.field)
     scattered = scale * outermost(diffusing.field)
     sent = scattered * light - lost * inflow.outside.view(-1, 1)
     if emitted is not None:
         sent = sent + outermost(emitted)
     backward = [
-        one.expand(-1, *_layer_of(emission.grid, axis)).flatten(1)
-        for one, (axis, _) in zip(inflow.backward, FACES, strict=True)
-        if emission.grid.shape[axis] > 1
+        faces.expand(-1, *_layer_of(outgoing.grid, axis)).flatten(1)
+        for faces, (axis, _) in zip(inflow.backward, FACES, strict=True)
+        if outgoing.grid.shape[axis] > 1
     ]
-    weight = shell.width * kept * torch.cat(backward, 1)
+    weight = shell.width * unpeaked * torch.cat(backward, 1)
     lack = weight * sent / (UNEVEN + shell.width * lost + weight * scattered)
     return lack if emitted is None else scale * lack
 
 
 def _layer_of(grid: Grid, axis: int) -> tuple[int, ...]:
     """The shape of a layer of cells across `axis`."""
-    return tuple(count for other, count in enumerate(grid.shape) if other != axis)
+    return tuple(count for across, count in enumerate(grid.shape) if across != axis)
 
 
 def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:

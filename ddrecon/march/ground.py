@@ -56,7 +56,7 @@ class LitGround:
 
 def light_evenly(ground: Ground, sources: Sequence[Source], grid: Grid, like: Tensor) -> LitGround:
     """`ground` in the light of `sources`, all above it, as if the box of `grid` were empty."""
-    lights = tuple(one for one in sources if isinstance(one, Beamed))
+    lights = tuple(light for light in sources if isinstance(light, Beamed))
     even = math.pi * ambient_radiance(sources, like).flatten()
     for sky in sources:
         if isinstance(sky, Sky):
@@ -87,29 +87,33 @@ def light_texels(
 
     texels = torch.zeros_like(behind)
     directions, angles = upwards(plane)
-    parts = (angles * directions[:, plane.axis]).tolist()
+    weights = (angles * directions[:, plane.axis]).tolist()
     sights = _sights(grid, plane, settings, behind.dtype, behind.device)
     sent = glow([sight.rays for sight in sights])
-    each = sent.diffuse.split(len(sent.diffuse) // len(sights))
-    alike = dict[int | None, list[int]]()
-    for number, sight in enumerate(sights):
-        alike.setdefault(sight.sampling.axis if sight.sampling else None, []).append(number)
-    # Directions across the same slices have their fields up to the faces together.
-    for axis, numbers in alike.items():
-        some = replace(sent, diffuse=torch.cat([each[number] for number in numbers]))
-        fields = extend_fields(some, axis)
-        split = fields["diffuse"].split(len(each[0]))
-        for number, diffuse in zip(numbers, split, strict=True):
-            extended = fields | {"diffuse": diffuse}
-            one = replace(sent, diffuse=each[number], extended=extended)
-            texels = texels + parts[number] * (
-                march(one, sights[number], settings, behind) - behind
-            )
+    for sight, weight, light in zip(sights, weights, _split(sent, sights), strict=True):
+        texels = texels + weight * (march(light, sight, settings, behind) - behind)
     for sky in sources:
         if isinstance(sky, Sky):
             for travel, vector in zip(sky.travel, sky.vector, strict=True):
                 texels = texels - vector[plane.axis][:, None] * recompute(shade, travel)
     return replace(lit, texels=texels.unflatten(1, shape))
+
+
+def _split(sent: OutgoingLight, sights: Sequence[Sight]) -> list[OutgoingLight]:
+    """What is `sent` along the rays of each of `sights`, with its fields up to the faces."""
+    bundles = sent.diffuse.split(len(sent.diffuse) // len(sights))
+    axes = [sight.sampling.axis if sight.sampling else None for sight in sights]
+    split = [sent] * len(sights)
+    for axis in dict.fromkeys(axes):
+        # Directions across the same slices have their fields extended together.
+        numbers = [number for number, across in enumerate(axes) if across == axis]
+        together = replace(sent, diffuse=torch.cat([bundles[number] for number in numbers]))
+        fields = extend_fields(together, axis)
+        extended = fields["diffuse"].split(len(bundles[0]))
+        for number, diffuse in zip(numbers, extended, strict=True):
+            light = replace(sent, diffuse=bundles[number], extended=fields | {"diffuse": diffuse})
+            split[number] = light
+    return split
 
 
 def upwards(plane: Plane) -> tuple[Tensor, Tensor]:
@@ -166,11 +170,9 @@ def reflect(lit: LitGround, medium: Medium, settings: RenderSettings) -> tuple[T
             _, travel = unit_directions(light.direction)
             even = even - travel[plane.axis] * light.irradiance
     texels = direct.unflatten(1, points.shape[:2]) + lit.texels + (lit.even - even).view(-1, 1, 1)
-    here, beyond = (
-        part / math.pi for part in (lit.ground.albedo_on(*points.shape[:2]), lit.ground.mean_albedo)
-    )
-    more = here * texels + (here - beyond.view(-1, 1, 1)) * even.view(-1, 1, 1)
-    return beyond * even, more
+    albedo, mean = lit.ground.albedo_on(*points.shape[:2]), lit.ground.mean_albedo
+    more = albedo * texels + (albedo - mean.view(-1, 1, 1)) * even.view(-1, 1, 1)
+    return mean / math.pi * even, more / math.pi
 
 
 def see_ground(

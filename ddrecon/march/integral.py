@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.march.box import Crossing
-from ddrecon.march.lattice import Lattice, find_rough, interpolate_between
+from ddrecon.march.lattice import find_rough, interpolate
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.periods import march_periods
 from ddrecon.march.samplers import Sampler
@@ -26,12 +26,10 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
 
 CHUNK_NODES = 1 << 18
-"""Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
-memory does not grow with pixels.
-"""
+"""Nodes marched at a time, so that a chunk's tensors stay in a processor's cache."""
 CELLS_PER_NODE = 16
-"""At most so many cells of a large volume to a node marched at a time: for every chunk of rays the
-backward pass fills an array of all cells.
+"""Cells of a large volume to a node marched at a time, at most: the backward pass fills an array of
+all cells for every chunk of rays.
 """
 
 
@@ -40,10 +38,9 @@ def march(
 ) -> Tensor:
     """Radiance [C, R] along the rays of a camera, with that `behind` [C, R] the volume (E2.1).
 
-    Every ray through the box is marched itself. Where pixels are closer together than the volume
-    can tell, rays of a lattice are marched instead, and pixels interpolated between them to third
-    order. A pixel that this might change by more than `settings.tolerance` of the image's root
-    mean square keeps its own ray.
+    Where pixels are closer together than the volume can tell, rays of a lattice are marched in
+    place of theirs, and pixels are interpolated to third order. A pixel that this might change by
+    more than `settings.tolerance` of the image's root mean square keeps its own ray.
     """
     radiance = _march_alone(outgoing, sight, settings, behind)
     for light in outgoing.lit:
@@ -55,26 +52,30 @@ def _march_alone(
     outgoing: OutgoingLight, sight: Sight, settings: RenderSettings, behind: Tensor | None
 ) -> Tensor:
     """As `march`, of `outgoing` light without that of beams with a profile, its `lit`."""
+    rays, crossing, lattice = sight.rays, sight.crossing, sight.lattice
     if sight.sampling is None:
-        nothing = outgoing.diffuse.new_zeros(outgoing.colors, len(sight.rays.direction))
+        nothing = outgoing.diffuse.new_zeros(outgoing.colors, len(rays.direction))
         return nothing if behind is None else nothing + behind
     sampler = Sampler(outgoing, sight.sampling, settings.steps)
 
-    def march_these(rays: Rays, crossing: Crossing) -> Tensor:
+    def march_along(rays: Rays, crossing: Crossing) -> Tensor:
         """What comes from the volume along `rays` in `crossing`; and 1 - tau of what is behind."""
         radiance, mass = _march_by_engine(sampler, rays, crossing)
-        return radiance if behind is None else torch.cat([radiance, opacity_of(outgoing, mass)])
+        if behind is None:
+            return radiance
+        return torch.cat([radiance, -torch.expm1(-outgoing.extinction_scale * mass)])
 
-    if sight.lattice is None:
-        values = _spread(march_these(sight.rays, sight.crossing), sight)
+    if lattice is None:
+        values = march_along(rays, crossing)
     else:
-        lattice = sight.lattice
-        between = march_these(lattice.rays, lattice.crossing).unflatten(1, lattice.shape)
-        values = _spread(interpolate_between(between, lattice.places), sight)
-        numbers = _find_rough(between, lattice, settings.tolerance, behind)
-        rough = sight.crossing.select(numbers)
-        if len(rough.hit):
-            values = values.index_copy_(1, rough.hit, march_these(sight.rays, rough))
+        on_lattice = march_along(lattice.rays, lattice.crossing).unflatten(1, lattice.shape)
+        values = interpolate(on_lattice, lattice.places).clamp(min=0)
+        numbers = find_rough(on_lattice, lattice, settings.tolerance, behind)
+        if len(numbers):
+            values = values.index_copy(1, numbers, march_along(rays, crossing.select(numbers)))
+    if len(crossing.hit) < len(rays.direction):
+        missed = values.new_zeros(len(values), len(rays.direction))
+        values = missed.index_copy(1, crossing.hit, values)
     if behind is None:
         return values
     scattered, opacity = values.split(outgoing.colors)
@@ -83,38 +84,12 @@ def _march_alone(
 
 def _march_by_engine(sampler: Sampler, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
     """As `march_rays`, by the engine in use, through all periods of a grid."""
-    march_own = march_rays
+    march_once = march_rays
     if is_fused():
-        from ddrecon.march.fused.integrate import march_rays as march_own
+        from ddrecon.march.fused.integrate import march_rays as march_once
     if sampler.outgoing.period is not None:
-        return march_periods(march_own, sampler, rays, crossing)
-    return march_own(sampler, rays, crossing)
-
-
-def _find_rough(
-    values: Tensor, lattice: Lattice, tolerance: float, behind: Tensor | None
-) -> Tensor:
-    """Which pixels among the rays of a lattice are not to be interpolated: numbers [*].
-
-    The `values` [C or 2 C, r, c] of the lattice say that this may change the image by more than
-    `tolerance` of its root mean square.
-    """
-    values = seen = values.detach()
-    if behind is not None:
-        (scattered, opacity), brightest = values.chunk(2), behind.detach().max()
-        seen = scattered + brightest * (1 - opacity)
-        values = torch.cat([scattered, brightest * opacity])
-    size = float(seen.square().mean(dtype=torch.float64).sqrt())
-    return find_rough(values, tolerance * size, lattice)
-
-
-def _spread(along: Tensor, sight: Sight) -> Tensor:
-    """Numbers [K, R] of all rays: those `along` the ones that hit, else 0."""
-    count = len(sight.rays.direction)
-    if along.shape[1] == count:
-        return along
-    pixels = along.new_zeros(len(along), count)
-    return pixels.index_copy(1, sight.crossing.hit, along)
+        return march_periods(march_once, sampler, rays, crossing)
+    return march_once(sampler, rays, crossing)
 
 
 def march_rays(
@@ -138,14 +113,8 @@ def march_rays(
 
     count = max(CHUNK_NODES, outgoing.diffuse[0].numel() // CELLS_PER_NODE) // sampler.nodes
     chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(max(1, count))
-    found = torch.cat([recompute(run, chunk) for chunk in chunks], 1)
-    return found[: outgoing.colors], found[outgoing.colors :]
-
-
-def opacity_of(outgoing: OutgoingLight, mass: Tensor) -> Tensor:
-    """1 - tau [C, R] of rays that pass `mass` [K, R]."""
-    scale = outgoing.extinction.scale.view(-1, 1).expand(outgoing.colors, 1)
-    return -torch.expm1(-scale * mass)
+    marched = torch.cat([recompute(run, chunk) for chunk in chunks], 1)
+    return marched[: outgoing.colors], marched[outgoing.colors :]
 
 
 def integrate_segments(
@@ -160,11 +129,11 @@ def integrate_segments(
     """
     extinction, scattering = at_nodes["extinction"], at_nodes.get("scattering")
     scattering = extinction if scattering is None else scattering
-    scale = outgoing.extinction.scale.view(-1, 1).expand(outgoing.colors, 1)
+    scale = outgoing.extinction_scale
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
-    own = nodes.integral(extinction).cumsum(0)
-    first = torch.zeros_like(own[:1]) if front is None else front[None]
-    passed = torch.cat([first, first + own])
+    masses = nodes.integral(extinction).cumsum(0)
+    first = torch.zeros_like(masses[:1]) if front is None else front[None]
+    passed = torch.cat([first, first + masses])
     begin, end = passed[:-1], passed[1:]
     # E2.3, E2.11: the integral of tau (kappa_s (L0 + g L1 . w) + j).
     diffuse = at_nodes.get("remaining", scattering) * at_nodes["diffuse"]
@@ -185,4 +154,4 @@ def integrate_segments(
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + arriving * strength.view(-1, 1)
-    return scattered, own[-1]
+    return scattered, masses[-1]

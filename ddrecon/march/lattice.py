@@ -70,10 +70,10 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     # Row and column 0 lie half a step within the box.
     distance = (0.5 * (low + high) - hitting.origin[:, axis]) / hitting.direction[:, axis]
     places = []
-    for other in across(axis):
-        step = grid.spacing[other] / RAYS_PER_VOXEL
-        place = hitting.origin[:, other] + distance * hitting.direction[:, other]
-        places.append((place - grid.lower[other]) / step - 0.5)
+    for along in across(axis):
+        step = grid.spacing[along] / RAYS_PER_VOXEL
+        place = hitting.origin[:, along] + distance * hitting.direction[:, along]
+        places.append((place - grid.lower[along]) / step - 0.5)
     first = [math.floor(place.detach().amin()) - MARGIN for place in places]
     last = [math.ceil(place.detach().amax()) + MARGIN for place in places]
     rows, columns = (b - a + 1 for a, b in zip(first, last, strict=True))
@@ -82,10 +82,10 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     rays = _lattice_rays(grid, axis, hitting, first, (rows, columns))
     near, far = intersect_box(grid, rays)
     # Where a ray that misses enters may be infinitely far.
-    near, far = (torch.where(far > near, each, 0) for each in (near, far))
+    near, far = (torch.where(far > near, distance, 0) for distance in (near, far))
     crossing = Crossing(torch.arange(len(near), device=near.device), near, far)
-    own = torch.stack([place - a for place, a in zip(places, first, strict=True)], -1)
-    return Lattice(rays, crossing, (rows, columns), own)
+    within = torch.stack([place - a for place, a in zip(places, first, strict=True)], -1)
+    return Lattice(rays, crossing, (rows, columns), within)
 
 
 def _lattice_rays(
@@ -94,12 +94,12 @@ def _lattice_rays(
     """Rays of a lattice of this `shape`, through one point or parallel as those `like` them."""
     point = [like.direction.new_tensor(0.5 * (grid.lower[axis] + grid.upper[axis]))] * 3
     lines = []
-    for other, a, count in zip(across(axis), first, shape, strict=True):
-        step = grid.spacing[other] / RAYS_PER_VOXEL
+    for along, a, count in zip(across(axis), first, shape, strict=True):
+        step = grid.spacing[along] / RAYS_PER_VOXEL
         index = torch.arange(a, a + count, dtype=like.direction.dtype).to(like.direction.device)
-        lines.append(grid.lower[other] + 0.5 * step + step * index)
-    for other, place in zip(across(axis), torch.meshgrid(*lines, indexing="ij"), strict=True):
-        point[other] = place.flatten()
+        lines.append(grid.lower[along] + 0.5 * step + step * index)
+    for along, place in zip(across(axis), torch.meshgrid(*lines, indexing="ij"), strict=True):
+        point[along] = place.flatten()
     points = torch.stack(torch.broadcast_tensors(*point), -1)
     if like.eye is None:
         # They begin outside of the box.
@@ -109,35 +109,35 @@ def _lattice_rays(
     return Rays(like.eye.expand_as(points), normalize(points - like.eye, dim=-1), like.eye)
 
 
-def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
-    """`values` [K, r, c] of lattice rays at `places` [P, 2] (rows, columns): `[K, P]`.
-
-    They are interpolated to third order, and not below zero.
-    """
-    return interpolate(values, places).clamp(min=0)
-
-
 def interpolate(values: Tensor, places: Tensor) -> Tensor:
-    """The same, whatever it is."""
+    """`values` [K, r, c] of lattice rays at `places` [P, 2] in it, to third order: [K, P]."""
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
-def find_rough(values: Tensor, tolerance: float, lattice: Lattice) -> Tensor:
-    """Which pixels interpolation may have off by more than `tolerance`: numbers [*].
+def find_rough(values: Tensor, lattice: Lattice, tolerance: float, behind: Tensor | None) -> Tensor:
+    """Which pixels interpolation may change too much: numbers [*].
 
-    That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
-    they are large at edges sharper than the lattice as well. They come in an order in which
-    neighbors are neighbors in the volume: along stripes as high as a voxel.
+    By more than `tolerance` of the image's root mean square, where `values` [K, r, c] are those of
+    the lattice's rays: radiance, and if something is `behind`, opacity. Their errors count together
+    and are judged by fourth differences, which are large at edges sharper than the lattice as well.
+    Pixels come in an order in which neighbors are neighbors in the volume: along stripes as high as
+    a voxel.
     """
+    values = radiance = values.detach()
+    if behind is not None:
+        (scattered, opacity), brightest = values.chunk(2), behind.detach().max()
+        radiance = scattered + brightest * (1 - opacity)
+        values = torch.cat([scattered, brightest * opacity])
+    size = float(radiance.square().mean(dtype=torch.float64).sqrt())
     # In numpy: the arrays are small. Between the outermost two rays lie no pixels.
     v = values.cpu().numpy()
     down, along = np.diff(v, 4, axis=1)[:, :, 2:-2], np.diff(v, 4, axis=2)[:, 2:-2]
     uneven = np.pad((np.abs(down) + np.abs(along)).sum(0), 2)
     # Of each place, the largest of the four rays around.
     rows = np.maximum(uneven[1:], uneven[:-1])
-    is_rough = DOUBT * np.maximum(rows[:, 1:], rows[:, :-1]) > tolerance
+    is_rough = DOUBT * np.maximum(rows[:, 1:], rows[:, :-1]) > tolerance * size
     numbers = is_rough.ravel()[lattice.cells.cpu().numpy()].nonzero()[0]
     rough = torch.from_numpy(numbers).to(values.device)
     rows, columns = lattice.places.detach()[rough].unbind(-1)

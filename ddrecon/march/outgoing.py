@@ -23,13 +23,14 @@ class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
     `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, z, y, x] of what cells
-    receive of beams, `kept` times which counts as `diffuse` light does. `backward` are, by face,
-    the parts [C, rows, columns] of light from there that are scattered into the camera's rays.
+    receive of beams, of which the share `unpeaked` counts as `diffuse` light does. `backward` are,
+    by face, the parts [C, rows, columns] of light from there that are scattered into the camera's
+    rays.
     """
 
     outside: Tensor
     received: Tensor
-    kept: Tensor
+    unpeaked: Tensor
     backward: Sequence[Tensor]
 
 
@@ -92,6 +93,11 @@ class OutgoingLight:
             1 if self.emitted is None else len(self.emitted),
         )
 
+    @property
+    def extinction_scale(self) -> Tensor:
+        """By what rays multiply masses, [C, 1]."""
+        return self.extinction.scale.view(-1, 1).expand(self.colors, 1)
+
     @functools.cached_property
     def fields(self) -> dict[str, Tensor]:
         """What rays sample, `[channels, z, y, x]`, as it stands in channels of one interpolation.
@@ -134,22 +140,13 @@ def light_up(outgoing: OutgoingLight, beams: Sequence[Beam | PointBeam]) -> Outg
     A beam with a profile is a directional light where the medium scatters by so much more.
     """
     plain, lit = list[Beam | PointBeam](), list[OutgoingLight]()
-    scattering, dark = outgoing.scattering, torch.zeros_like(outgoing.diffuse[:1])
+    nothing = torch.zeros_like(outgoing.diffuse[:1])
+    dark = replace(outgoing, diffuse=nothing, remaining=None, emitted=None, inflow=None)
     for beam in beams:
         if isinstance(beam, PointBeam) or beam.profile is None:
             plain.append(beam)
-            continue
-        within = replace(scattering, field=scattering.field * beam.profile)
-        alone = OutgoingLight(
-            outgoing.grid,
-            outgoing.extinction,
-            within,
-            (replace(beam, profile=None),),
-            dark,
-            outgoing.seen,
-            outgoing.peak,
-            support=outgoing.support,
-            period=outgoing.period,
-        )
-        lit.append(alone)
+        else:
+            field = outgoing.scattering.field * beam.profile
+            within, even = replace(outgoing.scattering, field=field), replace(beam, profile=None)
+            lit.append(replace(dark, scattering=within, beams=(even,)))
     return replace(outgoing, beams=tuple(plain), lit=tuple(lit))

@@ -6,6 +6,7 @@ nodes do: so it does not matter where a period begins.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,40 +31,36 @@ OPAQUE = 40.0
 
 def absorb(medium: Medium) -> OutgoingLight:
     """What view rays meet in `medium` that sends nothing."""
-    period, is_periodic = unroll(medium.grid, HALO), bool(medium.grid.periodic)
-    medium = medium.put(period.wide, period.extend) if is_periodic else medium
+    period = unroll(medium.grid, HALO) if medium.grid.periodic else None
+    medium = medium if period is None else medium.put(period.wide, period.extend)
     extinction, dark = medium.extinction, torch.zeros_like(medium.extinction.field[:1])
-    absorbing = OutgoingLight(
-        medium.grid, extinction, extinction, (), dark, medium.seen, None, support=medium.support
+    matter = medium.grid, extinction, extinction
+    return OutgoingLight(
+        *matter, (), dark, medium.seen, None, support=medium.support, period=period
     )
-    return replace(absorbing, period=period) if is_periodic else absorbing
 
 
 def march_periods(
-    march_own: Callable[..., tuple[Tensor, Tensor]],
+    march_once: Callable[..., tuple[Tensor, Tensor]],
     sampler: Sampler,
     rays: Rays,
     crossing: Crossing,
 ) -> tuple[Tensor, Tensor]:
-    """As `integral.march_rays`, period by period, by `march_own` in each."""
-    outgoing, period = sampler.outgoing, sampler.outgoing.period
+    """As `integral.march_rays`, period by period, by `march_once` in each."""
+    outgoing, period, eye = sampler.outgoing, sampler.outgoing.period, rays.eye
     assert period is not None
     grid, scale = period.grid, outgoing.extinction.scale.view(-1, 1)
     longest = min(sampler.sampling.longest, math.hypot(*grid.extent))
     sampler = replace(sampler, sampling=replace(sampler.sampling, longest=longest))
-    samplers = dict[tuple[int, ...], Sampler]()
-
-    def from_copy(copy: list[int]) -> Sampler:
-        """What the eye sees of a copy, whose cells it sees from another side."""
-        if rays.eye is None or outgoing.from_eye is None:
-            return sampler
-        key = tuple(copy)
-        if key not in samplers:
-            seen = outgoing.from_eye(rays.eye - extent * extent.new_tensor(copy))
-            samplers[key] = replace(sampler, outgoing=seen)
-        return samplers[key]
-
     extent, lower, upper = map(rays.origin.new_tensor, (grid.extent, grid.lower, grid.upper))
+
+    @functools.cache
+    def see_copy(*copy: float) -> Sampler:
+        """What the eye sees of a copy, whose cells it sees from another side."""
+        if eye is None or outgoing.from_eye is None:
+            return sampler
+        return replace(sampler, outgoing=outgoing.from_eye(eye - extent * extent.new_tensor(copy)))
+
     repeats = extent.new_tensor([float(axis in grid.periodic) for axis in range(3)])
     number = (crossing.far > crossing.near).nonzero()[:, 0]
     radiance = outgoing.diffuse.new_zeros(outgoing.colors, len(crossing.hit))
@@ -72,26 +69,26 @@ def march_periods(
     begin = (rays.origin + near[:, None] * rays.direction).detach()
     copy = repeats * ((begin - lower) / extent).floor()
     while len(number):
-        own = Rays(rays.origin - copy * extent, rays.direction, None)
-        direction = torch.where(own.direction.abs() < 1e-30, 1e-30, own.direction)
+        moved = Rays(rays.origin - copy * extent, rays.direction, None)
+        direction = torch.where(moved.direction.abs() < 1e-30, 1e-30, moved.direction)
         faces = torch.where(direction > 0, upper, lower)
-        ends = torch.where(repeats > 0, (faces - own.origin) / direction, torch.inf)
+        ends = torch.where(repeats > 0, (faces - moved.origin) / direction, torch.inf)
         leave, axis = ends.min(1)
-        end = torch.minimum(next_node(outgoing.grid, own, leave, sampler), far)
+        end = torch.minimum(next_node(outgoing.grid, moved, leave, sampler), far)
         # The node may be one that lies before the ray enters.
         end = torch.where(leave < far, torch.maximum(end, near), far)
         is_there = end > near
-        which, group = copy[is_there].unique(dim=0, return_inverse=True)
-        if outgoing.from_eye is None or rays.eye is None:
-            which, group = which[:1], torch.zeros_like(group)
-        for index, one in enumerate(which.long().tolist()):
+        # Where copies look alike, all rays go together.
+        apart = copy if outgoing.from_eye and eye is not None else 0 * copy
+        copies, group = apart[is_there].unique(dim=0, return_inverse=True)
+        for index, place in enumerate(copies.tolist()):
             chosen = is_there.nonzero()[:, 0][group == index]
-            hit = number[chosen]
-            here = Crossing(torch.arange(len(chosen), device=hit.device), near[chosen], end[chosen])
-            found = march_own(from_copy(one), own.select(chosen), here, mass[:, hit])
+            hit, among = number[chosen], torch.arange(len(chosen), device=number.device)
+            segment = Crossing(among, near[chosen], end[chosen])
+            more = march_once(see_copy(*place), moved.select(chosen), segment, mass[:, hit])
             radiance, mass = (
-                total.index_add(1, hit, part)
-                for total, part in zip((radiance, mass), found, strict=True)
+                total.index_add(1, hit, change)
+                for total, change in zip((radiance, mass), more, strict=True)
             )
         depth = (scale * mass[:, number]).detach().amin(0)
         left = ((far > end) & (depth < OPAQUE)).nonzero()[:, 0]

@@ -18,7 +18,7 @@ from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.coefficients import Volume, along_colors
+from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
@@ -110,11 +110,11 @@ class Sampler:
         else:
             distance = (planes - rays.origin[:, axis]) / rays.direction[:, axis]
         places = []
-        for one in reversed(axes):
-            place = rays.origin[:, one] + distance * rays.direction[:, one]
+        for along in reversed(axes):
+            place = rays.origin[:, along] + distance * rays.direction[:, along]
             # From -1 to 1 with the layer more on both sides; beyond the box as on its face.
-            inside = (2 * (place - grid.lower[one]) / grid.extent[one] - 1).clamp(-1, 1)
-            places.append(inside * (grid.shape[one] / (grid.shape[one] + 2)))
+            inside = (2 * (place - grid.lower[along]) / grid.extent[along] - 1).clamp(-1, 1)
+            places.append(inside * (grid.shape[along] / (grid.shape[along] + 2)))
         points = torch.stack(places, -1)
         if axis is None:
             return sample_volume(values, points, third_order).transpose(0, 1), distance
@@ -174,11 +174,8 @@ def greatest_depth(volume: Volume) -> float:
 
     Along axes of a single cell nothing varies: they do not count, unless there are no others.
     """
-    absorbing, scattering = (
-        sigma.detach() if sigma.ndim == 4 else along_colors(sigma).detach()
-        for sigma in (volume.sigma_a, volume.sigma_s)
-    )
-    most, density = (absorbing + scattering).amax(0), volume.density.detach()
+    sigma_t = for_cells(volume.sigma_a).detach() + for_cells(volume.sigma_s).detach()
+    most, density = sigma_t.amax(0), volume.density.detach()
     if not any(density.stride()):
         density = density[:1, :1, :1]  # the same in all cells, which may be too many to be made
     sides = list(zip(volume.grid.spacing, volume.grid.shape, strict=True))

@@ -5,8 +5,10 @@ It takes many small operations, and reads of numbers for which a processor waits
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
 from ddrecon.grid import Grid
@@ -15,6 +17,8 @@ from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import RaySampling, choose_sampling
 from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -43,21 +47,23 @@ def look_along(grid: Grid, rays: Rays, settings: RenderSettings) -> Sight:
     )
 
 
+def remember_of_camera(function: Callable[..., T]) -> Callable[..., T]:
+    """`function` of a camera, kept while the fields of that stay and are not varied."""
+
+    @remember
+    def find(count: int, *arguments: Any) -> T:
+        return function(Camera(*arguments[:count]), *arguments[count:])
+
+    @functools.wraps(function)
+    def recall(camera: Camera, *others: Any) -> T:
+        values = [getattr(camera, field.name) for field in fields(camera)]
+        return find(len(values), *values, *others)
+
+    return recall
+
+
+@remember_of_camera
 def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
-    """The sight of all rays of `camera`, bundle by bundle of its subpixels.
-
-    It is kept while the camera is there, unless that is varied, and found anew when any of its
-    fields is another or has changed.
-    """
-    return _look(grid, settings, *parts_of(camera))
-
-
-def parts_of(camera: Camera) -> list[Any]:
-    """Its fields, in their order."""
-    return [getattr(camera, part.name) for part in fields(camera)]
-
-
-@remember
-def _look(grid: Grid, settings: RenderSettings, *values: Any) -> Sight:
-    camera, offsets = Camera(*values), subpixel_offsets(settings.samples_per_pixel)
-    return look_along(grid, cast_rays(camera, *offsets), settings)
+    """The sight of all rays of `camera`, bundle by bundle of its subpixels; it is kept."""
+    rays = cast_rays(camera, *subpixel_offsets(settings.samples_per_pixel))
+    return look_along(grid, rays, settings)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,12 +14,11 @@ from ddrecon.light.moments import fill
 from ddrecon.march.box import cross_box
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.march.sight import Sight, look_along, parts_of
+from ddrecon.march.sight import Sight, look_along, remember_of_camera
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.fresnel import reflectance, refract
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.numerics.remember import remember
 from ddrecon.settings import RenderSettings
 
 
@@ -42,18 +40,12 @@ class Window:
     reflected: Tensor
 
 
+@remember_of_camera
 def look_inside(
     camera: Camera, grid: Grid, index: float, settings: RenderSettings
 ) -> tuple[Rays, tuple[Window, ...]]:
-    """All rays of `camera`, as `look_through` has them, and its windows; kept as by that."""
-    return _look(grid, index, settings, *parts_of(camera))
-
-
-@remember
-def _look(
-    grid: Grid, index: float, settings: RenderSettings, *values: Any
-) -> tuple[Rays, tuple[Window, ...]]:
-    rays = cast_rays(Camera(*values), *subpixel_offsets(settings.samples_per_pixel))
+    """All rays of `camera`, as `look_through` has them, and its windows; both are kept."""
+    rays = cast_rays(camera, *subpixel_offsets(settings.samples_per_pixel))
     return rays, _open(rays, grid, index, replace(settings, tolerance=0.0))
 
 
@@ -72,13 +64,12 @@ def _open(rays: Rays, grid: Grid, index: float, settings: RenderSettings) -> tup
     axes = torch.eye(3, dtype=entry.dtype, device=entry.device)
     for axis in range(3):
         for sign in (1, -1):
-            mine = ((axis_met == axis) & (hitting.direction[:, axis].sign() == sign)).nonzero()[
-                :, 0
-            ]
-            if not len(mine):
+            is_inward = hitting.direction[:, axis].sign() == sign
+            entering = ((axis_met == axis) & is_inward).nonzero()[:, 0]
+            if not len(entering):
                 continue
-            numbers, points = crossing.hit[mine], entry[mine]
-            direction = refract(hitting.direction[mine], axes[axis], 1 / index)
+            numbers, points = crossing.hit[entering], entry[entering]
+            direction = refract(hitting.direction[entering], axes[axis], 1 / index)
             passed = (1 - reflectance(direction[:, axis].abs(), index)) / index**2
             face = (grid.lower if sign > 0 else grid.upper)[axis]
             pane = None if rays.eye is None else Pane(axis, face, index)
@@ -122,8 +113,8 @@ def see_through(
         for a in (2, 1, 0)
     ]
     moments = fill(light, degree)
-    found = sample_volume(moments.flatten(0, 1), torch.stack(places, -1)[None])[:, 0]
-    along = harmonics(-window.inside, degree)[:, None] * found.unflatten(0, moments.shape[:2])
+    phi = sample_volume(moments.flatten(0, 1), torch.stack(places, -1)[None])[:, 0]
+    along = harmonics(-window.inside, degree)[:, None] * phi.unflatten(0, moments.shape[:2])
     behind = window.reflected * along.sum(0).clamp(min=0)
     if background is not None:
         behind = behind + (1 - window.reflected) * medium.index**2 * background

@@ -41,7 +41,7 @@ def black_body_radiance(temperature: Tensor) -> Tensor:
         # Planck's law without its constant, divided by its exponential at 560 nm and `WHITE`.
         shift = SECOND / (560.0 * WHITE)
         spectrum = torch.exp(shift - exponent) / -torch.expm1(-exponent) * (560.0 / length) ** 5
-        return torch.stack([(spectrum * one).sum(-1) for one in matching])
+        return torch.stack([(spectrum * curve).sum(-1) for curve in matching])
 
     brightness = tristimulus(torch.tensor(WHITE))[1]
     colors = torch.tensordot(torch.tensor(SRGB).double(), tristimulus(temperature), 1) / brightness

@@ -107,12 +107,12 @@ class Medium:
 
     f is `forward_fraction`, the forward peak's. `absorption` is kappa_a. `scattering` is all of
     kappa_s, by which beams scatter with the exact phase function `seen`, of mean cosine `g`.
-    `remaining` is (1 - f) kappa_s, `extinction` kappa_a more, and `mean_cosine` the g' of what
-    remains. f, g and g' are scalars, [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the
-    phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
-    times a mass, it is the depth x of E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of
-    it varies, and None without a peak. `support` is the volume's. `emission` j [C, z, y, x] is the
-    radiance that a unit of length adds (E2.11), None where nothing glows. `index` is the volume's.
+    `remaining` is (1 - f) kappa_s, and `extinction` kappa_a more. f and g are scalars,
+    [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the phase function does from cell to
+    cell. `peak` is f kappa_s per unit of the extinction's field: times a mass, it is the depth x of
+    E8.7. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it varies, and None without a peak.
+    `emission` j [C, z, y, x] is the radiance that a unit of length adds (E2.11), None where nothing
+    glows. `support` and `index` are the volume's.
     """
 
     grid: Grid
@@ -121,7 +121,6 @@ class Medium:
     remaining: Coefficient
     absorption: Coefficient
     g: Tensor
-    mean_cosine: Tensor
     forward_fraction: Tensor
     peak: Tensor | None
     seen: SeenPhase
@@ -177,8 +176,9 @@ class Medium:
         """
         names = "extinction", "scattering", "remaining", "absorption"
         fields = {name: getattr(self, name).field for name in names}
-        # A field that coefficients share, they share there as well.
-        moved = {id(field): function(field) for field in fields.values()}
+        # A field that coefficients share is moved once, and they share it there as well.
+        different = {id(field): field for field in fields.values()}
+        moved = {key: function(field) for key, field in different.items()}
         for name, field in fields.items():
             changed[name] = replace(getattr(self, name), field=moved[id(field)])
         for name in others:
@@ -189,35 +189,28 @@ class Medium:
 
     def put(self, grid: Grid, put: Callable[[Tensor], Tensor]) -> Medium:
         """This medium on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
-        others, seen = ["support", "emission", "peak"], self.seen
-        if seen.phase.cells is not None:
-            others += ["g", "mean_cosine", "forward_fraction"]
-            seen = SeenPhase(seen.phase.with_cells(put(seen.phase.cells)), seen.degree)
-        return self.mapped(put, *others, grid=grid, seen=seen)
+        cellwise = ["g", "forward_fraction"] if self.is_cellwise else []
+        seen = replace(self.seen, phase=self.seen.phase.move_cells(put))
+        return self.mapped(put, "support", "emission", "peak", *cellwise, grid=grid, seen=seen)
 
 
 def put_volume(volume: Volume, grid: Grid, put: Callable[[Tensor], Tensor]) -> Volume:
     """`volume` on another `grid`, where `put` takes each of its fields [..., z, y, x]."""
     names = "density", "sigma_a", "sigma_s", "support", "emission", "black_body"
-    given = {name: getattr(volume, name) for name in names}
+    values = {name: getattr(volume, name) for name in names}
     fields: dict[str, Any] = {
-        name: put(field) if field is not None and field.ndim >= 3 else field
-        for name, field in given.items()
+        name: put(value) for name, value in values.items() if value is not None and value.ndim >= 3
     }
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(put(phase.cells))
-    return Volume(grid, phase=phase, index=volume.index, **fields)
+    return replace(volume, grid=grid, phase=volume.phase.move_cells(put), media=None, **fields)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
 
-    f is what of the phase function lies beyond `degree`, g' = (g - f) / (1 - f). Source: Joseph,
-    Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
+    f is what of the phase function lies beyond `degree`. Source: Joseph, Wiscombe, Weinman 1976,
+    doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    fraction = _forward_fraction(volume.phase, degree)
-    return _medium(volume, SeenPhase(volume.phase, degree), fraction)
+    return _medium(volume, degree, peak_fraction(volume.phase, degree, 1))
 
 
 def keep_medium(volume: Volume) -> Medium:
@@ -225,10 +218,10 @@ def keep_medium(volume: Volume) -> Medium:
 
     Path tracing separates single from multiple scattering by it.
     """
-    return _medium(volume, SeenPhase(volume.phase, P1_DEGREE), None)
+    return _medium(volume, P1_DEGREE, None)
 
 
-def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
+def _medium(volume: Volume, degree: int, fraction: Tensor | None) -> Medium:
     g = _mean_cosine(volume.phase)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
@@ -248,10 +241,9 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
         remaining=remaining,
         absorption=absorption,
         g=g,
-        mean_cosine=_scaled_mean_cosine(g, fraction),
         forward_fraction=fraction,
         peak=peak,
-        seen=seen,
+        seen=SeenPhase(volume.phase, degree),
         support=volume.support,
         emission=_find_emission(volume, absorption),
         index=volume.index,
@@ -263,13 +255,11 @@ def _find_emission(volume: Volume, absorption: Coefficient) -> Tensor | None:
 
     Within a refractive index n that is n^2 times as bright (E2.13).
     """
-    given = volume.emission if volume.black_body is None else volume.black_body
-    if given is None:
-        return None
-    radiance = for_cells(given)
     if volume.black_body is not None:
-        return absorption.value * (volume.index**2 * radiance)
-    emission = radiance.expand(-1, *volume.grid.shape)
+        return absorption.value * (volume.index**2 * for_cells(volume.black_body))
+    if volume.emission is None:
+        return None
+    emission = for_cells(volume.emission).expand(-1, *volume.grid.shape)
     return emission if volume.support is None else emission * volume.support
 
 
@@ -286,13 +276,14 @@ def _find_coefficients(
 
     is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
     scale = _remember_scaled if is_small else _scale_sections
-    scaled, kept, peak = scale(sigma_a, sigma_s, fraction, is_any_nonzero(fraction))
+    sigma_t, unpeaked, peak = scale(sigma_a, sigma_s, fraction, is_any_nonzero(fraction))
     scattering = coefficient(sigma_s)
-    remaining = coefficient(kept)
     if sigma_s[0].numel() > 1 and fraction.shape[1:].numel() == 1:
         # One field for both, as cells share what remains of their scattering.
         remaining = Coefficient((1 - fraction) * scattering.scale, scattering.field)
-    return coefficient(scaled), scattering, remaining, coefficient(sigma_a), peak
+    else:
+        remaining = coefficient(unpeaked)
+    return coefficient(sigma_t), scattering, remaining, coefficient(sigma_a), peak
 
 
 @functools.cache
@@ -327,24 +318,20 @@ _remember_scaled = remember(_scale_sections)
 
 @remember_of_phase
 def _mean_cosine(phase: PhaseFunction) -> Tensor:
-    return _for_cells(phase.moments(2)[:, 1])
+    return _by_color(phase.moments(2)[:, 1])
 
 
 @remember_of_phase
-def _forward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
-    return _for_cells(phase.forward_fraction(degree))
+def peak_fraction(phase: PhaseFunction, degree: int, sign: int) -> Tensor:
+    """The part of scattering that a peak is, f or b by the `sign`, as of `Medium`."""
+    return _by_color(phase.peak_tail(degree, 1, sign)[:, 0])
 
 
-@remember
-def _scaled_mean_cosine(g: Tensor, fraction: Tensor) -> Tensor:
-    return (g - fraction) / (1 - fraction)
-
-
-def _for_cells(numbers: Tensor) -> Tensor:
+def _by_color(numbers: Tensor) -> Tensor:
     """One number for each color, [1 or 3], as a scalar or `[3, 1, 1, 1]`; of cells as they are."""
-    if numbers.ndim == 4:
-        return numbers + 0
-    return numbers[0] + 0 if len(numbers) == 1 else numbers.view(-1, 1, 1, 1) + 0
+    if numbers.ndim != 4:
+        numbers = numbers[0] if len(numbers) == 1 else numbers.view(-1, 1, 1, 1)
+    return numbers + 0
 
 
 def _broadcast(sigma: Tensor, g: Tensor) -> Tensor:
@@ -368,8 +355,8 @@ def along_colors(sigma: Tensor) -> Tensor:
 def thinness(grid: Grid, extinction: Tensor, depth: float) -> Tensor:
     """From 1 where cells are thin to 0 where they are thick, [C, z, y, x]; 1/2 at a `depth`."""
     # to the fourth power, which must not overflow
-    given = mean_width(grid) / depth * extinction
-    return 1 / (1 + (given / (1 + 1e-6 * given)).square().square())
+    ratio = mean_width(grid) / depth * extinction
+    return 1 / (1 + (ratio / (1 + 1e-6 * ratio)).square().square())
 
 
 def for_channels(values: Tensor, count: int) -> Tensor:

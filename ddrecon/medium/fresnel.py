@@ -76,12 +76,12 @@ def quadrature_reflectances(index: float, count: int) -> Tensor:
     """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
     cosines = points.abs().numpy().round(12)
-    levels, which = np.unique(cosines[:, 0], return_inverse=True)
-    part = np.bincount(which, weights.numpy())
-    nodes, own = np.polynomial.legendre.leggauss(NODES)
-    place = (part.cumsum() - part)[:, None] + part[:, None] * (nodes + 1) / 2
+    levels, level = np.unique(cosines[:, 0], return_inverse=True)
+    share = np.bincount(level, weights.numpy())
+    nodes, gauss = np.polynomial.legendre.leggauss(NODES)
+    place = (share.cumsum() - share)[:, None] + share[:, None] * (nodes + 1) / 2
     passed = 1 - reflectance(torch.from_numpy(place), index).numpy()
-    mean = (passed * place) @ own / (place @ own)
-    entering = transmitted_moments(index)[0] * (part * levels).sum()
-    reflected = 1 - np.minimum(entering / (part * levels * mean).sum() * mean, 1)
+    mean = (passed * place) @ gauss / (place @ gauss)
+    entering = transmitted_moments(index)[0] * (share * levels).sum()
+    reflected = 1 - np.minimum(entering / (share * levels * mean).sum() * mean, 1)
     return torch.from_numpy(reflected[np.searchsorted(levels, cosines)])

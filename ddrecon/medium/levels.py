@@ -26,12 +26,15 @@ def volume_at_level(volume: Volume, grid: Grid) -> Volume:
         if volume.media is None:
             volume.density = volume.density * support
         else:
-            parts = volume.media.items()
-            volume.media = {n: replace(one, density=one.density * support) for n, one in parts}
+            volume.media = {
+                name: replace(medium, density=medium.density * support)
+                for name, medium in volume.media.items()
+            }
     coarse = put_volume(volume, grid, partial(resample, grid=grid))
     if volume.media is None:
         return coarse
-    return remix(coarse, {n: volume_at_level(one, grid) for n, one in volume.media.items()})
+    media = volume.media.items()
+    return remix(coarse, {name: volume_at_level(medium, grid) for name, medium in media})
 
 
 def refine_medium(medium: Medium, times: int, along: str = "xyz") -> Medium:
@@ -56,13 +59,12 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
     if shape.numel() > grid.cells:
         resampled = adaptive_avg_pool3d(colors, grid.shape)
     else:
-        # The fewest cells more on both sides that are whole cells of both.
-        sizes = [*zip(shape, grid.shape, strict=True)]
-        ends = [
-            own // math.gcd(own, new) * (a in grid.periodic) for a, (own, new) in enumerate(sizes)
-        ]
-        more = [end * new // own for end, (own, new) in zip(ends, sizes, strict=True)]
-        around, wide = (Unrolled(grid, tuple(end), tuple(end)) for end in (more, ends))
+        # Around periodic axes the fewest cells more on both sides that are whole cells of both.
+        before, after = [0, 0, 0], [0, 0, 0]
+        for axis in grid.periodic:
+            common = math.gcd(shape[axis], grid.shape[axis])
+            before[axis], after[axis] = shape[axis] // common, grid.shape[axis] // common
+        wide, around = (Unrolled(grid, tuple(ends), tuple(ends)) for ends in (before, after))
         size = around.wide.shape
         resampled = interpolate(wide.extend(colors), size, mode="trilinear", align_corners=False)
         resampled = around.crop(resampled)

@@ -26,14 +26,14 @@ def scatter_droplets(
     """
     miepython = load_extra("miepython", "a phase function by Mie's theory")
     radii, counts = _radii(effective_radius, effective_variance)
-    sizes = 2 * math.pi * radii / wavelength
-    series = [miepython.coefficients(refractive_index, size) for size in sizes]
+    circumferences = 2 * math.pi * radii / wavelength
+    series = [miepython.coefficients(refractive_index, size) for size in circumferences]
     terms = max(len(a) for a, _ in series)
     order = np.arange(1, terms + 1)
     factor = (2 * order + 1) / (order * (order + 1))
     a, b = (
-        np.stack([np.pad(each[which], (0, terms - len(each[which]))) for each in series]) * factor
-        for which in (0, 1)
+        factor * np.stack([np.pad(numbers, (0, terms - len(numbers))) for numbers in coefficients])
+        for coefficients in zip(*series, strict=True)
     )
     pi, tau = _angular_functions(np.cos(np.linspace(0, math.pi, STEPS + 1)), terms)
     # Amplitudes S1 and S2 of each size [RADII, STEPS + 1]; unpolarized light has their mean power.
@@ -63,9 +63,10 @@ def _angular_functions(cosine: np.ndarray, terms: int) -> tuple[np.ndarray, np.n
     Source: Bohren and Huffman 1983, equation 4.47.
     """
     pi, tau = np.empty((terms, len(cosine))), np.empty((terms, len(cosine)))
-    before, here = np.zeros_like(cosine), np.ones_like(cosine)
+    previous, current = np.zeros_like(cosine), np.ones_like(cosine)
     for n in range(1, terms + 1):
-        pi[n - 1] = here
-        tau[n - 1] = n * cosine * here - (n + 1) * before
-        before, here = here, ((2 * n + 1) * cosine * here - (n + 1) * before) / n
+        pi[n - 1] = current
+        tau[n - 1] = n * cosine * current - (n + 1) * previous
+        following = ((2 * n + 1) * cosine * current - (n + 1) * previous) / n
+        previous, current = current, following
     return pi, tau

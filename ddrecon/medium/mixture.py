@@ -28,8 +28,8 @@ def mix_media(media: Mapping[str, Volume]) -> Volume:
     for name, medium in media.items():
         glows = medium.emission is not None or medium.black_body is not None
         if glows or medium.support is not None or medium.index != 1:
-            what = "emission, black_body, support and index are for the mixture"
-            raise ValueError(f"media.{name}: {what}, not for a medium of it")
+            keys = "emission, black_body, support and index"
+            raise ValueError(f"media.{name}: {keys} are for the mixture, not for a medium of it")
     first, second = media.values()
     grid = first.grid
     absorbing = [for_cells(medium.sigma_a) * medium.density for medium in (first, second)]

@@ -54,19 +54,13 @@ class PhaseFunction(ABC):
     def moments(self, count: int) -> Tensor:
         """chi_l for l < `count`, [C, count], or of cells [C, count, z, y, x]."""
 
-    def peak_tail(self, degree: int, count: int) -> Tensor:
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
         """The moments f r_l of the forward peak for `count` degrees l > `degree`, [C, count].
 
         The first is f, the part of scattering that counts as not scattered where light is known to
         `degree` (docs/theory.md E8.5). f is 0 without a forward peak, and the others are at most f.
-        """
-        return torch.zeros_like(self.moments(count))
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        """The moments b r_l of the backward peak for `count` degrees l > `degree`, [C, count].
-
-        They are those about the backward direction. The first is b, the part of scattering that
-        counts as turned back where light is known to `degree`; the others are at most b.
+        With a `sign` of -1 they are of the backward peak, about that direction, and the first is b,
+        the part of scattering that counts as turned back (E8.11).
         """
         return torch.zeros_like(self.moments(count))
 
@@ -93,7 +87,8 @@ class PhaseFunction(ABC):
     def colors(self) -> int:
         """How many colors have a phase function of their own: 1 where all share one."""
         cells = self.cells
-        return len(self.moments(1)) if cells is None else len(cells)
+        phase = self if cells is None else self.with_cells(cells[:, :1, :1, :1])
+        return len(phase.moments(1))
 
     @property
     def cells(self) -> Tensor | None:
@@ -106,13 +101,9 @@ class PhaseFunction(ABC):
         assert self.CELLWISE is not None
         return replace(self, **{self.CELLWISE: number})
 
-    def forward_fraction(self, degree: int) -> Tensor:
-        """f [C], the forward peak's part of scattering where light is known to `degree`."""
-        return self.peak_tail(degree, 1)[:, 0]
-
-    def backward_fraction(self, degree: int) -> Tensor:
-        """b [C], the backward peak's part of scattering where light is known to `degree`."""
-        return self.backward_tail(degree, 1)[:, 0]
+    def move_cells(self, move: Callable[[Tensor], Tensor]) -> Self:
+        """The same with what `move` makes of the number that differs from cell to cell, if any."""
+        return self if self.cells is None else self.with_cells(move(self.cells))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,14 +126,12 @@ class HenyeyGreenstein(PhaseFunction):
     def moments(self, count: int) -> Tensor:
         return _powers(self.g, 0, count)
 
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        return _powers(self.g.clamp(min=0), degree + 1, count)
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return _powers((-self.g).clamp(min=0), degree + 1, count)
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
+        return _powers((sign * self.g).clamp(min=0), degree + 1, count)
 
     def length(self) -> int:
-        return length_of(self.g)
+        largest = float(self.g.detach().abs().max())
+        return next((count for count in COUNTS if largest**count < NEGLIGIBLE), COUNTS[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +149,9 @@ class Rayleigh(PhaseFunction):
         return (0.75 * (1 + cosine * cosine))[None]
 
     def moments(self, count: int) -> Tensor:
-        found = self.like.new_zeros(1, count)
-        found[:, :1], found[:, 2:3] = 1.0, 0.1
-        return found
+        moments = self.like.new_zeros(1, count)
+        moments[:, :1], moments[:, 2:3] = 1.0, 0.1
+        return moments
 
     def length(self) -> int:
         return COUNTS[0]
@@ -197,16 +186,14 @@ def colored(number: Tensor) -> Tensor:
     return number if number.ndim == 4 else number[None]
 
 
+def beside_degrees(number: Tensor) -> Tensor:
+    """`number` to broadcast against moments, [C, 1], or of cells [C, 1, z, y, x]."""
+    return colored(number)[:, None] if number.ndim > 2 else number.reshape(-1, 1)
+
+
 def _powers(g: Tensor, first: int, count: int) -> Tensor:
     """g^l for `count` degrees l from `first` on, [C, count] or [C, count, z, y, x]."""
     degree = torch.arange(first, first + count, dtype=g.dtype, device=g.device)
-    if g.ndim > 2:
-        powers: Tensor = colored(g)[:, None] ** degree.view(-1, 1, 1, 1)
-        return powers
-    return g.reshape(-1, 1) ** degree
-
-
-def length_of(g: Tensor) -> int:
-    """How many powers of the largest of `g` are not negligible."""
-    largest = float(g.detach().abs().max())
-    return next((count for count in COUNTS if largest**count < NEGLIGIBLE), COUNTS[-1])
+    base = beside_degrees(g)
+    powers: Tensor = base ** degree.view(-1, *[1] * (base.ndim - 2))
+    return powers

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from torch import Tensor
 
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind, beside, colored
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind, beside, beside_degrees
 
 
 class Mixture(PhaseFunction):
@@ -27,35 +26,26 @@ class Mixture(PhaseFunction):
     def parts(self) -> tuple[PhaseFunction, PhaseFunction]:
         """Both phase functions; no number of theirs differs from cell to cell."""
 
-    @functools.cached_property
-    def colors(self) -> int:
-        own = 1 if self.weight.ndim in (0, 3) else len(self.weight)
-        return max(own, *(part.colors for part in self.parts))
-
     def value(self, cosine: Tensor) -> Tensor:
-        first, second = (part.value(cosine) for part in self.parts)
+        first, second = (phase.value(cosine) for phase in self.parts)
         weight = beside(self.weight, cosine)
         return weight * first + (1 - weight) * second
 
     def moments(self, count: int) -> Tensor:
-        return self._mix([part.moments(count) for part in self.parts])
+        return self._mix(*(phase.moments(count) for phase in self.parts))
 
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([part.peak_tail(degree, count) for part in self.parts])
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([part.backward_tail(degree, count) for part in self.parts])
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
+        return self._mix(*(phase.peak_tail(degree, count, sign) for phase in self.parts))
 
     def length(self) -> int:
-        return max(part.length() for part in self.parts)
+        return max(phase.length() for phase in self.parts)
 
-    def _mix(self, parts: Sequence[Tensor]) -> Tensor:
-        """Moments [C, count] of both parts as those of the mixture."""
-        weight = self.weight.reshape(-1, 1)
-        if self.weight.ndim > 2:
-            weight = colored(self.weight)[:, None]
-            parts = [part[..., None, None, None] for part in parts]
-        return weight * parts[0] + (1 - weight) * parts[1]
+    def _mix(self, first: Tensor, second: Tensor) -> Tensor:
+        """Moments [C, count] of both phase functions as those of the mixture."""
+        weight = beside_degrees(self.weight)
+        if weight.ndim > 2:
+            first, second = first[..., None, None, None], second[..., None, None, None]
+        return weight * first + (1 - weight) * second
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,16 +89,15 @@ class Blend(Mixture):
 
     @property
     def kind(self) -> PhaseKind:
-        return _BlendOf(type(self.first), type(self.second))
+        return _find_kind(type(self.first), type(self.second))
 
 
-@dataclass(frozen=True)
-class _BlendOf:
-    """Makes blends of the numbers of two kinds of phase functions and a weight."""
+@functools.cache
+def _find_kind(first: type[PhaseFunction], second: type[PhaseFunction]) -> PhaseKind:
+    """What makes blends of the numbers of two kinds of phase functions and a weight."""
+    count = len(fields(first))
 
-    first: type[PhaseFunction]
-    second: type[PhaseFunction]
+    def blend(*numbers: Tensor) -> Blend:
+        return Blend(first(*numbers[:count]), second(*numbers[count:-1]), numbers[-1])
 
-    def __call__(self, *numbers: Tensor) -> Blend:
-        count = len(fields(self.first))
-        return Blend(self.first(*numbers[:count]), self.second(*numbers[count:-1]), numbers[-1])
+    return blend

@@ -3,17 +3,29 @@
 Light that the forward peak alone has scattered, often or once, is still on its way; at a depth x of
 the peak it has spread (docs/theory.md E8.7, E8.6). Along a ray only x changes: the function is a
 polynomial in (x - s) / (x + s), whose coefficients are kept over the angle.
+
+Where a number of the phase function differs from cell to cell, it is interpolated to the nodes of
+rays, as density is. There S of E8.7 is a polynomial in that number too (E8.9). Of Henyey and
+Greenstein's function the polynomial is of S over p, so that S is exact without a peak.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
-from ddrecon.medium.phase_cells import count_powers, is_scaled, number_place, number_table
+from ddrecon.medium.phase import (
+    HenyeyGreenstein,
+    PhaseFunction,
+    PhaseKind,
+    henyey_greenstein,
+    remember_of_phase,
+)
 from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
 from ddrecon.numerics.chebyshev import (
     COEFFICIENTS,
@@ -25,6 +37,11 @@ from ddrecon.numerics.chebyshev import (
 )
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.legendre import even_angles, legendre_at_even_angles, series_weights
+
+WEIGHT_POWERS = 4
+"""Coefficients over a weight: S of two forward lobes is within about 2 % of E8.7."""
+STEEPEST = 0.99
+"""The largest g of tables. Over artanh g up to there, S has as many coefficients as over depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,48 +89,122 @@ class SeenPhase:
         At even angles, with slopes by the angle (`numerics.angle_table`), in double precision. Of a
         phase function that differs from cell to cell K is as `number_table` has it.
         """
-        make, degree = (peak_table, (self.degree,)) if has_peak else (_plain_table, ())
+        make, degree = (_peak_table, (self.degree,)) if has_peak else (_plain_table, ())
         if self.phase.cells is None:
             return make(self.phase, *degree)
-        return number_table(self.phase, make, count_powers(self.phase, has_peak), 1, *degree)
+        return number_table(self.phase, make, has_peak, 1, *degree)
+
+
+def is_scaled(kind: PhaseKind) -> bool:
+    """Whether the number is g, and tables have S over p; else p is linear in it, a weight."""
+    return kind is HenyeyGreenstein
+
+
+def count_powers(phase: PhaseFunction, has_peak: bool) -> int:
+    """Coefficients of S over the number that differs from cell to cell, 1 where none does."""
+    if phase.cells is None:
+        return 1
+    if is_scaled(phase.kind):
+        return COEFFICIENTS if has_peak else 1
+    return WEIGHT_POWERS if has_peak else 2
+
+
+def number_place(kind: PhaseKind, number: Tensor) -> Tensor:
+    """`number` from -1 to 1 in polynomials: of a weight, or of g by its artanh, 0 and less as 0."""
+    if not is_scaled(kind):
+        return 2 * number - 1
+    g = torch.where(number > 0, number, torch.zeros_like(number))
+    g = torch.where(g < STEEPEST, g, torch.full_like(g, STEEPEST))
+    return torch.atanh(g) / (math.atanh(STEEPEST) / 2) - 1
+
+
+def number_table(
+    phase: PhaseFunction, make: Callable[..., Tensor], has_peak: bool, sign: int, *arguments: int
+) -> Tensor:
+    """Coefficients over the number of the tables that `make` has of `phase` and `arguments`.
+
+    They are [C, steps + 1, 2, powers K], of tables [C, steps + 1, 2, K], with so many powers as
+    `count_powers` says. `sign` is that of g.
+    """
+    powers, device = count_powers(phase, has_peak), phase.numbers[0].device
+    numbers = _fitted_numbers(is_scaled(phase.kind), powers, sign, device)
+    return _fit(phase.with_cells(numbers), make, *arguments)
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _fitted_numbers(is_g: bool, powers: int, sign: int, device: torch.device) -> Tensor:
+    """The numbers [`powers`] at which polynomials are fitted."""
+    places, *_ = extrema(powers)
+    half = (places + 1) / 2
+    return (sign * torch.tanh(math.atanh(STEEPEST) * half) if is_g else half).to(device)
+
+
+@remember_of_phase
+def _fit(phase: PhaseFunction, make: Callable[..., Tensor], *arguments: int) -> Tensor:
+    """As `number_table`, of a `phase` with all numbers at which polynomials are fitted."""
+    # one after the other: weak peaks have short series
+    phases = [phase.with_cells(number) for number in phase.numbers[-1]]
+    tables = torch.stack([make(at_number, *arguments) for at_number in phases])
+    if is_scaled(phase.kind):
+        # S over p, where p is summed as S is
+        moments = (at_number.moments(at_number.length()).double() for at_number in phases)
+        sums = torch.stack([tabulate_series(series_weights(chi)[..., None]) for chi in moments])
+        p, d_p = sums.unbind(-2)
+        values, slopes = tables.unbind(-2)
+        ratio = values / p
+        tables = torch.stack([ratio, (slopes - ratio * d_p) / p], -2)
+    *_, to_series = extrema(len(phases))
+    coefficients = torch.tensordot(to_series.to(tables), tables, 1)
+    return coefficients.movedim(0, -2).flatten(-2).contiguous()
+
+
+def tabulate_series(weights: Tensor) -> Tensor:
+    """Sums over l of `weights` [C, count, K] times P_l as a table [C, steps + 1, 2, K]."""
+    curves = legendre_at_even_angles(STEPS, weights.shape[1])
+    return torch.stack([rows.to(weights) @ weights for rows in curves], 2)
+
+
+def peak_moments(phase: PhaseFunction, degree: int, sign: int = 1) -> tuple[Tensor, Tensor]:
+    """All moments f r_l of a peak, and all r_l, which are 1 up to `degree` (E8.5).
+
+    `sign` is as of `PhaseFunction.peak_tail`.
+    """
+    tail = phase.peak_tail(degree, phase.length() - degree - 1, sign).double()
+    fraction = tail[:, :1]
+    low = fraction.expand(-1, degree + 1, *tail.shape[2:])
+    # Without a peak r_l beyond `degree` does not matter.
+    spread = tail / torch.where(fraction > 0, fraction, 1)
+    return torch.cat([low, tail], 1), torch.cat([torch.ones_like(low), spread], 1)
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
     """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E8.6)."""
-    count = phase.length()
-    chi = phase.moments(count).double()
-    tail = phase.peak_tail(degree, count - degree - 1).double()
-    peak = torch.cat([tail[:, :1].expand_as(chi[:, : degree + 1]), tail], 1)
-    # r_l, at most 1; without a peak it does not matter.
-    spread = peak / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
-    if chi.ndim == 2:
-        shape = (-1, *[1] * (depth.ndim - 2), count)
-        chi, peak, spread = (each.reshape(shape) for each in (chi, peak, spread))
-    else:
-        chi, peak, spread = (each[..., 0].movedim(1, -1) for each in (chi, peak, spread))
+    moments = phase.moments(phase.length()).double(), *peak_moments(phase, degree)
+    chi, peak, spread = (
+        numbers.movedim(1, -1).unflatten(0, (-1, *[1] * (depth.ndim - numbers.ndim)))
+        for numbers in moments
+    )
     # exp(-x (1 - r)) phi(r x), which is exp(-x) phi(-r x) for r < 0.
     forward, size = spread.clamp(min=0), spread.abs()
     turned = torch.exp((forward - 1) * depth) * decay_mean(size * depth)
     return series_weights(chi - peak + peak * turned)
 
 
-def in_double(phase: PhaseFunction) -> PhaseFunction:
-    """`phase` in double precision."""
-    return phase.kind(*(each.double() for each in phase.numbers))
+def _in_double(phase: PhaseFunction) -> PhaseFunction:
+    return phase.kind(*(number.double() for number in phase.numbers))
 
 
 @remember_of_phase
 def _plain_table(phase: PhaseFunction) -> Tensor:
     cosines = even_angles(STEPS).to(phase.numbers[0].device).cos()
-    return with_slopes(in_double(phase).value(cosines))
+    return with_slopes(_in_double(phase).value(cosines))
 
 
 @remember_of_phase
-def peak_table(phase: PhaseFunction, degree: int) -> Tensor:
+def _peak_table(phase: PhaseFunction, degree: int) -> Tensor:
     """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of a phase function."""
     places, inverse, _ = (array.to(phase.numbers[0].device) for array in extrema(COEFFICIENTS))
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].
-    series = peaked_series(in_double(phase), degree, depth_at(places)[None, :, None])
-    coefficients = (inverse @ series).mT
-    curves = legendre_at_even_angles(STEPS, coefficients.shape[1])
-    return torch.stack([rows.to(coefficients) @ coefficients for rows in curves], 2)
+    series = peaked_series(_in_double(phase), degree, depth_at(places)[None, :, None])
+    return tabulate_series((inverse @ series).mT)

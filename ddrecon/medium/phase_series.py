@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import NEGLIGIBLE, PhaseFunction
+from ddrecon.medium.phase import NEGLIGIBLE, PhaseFunction, beside
 from ddrecon.numerics.angle_table import angle_of, look_up, with_slopes
 from ddrecon.numerics.legendre import COUNTS, gauss_legendre, legendre
 
@@ -29,21 +29,22 @@ class Tabulated(PhaseFunction):
     values: Tensor
 
     def value(self, cosine: Tensor) -> Tensor:
-        found = look_up(with_slopes(self.values), angle_of(cosine))[..., 0]
-        norm = self.mean.reshape(-1, *[1] * cosine.ndim)
-        return (found / norm).clamp(min=0).to(cosine.dtype)
+        curve = look_up(with_slopes(self.values), angle_of(cosine))[..., 0]
+        return (curve / beside(self.mean, cosine)).clamp(min=0).to(cosine.dtype)
 
     def moments(self, count: int) -> Tensor:
         integrals = self._integrals(count)
         return integrals / integrals[:, :1]
 
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        """As many moments as there are of what a peak of part f can have.
+    def peak_tail(self, degree: int, count: int, sign: int = 1) -> Tensor:
+        """As many moments as there are of what a forward peak of part f can have.
 
         f is chi_(degree + 1), but not below 0, and not more than leaves a mean cosine >= 0 to the
         rest. So a function without a forward peak, as Rayleigh's, has none.
         """
         chi = self.moments(degree + count + 1)
+        if sign < 0:
+            return torch.zeros_like(chi[:, :count])
         peak = torch.minimum(chi[:, degree + 1 : degree + 2], chi[:, 1:2]).clamp(min=0)
         tail = torch.maximum(torch.minimum(chi[:, degree + 2 :], peak), -peak)
         return torch.cat([peak, tail], 1)

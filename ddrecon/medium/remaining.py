@@ -5,12 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import P1_DEGREE, Medium
+from ddrecon.medium.coefficients import P1_DEGREE, Medium, peak_fraction
 from ddrecon.medium.phase import PhaseFunction, henyey_greenstein, remember_of_phase
-from ddrecon.medium.phase_cells import count_powers, is_scaled, number_place, number_table
-from ddrecon.numerics.angle_table import STEPS, look_up
+from ddrecon.medium.phase_peak import (
+    is_scaled,
+    number_place,
+    number_table,
+    peak_moments,
+    tabulate_series,
+)
+from ddrecon.numerics.angle_table import look_up
 from ddrecon.numerics.chebyshev import sum_series
-from ddrecon.numerics.legendre import legendre, legendre_at_even_angles, series_weights
+from ddrecon.numerics.legendre import legendre, series_weights
 from ddrecon.numerics.remember import is_any_nonzero
 
 
@@ -42,17 +48,8 @@ def unturned_moments(medium: Medium) -> Tensor:
 
 
 def backward_fraction(medium: Medium) -> Tensor:
-    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E8.11).
-
-    It is [C or 1, z, y, x] where the phase function differs from cell to cell.
-    """
-    return _backward_fraction(medium.seen.phase, medium.seen.degree)
-
-
-@remember_of_phase
-def _backward_fraction(phase: PhaseFunction, degree: int) -> Tensor:
-    fraction = phase.backward_fraction(degree)
-    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
+    """b, the part of scattering that counts as turned back (E8.11), shaped as f of `Medium`."""
+    return peak_fraction(medium.seen.phase, medium.seen.degree, -1)
 
 
 def has_backward_peak(medium: Medium) -> bool:
@@ -68,15 +65,10 @@ def turned_table(phase: PhaseFunction, degree: int, turns: int) -> Tensor:
     moments are chi_l up to `degree`, and chi_l r_l^turns beyond, where r_l are the backward peak's;
     less the forward peak's, which counts as not scattered.
     """
-    count = phase.length()
-    tail = phase.backward_tail(degree, count - degree - 1).double()
-    spread = tail / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
-    spread = torch.cat([torch.ones_like(spread[:, :1]).expand(-1, degree + 1), spread], 1)
-    forward = phase.peak_tail(degree, count - degree - 1).double()
-    forward = torch.cat([forward[:, :1].expand(-1, degree + 1), forward], 1)
-    weights = series_weights((phase.moments(count).double() - forward) * spread**turns)
-    curves = legendre_at_even_angles(STEPS, count)
-    return torch.stack([weights @ rows.to(weights).T for rows in curves], -1)[..., None]
+    forward, _ = peak_moments(phase, degree)
+    _, spread = peak_moments(phase, degree, -1)
+    moments = phase.moments(phase.length()).double() - forward
+    return tabulate_series(series_weights(moments * spread**turns)[..., None])
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
@@ -84,13 +76,12 @@ def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
     phase, degree = medium.seen.phase, medium.seen.degree
     number, kind, cosine = phase.cells, phase.kind, angle.cos().to(phase.numbers[-1])
     assert number is not None
-    powers = count_powers(phase, has_peak=True)
-    table = number_table(phase, turned_table, powers, -1, degree, turns).to(number)
+    table = number_table(phase, turned_table, True, -1, degree, turns).to(number)
     coefficients = look_up(table, angle.double()).unbind(-1)
     if not is_scaled(kind):
         return sum_series(coefficients, number_place(kind, number))
     turned = sum_series(coefficients, number_place(kind, -number))
     # Where g is positive nothing is turned back, and the forward peak counts as not scattered.
-    rest = (phase.moments(degree + 1) - phase.peak_tail(degree, 1)).movedim(1, -1)
-    forward = (series_weights(rest) * legendre(cosine, degree + 1)).sum(-1)
+    moments = (phase.moments(degree + 1) - phase.peak_tail(degree, 1)).movedim(1, -1)
+    forward = (series_weights(moments) * legendre(cosine, degree + 1)).sum(-1)
     return torch.where(number < 0, henyey_greenstein(cosine, number) * turned, forward)

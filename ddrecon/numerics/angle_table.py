@@ -7,6 +7,7 @@ the step and with a continuous slope.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,26 +33,19 @@ def look_up(table: Tensor, angle: Tensor) -> Tensor:
     The two entries are value and slope by the angle. Values have the precision of `table`.
     """
     colors, steps = len(table), table.shape[1] - 1
-    rows, weights = _cubic(angle.flatten(), steps, table.dtype)
-    found = torch.stack([_weigh(curves.flatten(0, 1), rows, weights) for curves in table])
-    return found.view(colors, *angle.shape, table.shape[-1])
-
-
-def _cubic(angle: Tensor, steps: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Rows [N, 4] and weights of Hermite's cubic at `angle` [N], of `steps` from 0 to pi.
-
-    Values and slopes at both ends of a step, which stand beside each other, are those rows.
-    """
-    step = math.pi / steps
-    place = angle / step
+    place = angle.flatten() / (math.pi / steps)
     first = place.detach().long().clamp(0, steps - 1)
-    part = (place - first).to(dtype)
-    rest = 1 - part
-    # values by (1 + 2 t)(1 - t)^2, slopes by t (1 - t)^2, and mirrored
-    low = (1 + 2 * part) * rest**2, step * part * rest**2
-    high = (1 + 2 * rest) * part**2, -step * rest * part**2
+    weights = torch.stack(_cubic((place - first).to(table.dtype), math.pi / steps), -1)
+    # Values and slopes at both ends of a step stand beside each other.
     rows = 2 * first[:, None] + torch.arange(4, device=place.device)
-    return rows, torch.stack([*low, *high], -1)
+    values = torch.stack([_weigh(curves.flatten(0, 1), rows, weights) for curves in table])
+    return values.view(colors, *angle.shape, table.shape[-1])
+
+
+def _cubic(t: Any, step: Any) -> tuple[Any, Any, Any, Any]:
+    """Weights of values and slopes at both ends of a `step`, the part `t` of it on (Hermite)."""
+    u = 1 - t
+    return (1 + 2 * t) * u**2, step * t * u**2, (1 + 2 * u) * t**2, -step * u * t**2
 
 
 def _weigh(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
@@ -86,18 +80,11 @@ def at_even_angles(angles: np.ndarray, values: np.ndarray) -> np.ndarray:
     before, after = widths[:-1], widths[1:]
     weights = (2 * after + before), (after + 2 * before)
     is_monotone = rises[:, :-1] * rises[:, 1:] > 0
-    one, other = (np.where(is_monotone, rise, 1) for rise in (rises[:, :-1], rises[:, 1:]))
-    inner = sum(weights) / (weights[0] / one + weights[1] / other)
+    low, high = (np.where(is_monotone, rise, 1) for rise in (rises[:, :-1], rises[:, 1:]))
+    inner = sum(weights) / (weights[0] / low + weights[1] / high)
     slopes = np.pad(np.where(is_monotone, inner, 0), ((0, 0), (1, 1)))
     places = np.linspace(0, math.pi, STEPS + 1)
     left = np.searchsorted(angles, places, side="right").clip(1, len(angles) - 1) - 1
-    width = widths[left]
-    part = (places - angles[left]) / width
-    rest = 1 - part
-    value = (1 + 2 * part) * rest**2 * values[:, left] + (1 + 2 * rest) * part**2 * values[
-        :, left + 1
-    ]
-    found: np.ndarray = value + width * part * rest * (
-        rest * slopes[:, left] - part * slopes[:, left + 1]
-    )
-    return found
+    entries = values[:, left], slopes[:, left], values[:, left + 1], slopes[:, left + 1]
+    cubic = _cubic((places - angles[left]) / widths[left], widths[left])
+    return np.sum([weight * entry for weight, entry in zip(cubic, entries, strict=True)], axis=0)

@@ -14,7 +14,7 @@ def mean_around(field: Tensor, width: int = 5) -> Tensor:
     """
     cells = field.reshape(-1, 1, *field.shape[-3:])
     sums, counts = (
-        avg_pool3d(pad(each, [width // 2] * 6), width, 1)
-        for each in (cells, torch.ones_like(cells[:1]))
+        avg_pool3d(pad(values, [width // 2] * 6), width, 1)
+        for values in (cells, torch.ones_like(cells[:1]))
     )
     return (sums / counts).view(field.shape)

@@ -35,7 +35,7 @@ def is_forward() -> bool:
 def is_steady(*tensors: Tensor) -> bool:
     """Whether what is made of `tensors` has no derivatives, and may be kept for later."""
     return not (
-        any(one.requires_grad or one.is_inference() for one in tensors)
+        any(tensor.requires_grad or tensor.is_inference() for tensor in tensors)
         or torch._C._are_functorch_transforms_active()
         or (is_forward() and any(map(is_varied, tensors)))
     )
@@ -84,7 +84,7 @@ def is_fused(*steady: Tensor) -> bool:
     """
     if current_engine() != "warp":
         return False
-    return not any(forward_ad.unpack_dual(one).tangent is not None for one in steady)
+    return not any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in steady)
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
@@ -115,8 +115,7 @@ class _Plain(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        found = output if isinstance(output, tuple) else (output,)
-        ctx.mark_non_differentiable(*(one for one in found if isinstance(one, Tensor)))
+        ctx.mark_non_differentiable(*tensors_in(output))
 
 
 def differentiate_once(backward: Callable[..., T]) -> Callable[..., T]:
@@ -178,7 +177,7 @@ class _Recomputation:
 
     def __init__(self, function: Callable[[], Any]):
         self.function, self.engine = function, current_engine()
-        self.versions = [(tensor, version_of(tensor)) for tensor in _tensors_in(function)]
+        self.versions = [(tensor, version_of(tensor)) for tensor in tensors_in(function)]
         self.count = 0
         self.saved: dict[int, Tensor] = {}
 
@@ -200,15 +199,13 @@ class _Recomputation:
                 "since: the gradient would be that of other numbers"
             )
         saved: list[Tensor] = []
+        hooks = saved_tensors_hooks(lambda tensor: saved.append(tensor.detach()), saved.__getitem__)
         level, engine = forward_ad._current_level, current_engine()
         try:
             forward_ad._current_level = -1
             if engine != self.engine:
                 use_engine(self.engine)
-            with (
-                torch.enable_grad(),
-                saved_tensors_hooks(lambda one: saved.append(one.detach()), saved.__getitem__),
-            ):
+            with torch.enable_grad(), hooks:
                 self.function()
         finally:
             forward_ad._current_level = level
@@ -217,25 +214,24 @@ class _Recomputation:
         self.saved = dict(enumerate(saved))
 
 
-def _tensors_in(value: Any) -> Iterator[Tensor]:
+def tensors_in(value: Any) -> Iterator[Tensor]:
     """The tensors in `value`: records, lists, tuples, mappings, and what a function has bound."""
+    entries: Iterable[Any] = ()
     if isinstance(value, Tensor):
         yield value
-        return
-    inner: Iterable[Any] = ()
-    if isinstance(value, list | tuple):
-        inner = value
+    elif isinstance(value, list | tuple):
+        entries = value
     elif isinstance(value, dict):
-        inner = value.values()
-    elif isinstance(value, functools.partial):
-        inner = (value.func, value.args, value.keywords)
+        entries = value.values()
     elif is_dataclass(value):
-        inner = (getattr(value, key.name) for key in fields(value))
+        entries = (getattr(value, key.name) for key in fields(value))
+    elif isinstance(value, functools.partial):
+        entries = value.func, value.args, value.keywords
+    elif isinstance(value, MethodType):
+        entries = (value.__self__,)
     elif isinstance(value, FunctionType):
         # An empty cell is that of a variable that has no value yet.
         cells = [cell for cell in value.__closure__ or () if cell != CellType()]
-        inner = (*(cell.cell_contents for cell in cells), *(value.__defaults__ or ()))
-    elif isinstance(value, MethodType):
-        inner = (value.__self__,)
-    for entry in inner:
-        yield from _tensors_in(entry)
+        entries = *(cell.cell_contents for cell in cells), *(value.__defaults__ or ())
+    for entry in entries:
+        yield from tensors_in(entry)

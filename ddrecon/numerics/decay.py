@@ -59,9 +59,9 @@ def decay_terms(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _eta(depth: Tensor, phi: Tensor) -> Tensor:
     """eta, given `phi`; or as the sum over k of (-`depth`)^k (k + 1) / (2 (k + 3)!)."""
-    *others, last = constant(SERIES, depth)
+    *factors, last = constant(SERIES, depth)
     series = last.expand_as(depth)
-    for factor in reversed(others):
+    for factor in reversed(factors):
         series = torch.addcmul(factor, depth, series, value=-1)
     thick = depth.clamp(min=SERIES_BELOW)
     return torch.where(depth < SERIES_BELOW, series, ((1 - phi) / thick - 0.5 * phi) / thick)

@@ -26,19 +26,19 @@ def find_flow(before: Tensor, after: Tensor) -> Tensor:
     Both are [z, y, x] and at least 0. `carry(before, flow)` is near to `after`.
     """
     size = torch.maximum(before.max(), after.max()).clamp(min=torch.finfo(before.dtype).tiny)
-    whole, factor = torch.stack([before, after]) / size, 1
+    fields, factor = torch.stack([before, after]) / size, 1
     while min(before.shape) // (2 * factor) >= COARSEST:
         factor *= 2
     flow = before.new_zeros(3, 1, 1, 1)
     while factor:
         z, y, x = (max(1, round(count / factor)) for count in before.shape)
         shape = z, y, x
-        one, other = adaptive_avg_pool3d(whole, shape)
+        coarse = adaptive_avg_pool3d(fields, shape)
         stretch = [new / old for new, old in zip(shape, flow.shape[1:], strict=True)]
         flow = interpolate(flow[None], shape, mode="trilinear", align_corners=False)[0]
         flow = flow * flow.new_tensor(stretch).view(3, 1, 1, 1)
         for _ in range(WARPS):
-            flow = _relax(one, other, flow)
+            flow = _relax(coarse[0], coarse[1], flow)
         factor //= 2
     return flow
 
@@ -51,10 +51,10 @@ def carry(field: Tensor, flow: Tensor) -> Tensor:
     shape = flow.shape[1:]
     lines = [torch.arange(count, dtype=flow.dtype, device=flow.device) for count in shape]
     places = torch.stack(torch.meshgrid(*lines, indexing="ij")) - flow
-    parts = [(2 * place + 1) / count - 1 for place, count in zip(places, shape, strict=True)]
+    points = [(2 * place + 1) / count - 1 for place, count in zip(places, shape, strict=True)]
     carried = grid_sample(
         field.reshape(1, -1, *shape),
-        torch.stack(parts[::-1], -1)[None],
+        torch.stack(points[::-1], -1)[None],
         padding_mode="border",
         align_corners=False,
     )
@@ -63,15 +63,15 @@ def carry(field: Tensor, flow: Tensor) -> Tensor:
 
 def _relax(before: Tensor, after: Tensor, flow: Tensor) -> Tensor:
     """A better `flow`: the changes that are left along it are made small by Jacobi sweeps."""
-    here = carry(before, flow)
-    pairs = _neighbors((here + after) / 2)
+    carried = carry(before, flow)
+    pairs = _neighbors((carried + after) / 2)
     slope = torch.stack([(above - below) / 2 for below, above in pairs])
-    # To first order here(x - d) is here - slope d: slope (new - flow) + after - here is to vanish.
-    left = after - here - (slope * flow).sum(0)
+    # To first order f(x - d) is f - slope d: slope (new - flow) + after - carried is to vanish.
+    difference = after - carried - (slope * flow).sum(0)
     strength = 1 / (STIFFNESS + slope.square().sum(0))
     for _ in range(SWEEPS):
         mean = torch.stack([below + above for below, above in _neighbors(flow)]).sum(0) / 6
-        flow = mean - slope * ((slope * mean).sum(0) + left) * strength
+        flow = mean - slope * ((slope * mean).sum(0) + difference) * strength
     return flow
 
 

@@ -19,7 +19,6 @@ from ddrecon.numerics.third_order import (
     ThirdOrder,
     second_difference,
     split_place,
-    subtract_correction,
     third_order_weight,
 )
 
@@ -42,11 +41,7 @@ def sample_volume(volume: Tensor, points: Tensor, third_order: ThirdOrder | None
 
 
 def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None) -> Tensor:
-    """Values `[N, K, ...]` of `values` [N, K, ...] at `points`, linear or to third order.
-
-    A part a of the way from one center to the next, linear interpolation is too large by a (1 - a)
-    / 2 times the second difference: of channels in `third_order` that is taken off, for each axis.
-    """
+    """Values `[N, K, ...]` of `values` [N, K, ...] at `points`, linear or to third order."""
     if third_order is None:
         return _sample(values, points)
 
@@ -57,12 +52,12 @@ def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None)
     sampled = _sample(torch.cat([values, *differences], 1), points)
     linear, *bends = sampled.split([values.shape[1]] + [curved.shape[1]] * len(axes), 1)
 
-    # a (1 - a) / 2 times the second difference along each axis; `points` count axes from the last.
+    # `points` count axes from the last.
     corrections = [
         third_order_weight(points[..., 1 - axis], size, third_order.border)[:, None] * bend
         for axis, size, bend in zip(axes, values.shape[2:], bends, strict=True)
     ]
-    return subtract_correction(linear, torch.stack(corrections).sum(0), third_order)
+    return third_order.correct(linear, torch.stack(corrections).sum(0))
 
 
 def _sample(values: Tensor, points: Tensor) -> Tensor:
@@ -79,12 +74,12 @@ def _gather(values: Tensor, points: Tensor) -> Tensor:
         (torch.zeros_like(points[..., 0], dtype=torch.long), torch.ones_like(points[..., 0]))
     ]
     for size, coordinate in zip(sizes, points.unbind(-1)[::-1], strict=True):
-        center, part = split_place(coordinate, size)
+        center, a = split_place(coordinate, size)
         cells = [(center.long() + side).clamp(0, size - 1) for side in (0, 1)]
         corners = [
             (size * number + cell, factor * weight)
             for number, factor in corners
-            for cell, weight in zip(cells, (1 - part, part), strict=True)
+            for cell, weight in zip(cells, (1 - a, a), strict=True)
         ]
     flat = values.flatten(2)
     return sum(

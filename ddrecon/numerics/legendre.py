@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import deque
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -37,12 +39,16 @@ def legendre_at_even_angles(steps: int, count: int) -> tuple[Tensor, Tensor]:
 
 def legendre(cosine: Tensor, count: int) -> Tensor:
     """P_l(`cosine`) for l < `count`, as a new last axis."""
-    before, here = torch.zeros_like(cosine), torch.ones_like(cosine)
-    rows = [here]
-    for degree in range(count - 1):
-        before, here = here, ((2 * degree + 1) * cosine * here - degree * before) / (degree + 1)
-        rows.append(here)
-    return torch.stack(rows, -1)
+    return torch.stack([*_each_legendre(cosine, count)], -1)
+
+
+def _each_legendre(cosine: Tensor, count: int) -> Iterator[Tensor]:
+    """P_l(`cosine`) for l < `count`, one at a time."""
+    before, value = torch.zeros_like(cosine), torch.ones_like(cosine)
+    for degree in range(count):
+        yield value
+        after = ((2 * degree + 1) * cosine * value - degree * before) / (degree + 1)
+        before, value = value, after
 
 
 def series_weights(moments: Tensor) -> Tensor:
@@ -73,7 +79,5 @@ def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
 
 def _last_legendre(cosine: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     """P_degree(`cosine`) and its derivative."""
-    before, here = torch.zeros_like(cosine), torch.ones_like(cosine)
-    for k in range(degree):
-        before, here = here, ((2 * k + 1) * cosine * here - k * before) / (k + 1)
-    return here, degree * (cosine * here - before) / (cosine**2 - 1)
+    before, value = deque(_each_legendre(cosine, degree + 1), maxlen=2)
+    return value, degree * (cosine * value - before) / (cosine**2 - 1)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Grid, Triple
+from ddrecon.grid import Grid
 
 FARTHEST = 16
 """Light is followed through periods for so many times the longest side of the box: light that goes
@@ -37,13 +37,14 @@ class Unrolled:
         grid = self.grid
         if not any(self.before + self.after):
             return grid
-        sizes = zip(self.before, grid.shape, self.after, strict=True)
-        z, y, x = (sum(cells) for cells in sizes)
-        lower, upper = (
-            _moved(grid, self.before, grid.lower, -1),
-            _moved(grid, self.after, grid.upper),
+        axes = zip(
+            self.before, grid.shape, self.after, grid.lower, grid.upper, grid.spacing, strict=True
         )
-        return Grid((z, y, x), lower, upper)
+        wide = (
+            (low + count + high, lower - low * step, upper + high * step)
+            for low, count, high, lower, upper, step in axes
+        )
+        return Grid(*zip(*wide, strict=True))
 
     def extend(self, field: Tensor) -> Tensor:
         """`field` [..., z, y, x] of a period in all cells."""
@@ -61,12 +62,6 @@ class Unrolled:
         return field
 
 
-def _moved(grid: Grid, cells: tuple[int, ...], corner: Triple, sign: int = 1) -> Triple:
-    steps = zip(corner, cells, grid.spacing, strict=True)
-    z, y, x = (place + sign * count * step for place, count, step in steps)
-    return z, y, x
-
-
 @functools.lru_cache(maxsize=64)
 def unroll(grid: Grid, reach: int) -> Unrolled:
     """So many cells more on both sides of a period."""
@@ -79,7 +74,7 @@ def unroll_along(grid: Grid, direction: Tensor, is_both: bool = False) -> Unroll
 
     And, if `is_both`, on its way from there.
     """
-    speed = [part / step for part, step in zip(direction.tolist(), grid.spacing, strict=True)]
+    speed = [cosine / step for cosine, step in zip(direction.tolist(), grid.spacing, strict=True)]
     times = [
         n / max(abs(s), 1e-30)
         for axis, (n, s) in enumerate(zip(grid.shape, speed, strict=True))

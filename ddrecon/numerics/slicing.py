@@ -17,7 +17,7 @@ NEARLY = 1e-9
 
 def across(axis: int) -> tuple[int, int]:
     """The axes along which rows and columns of the slices across `axis` are counted."""
-    row, column = (other for other in range(3) if other != axis)
+    row, column = (in_slice for in_slice in range(3) if in_slice != axis)
     return row, column
 
 

@@ -41,6 +41,11 @@ class ThirdOrder:
         """x / sqrt(1 + (bound x)^2)."""
         return x / (1 + (self.bound * x) ** 2).sqrt()
 
+    def correct(self, values: Tensor, correction: Tensor) -> Tensor:
+        """`values` with `correction`, bounded, taken off the channels, which axis 1 counts."""
+        corrected = values[:, self.channels] - self.bounded(correction)
+        return torch.cat([values[:, : self.first], corrected, values[:, self.last :]], 1)
+
 
 def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None) -> Tensor:
     """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors.
@@ -50,7 +55,7 @@ def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None)
     if steps == 1:
         return values
     low, high = values[:-1], values[1:]
-    parts = [low + (high - low) * (i / steps) for i in range(steps)]
+    fine = [low + (high - low) * (i / steps) for i in range(steps)]
     if third_order is not None:
         curved, border = values[:, third_order.channels], third_order.border
         if border:
@@ -63,21 +68,14 @@ def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None)
             # The second difference there, itself linear between neighbors.
             correction = 0.5 * a * (1 - a) * (bend[:-1] * (1 - a) + bend[1:] * a)
             correction = pad(correction, [0] * 2 * (values.ndim - 1) + [border] * 2)
-            parts[i] = subtract_correction(parts[i], correction, third_order)
-    return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
-
-
-def subtract_correction(values: Tensor, correction: Tensor, third_order: ThirdOrder) -> Tensor:
-    """`values` with `correction`, bounded, taken off the channels of `third_order`."""
-    corrected = values[:, third_order.channels] - third_order.bounded(correction)
-    return torch.cat([values[:, : third_order.first], corrected, values[:, third_order.last :]], 1)
+            fine[i] = third_order.correct(fine[i], correction)
+    return torch.cat([torch.stack(fine, 1).flatten(0, 1), values[-1:]])
 
 
 def second_difference(values: Tensor, axis: int) -> Tensor:
     """Second differences along `axis`, those at its ends with the end repeated."""
-    count = values.shape[axis]
-    longer = torch.cat([values.narrow(axis, 0, 1), values, values.narrow(axis, count - 1, 1)], axis)
-    return longer.diff(n=2, dim=axis)
+    ends = values.narrow(axis, 0, 1), values.narrow(axis, values.shape[axis] - 1, 1)
+    return values.diff(n=2, dim=axis, prepend=ends[0], append=ends[1])
 
 
 def nearly(like: Tensor, size: int) -> float:
@@ -86,7 +84,7 @@ def nearly(like: Tensor, size: int) -> float:
 
 
 def split_place(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """The last of `size` centers before places, and the part of the way from it to the next one.
+    """The last of `size` centers before places, and how far these are to the next one, 0 to 1.
 
     `coordinate`: from -1 to 1 between the outer faces. Centers count on, beyond these as well.
     """
@@ -100,6 +98,6 @@ def third_order_weight(coordinate: Tensor, size: int, border: int) -> Tensor:
 
     It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers within the `border`.
     """
-    center, part = split_place(coordinate, size)
+    center, a = split_place(coordinate, size)
     is_within = (center >= border) & (center < size - 1 - border)
-    return torch.where(is_within, 0.5 * part * (1 - part), torch.zeros_like(part))
+    return torch.where(is_within, 0.5 * a * (1 - a), torch.zeros_like(a))

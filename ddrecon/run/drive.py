@@ -163,10 +163,11 @@ def advance(
                         raise KeyboardInterrupt(f"{count_text}; go on with --resume")
         except (DivergenceError, RanksError) as error:
             folder.save(run)
-            raise error.with_advice(
+            error.advise(
                 f"the state after {run.iteration} iterations is kept in "
                 f"{folder.checkpoints / LAST}: go on from it with --resume"
-            ) from error
+            )
+            raise
 
 
 def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list[str]:

@@ -18,6 +18,7 @@ from ddrecon.scene import View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.frames import each_frame
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import Bounds
 from ddrecon.settings import AUTO, ParameterSettings
 
@@ -35,23 +36,23 @@ def fit_volume(scene_file: SceneFile) -> SceneFile:
     tree = scene_file.tree
     bounds, resolution = tree.volume.bounds, tree.volume.resolution
     if bounds is None:
-        what = "auto takes volume.bounds, a box in numbers or auto as well"
-        raise scene_file.refused("volume.resolution", what)
+        fault = "auto takes volume.bounds, a box in numbers or auto as well"
+        raise scene_file.refused("volume.resolution", fault)
     if isinstance(bounds, Bounds):
         corners = torch.tensor([bounds.min, bounds.max], dtype=torch.float64)
     else:
         corners = _find_box(scene_file)
     middle, sides = corners.mean(0), corners[1] - corners[0]
     if isinstance(resolution, str):
-        views = build_views(each_frame(scene_file)[0], None, torch.float32, torch.device("cpu"))
+        views = build_views(Maker(each_frame(scene_file)[0]), None)
         cell = CELL * mean(pixel_width(view.camera, middle) for view in views)
         x, y, z = (max(1, math.ceil(side / cell)) for side in sides.tolist())
         resolution = x, y, z
         if x * y * z > MANY_CELLS:
             times = math.ceil((x * y * z / MANY_CELLS) ** (1 / 3))
             fewer = f"pictures {times} times smaller along each side make {times**3} times fewer"
-            what = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
-            warnings.warn(f"volume.resolution: {what}", DataWarning, 2)
+            fault = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
+            warnings.warn(f"volume.resolution: {fault}", DataWarning, 2)
         sides = cell * sides.new_tensor(resolution)
     if not isinstance(bounds, Bounds):
         digits = 3 - math.floor(math.log10(float(sides.max())))
@@ -69,13 +70,13 @@ def _find_box(scene_file: SceneFile) -> Tensor:
     density = parameters.get("density", ParameterSettings())
 
     def frames() -> Iterator[tuple[Sequence[View], Sequence[Tensor]]]:
-        for one in each_frame(scene_file):
-            built = build_views(one, None, torch.float32, torch.device("cpu"))
+        for frame in each_frame(scene_file):
+            built = build_views(Maker(frame), None)
             views = [view for view in built if view.image is not None and not view.is_test]
             yield views, [find_shown(view, density.support or AUTO) for view in views]
 
     try:
         return bound_smoke(frames(), density.margin)
     except HullError as error:
-        what = f"auto: {error}; or give min and max in numbers"
-        raise scene_file.refused("volume.bounds", what) from error
+        fault = f"auto: {error}; or give min and max in numbers"
+        raise scene_file.refused("volume.bounds", fault) from error

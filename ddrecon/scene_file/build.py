@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.defaults import choose_diffusion, count_colors
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, suggestion
+from ddrecon.errors import DataWarning, FormatError, Problems, UsageError, gather, suggestion
 from ddrecon.io.images.table import read_image
 from ddrecon.layer import DTYPES
 from ddrecon.light.ground import Ground, Plane
@@ -31,17 +31,17 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
-from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
+from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     AmbientSection,
     BeamSection,
-    Color,
     DirectionalSection,
+    GroundSection,
     LightSection,
     PointSection,
 )
@@ -90,15 +90,15 @@ def build_scene(
         raise UsageError(f"device {device}: {error}") from None
     if scene_file.tree.frames is not None:
         scene_file = at_frame(scene_file, scene_file.tree.frames.first)
-    place, tree = torch.device(device), scene_file.tree
-    media, views, lights, ground = _build_parts(scene_file, dtype, place)
-    whole, optimize = _whole_of(media), tree.optimize
+    tree, maker = scene_file.tree, Maker(scene_file, dtype, device)
+    media, views, lights, ground = _build_parts(maker)
+    combined, optimize = _combine(media), tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    parameters = optimize.parameters if optimize else ()
-    diffusion, _ = choose_diffusion(tree.diffusion, whole, [*media.values()], parameters)
+    parameters = optimize.parameters if optimize else {}
+    diffusion, _ = choose_diffusion(tree.diffusion, combined, [*media.values()], parameters)
     needs = needs_of_scene(media, views, diffusion, optimize)
-    if too_much := refuse_excess(needs, place):
+    if too_much := refuse_excess(needs, torch.device(device)):
         raise scene_file.refused("volume.resolution", too_much)
     # Only now each cell has a number of its own.
     media = {
@@ -121,94 +121,80 @@ def build_scene(
         require_supported(scene)
         require_above(scene)
         for view in views if volume.index != 1 else ():
-            look_inside(view.camera, whole.grid, volume.index, scene.render)
+            look_inside(view.camera, combined.grid, volume.index, scene.render)
     except UsageError as error:
-        key, _, what = str(error).partition(": ")
-        raise scene_file.refused(key, what) from None
-    problems = Problems()
-    for name, settings in optimize.parameters.items() if optimize else ():
-        with problems.collecting():
-            scene.starts[name] = _start(scene_file, scene, name, settings)
-    problems.raise_any()
+        key, _, fault = str(error).partition(": ")
+        raise scene_file.refused(key, fault) from None
+    starts = gather(lambda name: _start(scene_file, scene, name, parameters[name]), parameters)
+    scene.starts = dict(zip(parameters, starts, strict=True))
     return scene
 
 
 def _build_parts(
-    scene_file: SceneFile, dtype: torch.dtype, place: torch.device
+    maker: Maker,
 ) -> tuple[dict[str, Volume], list[View], list[Light], Ground | None]:
     """Media by name, views, lights and ground; whatever is wrong with any is raised together."""
-    tree, problems = scene_file.tree, Problems()
+    tree, problems = maker.tree, Problems()
     media, grid = dict[str, Volume](), None
     with problems.collecting():
-        media = build_media(scene_file, dtype, place)
+        media = build_media(maker)
         grid = next(iter(media.values())).grid
     with problems.collecting():
-        views = build_views(scene_file, grid, dtype, place)
+        views = build_views(maker, grid)
     lights: list[Light] = []
     for index, section in enumerate(tree.lights):
         with problems.collecting():
-            lights.append(_build_light(scene_file, index, section, dtype, place))
+            lights.append(_build_light(maker, f"lights.{index}.", section))
     ground = None
     if media and tree.ground is not None:
         with problems.collecting():
-            ground = _build_ground(scene_file, dtype, place)
+            ground = _build_ground(maker, tree.ground)
     for name, settings in tree.optimize.parameters.items() if tree.optimize else ():
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
-                require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
+                key = f"optimize.parameters.{name}.init.file"
+                require(maker.scene_file, key, settings.init.file)
     problems.raise_any()
     return media, views, lights, ground
 
 
-def _build_light(
-    scene_file: SceneFile,
-    index: int,
-    section: LightSection,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Light:
-    def tensor(value: Color) -> Tensor:
-        return torch.tensor(value, dtype=dtype, device=device)
-
-    def color(name: str) -> Tensor:
-        """[1] or [3]"""
-        value = getattr(section, name)
-        return tensor(scene_file.tree.share_color(f"lights.{index}.{name}", value)).view(-1)
-
-    if isinstance(section, DirectionalSection):
-        return DirectionalLight(tensor(section.direction), color("irradiance"))
-    if isinstance(section, AmbientSection):
-        return AmbientLight(color("radiance"))
-    if isinstance(section, PointSection):
-        return PointLight(tensor(section.position), color("intensity"))
-    if isinstance(section, BeamSection):
-        position, direction = tensor(section.position), tensor(section.direction)
-        return BeamLight(position, direction, color("power"), tensor(section.radius))
-    pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
-    radiance = _map_of(scene_file, f"lights.{index}.radiance", pixels).to(device, dtype)
+def _build_light(maker: Maker, owner: str, section: LightSection) -> Light:
+    """The light of `section`, whose variables begin with `owner`."""
+    tensor, color = maker.tensor, maker.color
+    match section:
+        case DirectionalSection():
+            irradiance = color(f"{owner}irradiance", section.irradiance)
+            return DirectionalLight(tensor(section.direction), irradiance)
+        case AmbientSection():
+            return AmbientLight(color(f"{owner}radiance", section.radiance))
+        case PointSection():
+            intensity = color(f"{owner}intensity", section.intensity)
+            return PointLight(tensor(section.position), intensity)
+        case BeamSection():
+            ray = tensor(section.position), tensor(section.direction)
+            power = color(f"{owner}power", section.power)
+            return BeamLight(*ray, power, tensor(section.radius))
+    pixels = read_referenced(maker.scene_file, f"{owner}file", section.file, _read_map)
+    radiance = _map_of(maker, f"{owner}radiance", pixels)
     numbers = tensor(section.scale), tensor(section.rotation)
     return EnvironmentLight(radiance, *numbers, section.directions, section.up)
 
 
-def _map_of(scene_file: SceneFile, name: str, pixels: np.ndarray) -> Tensor:
+def _map_of(maker: Maker, name: str, pixels: np.ndarray) -> Tensor:
     """The variable `name` [C, h, w] of `pixels` [h, w, 3]; gray unless that may change."""
-    if not scene_file.tree.may_change(name) and bool((pixels == pixels[..., :1]).all()):
+    if not maker.tree.may_change(name) and bool((pixels == pixels[..., :1]).all()):
         pixels = pixels[..., :1]
-    return torch.from_numpy(pixels).permute(2, 0, 1).contiguous()
+    return maker.picture(pixels)
 
 
-def _build_ground(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Ground:
-    tree = scene_file.tree
-    section, axis = tree.ground, "zyx".index(tree.volume.up)
-    assert section is not None
-    if isinstance(section.albedo, FieldFile):
-        file = section.albedo.file
-        pixels = read_referenced(scene_file, "ground.albedo.file", file, _read_albedo)
-        reflected = _map_of(scene_file, "ground.albedo", pixels)
+def _build_ground(maker: Maker, section: GroundSection) -> Ground:
+    name, albedo = "ground.albedo", section.albedo
+    if isinstance(albedo, FieldFile):
+        pixels = read_referenced(maker.scene_file, f"{name}.file", albedo.file, _read_albedo)
+        reflected = _map_of(maker, name, pixels)
     else:
-        albedo = tree.share_color("ground.albedo", section.albedo)
-        reflected = torch.tensor(albedo, dtype=dtype).view(-1)
-    return Ground(reflected.to(device, dtype), Plane(section.height, axis))
+        reflected = maker.color(name, albedo)
+    return Ground(reflected, Plane(section.height, "zyx".index(maker.tree.volume.up)))
 
 
 def _read_albedo(path: Path) -> np.ndarray:
@@ -231,16 +217,18 @@ def _read_map(path: Path) -> np.ndarray:
             path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}"
         )
     if negative := np.count_nonzero(pixels.min(axis=2) < 0):
-        what = f"{negative} pixels with negative radiance are taken as 0"
-        warnings.warn(f"{path}: {what}", DataWarning, 4)
+        fault = f"{negative} pixels with negative radiance are taken as 0"
+        warnings.warn(f"{path}: {fault}", DataWarning, 4)
     return pixels.clip(min=0)
 
 
-def _whole_of(media: Mapping[str, Volume]) -> Volume:
+def _combine(media: Mapping[str, Volume]) -> Volume:
     """The first of `media`, with the phase function of all: of two a blend of both."""
-    first, *others = media.values()
+    first, *more = media.values()
+    if not more:
+        return first
     half = first.density.new_tensor(0.5)
-    return replace(first, phase=Blend(first.phase, others[0].phase, half)) if others else first
+    return replace(first, phase=Blend(first.phase, more[0].phase, half))
 
 
 def needs_of_scene(
@@ -253,19 +241,17 @@ def needs_of_scene(
 
     Of one medium that is alone its name is "". Derivatives count where something is optimized.
     """
-    whole, parameters = _whole_of(media), optimize.parameters if optimize else {}
-    colors = count_colors(whole, media.values())
-    is_directed = "g" in parameters or bool((whole.phase.moments(3)[:, 1:] != 0).any())
-    moments = count_harmonics(diffusion.angles) if is_directed else 1
-    varied = sum(_varied(name, one, media, colors) for name, one in parameters.items())
-    is_limited = diffusion.model == "flux_limited"
-    numbers = numbers_in_cell(colors, varied, moments * (diffusion.rounds > 0), is_limited)
+    combined, parameters = _combine(media), optimize.parameters if optimize else {}
+    colors = count_colors(combined, media.values())
+    is_directed = "g" in parameters or bool((combined.phase.moments(3)[:, 1:] != 0).any())
+    varied = sum(_varied(name, chosen, media, colors) for name, chosen in parameters.items())
+    numbers = numbers_in_cell(colors, varied, is_directed, diffusion)
     return Needs(
-        resolution=whole.grid.shape[::-1],
+        resolution=combined.grid.shape[::-1],
         # Light is computed in cells so many times as narrow along these axes.
         numbers=numbers * diffusion.times ** len(diffusion.refine_along),
         pixels=sum(view.camera.size[0] * view.camera.size[1] for view in views),
-        size=whole.density.element_size(),
+        size=combined.density.element_size(),
     )
 
 
@@ -309,10 +295,8 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
         value = _spread(scene_file, key, settings, value, scene.volume.grid.shape)
-    if not bool(((value >= kind.low) & (value <= kind.high)).all()):
-        raise scene_file.refused(
-            f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
-        )
+    if not kind.allows(value):
+        raise scene_file.refused(f"{key}.init", f"must be {kind.limits} everywhere")
     return value
 
 
@@ -335,10 +319,9 @@ def _fill(
     elif len(init) == (count or value.shape[:1].numel()) and value.ndim == 1 and not kind.is_color:
         return value.new_tensor(init)
     expected = f"a list of {count} numbers" if count else "one number"
-    if kind.is_color:
-        expected += " or [r, g, b]"
-    given = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
-    raise scene_file.refused(key, f"expected {expected}{given}")
+    expected += " or [r, g, b]" if kind.is_color else ""
+    length = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
+    raise scene_file.refused(key, f"expected {expected}{length}")
 
 
 def _spread(

@@ -27,7 +27,8 @@ from ddrecon.march.box import cross_box
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.schema import CameraSection, Color, PerspectiveSection
+from ddrecon.scene_file.maker import Maker
+from ddrecon.scene_file.view_schema import CameraSection, PerspectiveSection
 
 READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "image": read_image,
@@ -45,42 +46,37 @@ MOST_PIXELS = 2**18
 """Images are made about this small before they are looked at closely."""
 
 
-def build_views(
-    scene_file: SceneFile, grid: Grid | None, dtype: torch.dtype, device: torch.device
-) -> list[View]:
-    """The scene's views in `dtype` on `device`.
+def build_views(maker: Maker, grid: Grid | None) -> list[View]:
+    """The scene's views; where `grid` is known, cameras must see it.
 
-    Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
+    Raises SceneError or FormatError.
     """
-    problems, views, sections = Problems(), list[View](), scene_file.tree.views
+    problems, views, sections = Problems(), list[View](), maker.tree.views
     for index in range(len(sections)):
         with problems.collecting():
-            views.append(_build_view(scene_file, index, dtype, device))
+            views.append(_build_view(maker, index))
     cameras = {view.name: view.camera for view in views}
     blind = [name for name in cameras if grid is not None and not sees_box(cameras[name], grid)]
     if grid is not None and blind:
         index = [section.name for section in sections].index(blind[0])
-        others = f" and {len(blind) - 1} more" if len(blind) > 1 else ""
+        more = f" and {len(blind) - 1} more" if len(blind) > 1 else ""
         why = explain_blindness([cameras[name] for name in blind], [*cameras.values()], grid)
-        what = f"no pixel of view {blind[0]!r}{others} looks through the volume; {why}"
-        problems.note(scene_file.refused(f"views.{index}.camera", what))
+        fault = f"no pixel of view {blind[0]!r}{more} looks through the volume; {why}"
+        problems.note(maker.scene_file.refused(f"views.{index}.camera", fault))
     problems.raise_any()
     return views
 
 
-def _build_view(
-    scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
-) -> View:
-    key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
+def _build_view(maker: Maker, index: int) -> View:
+    key, section, problems = f"views.{index}", maker.tree.views[index], Problems()
     pictures, step = dict[str, Tensor](), 0.0
     for name, read in READERS.items():
         if isinstance(path := getattr(section, name), Path):
             with problems.collecting():
-                require(scene_file, f"{key}.{name}", path)
+                require(maker.scene_file, f"{key}.{name}", path)
                 is_still = name == "background"
                 stored = read(path, 0, 0.0) if is_still else read(path, section.frame, section.time)
-                pixels = torch.from_numpy(stored.pixels).permute(2, 0, 1).contiguous()
-                pictures[name] = pixels.to(device, dtype)
+                pictures[name] = maker.picture(stored.pixels)
                 step = stored.step if name == "image" else step
     image, resolution = pictures.get("image"), section.camera.resolution
     size = None if image is None else (image.shape[1], image.shape[2])
@@ -89,38 +85,30 @@ def _build_view(
     for name, picture in pictures.items():
         if size is not None and tuple(picture.shape[1:]) != size:
             (height, width), (rows, columns) = picture.shape[1:], size
-            wrong = f"is {width} x {height} pixels, but {key}.camera has {columns} x {rows}"
-            problems.note(FormatError(getattr(section, name), wrong))
+            fault = f"is {width} x {height} pixels, but {key}.camera has {columns} x {rows}"
+            problems.note(FormatError(getattr(section, name), fault))
     if size is not None:
         with problems.collecting():
-            camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
-            _require_unfolded(scene_file, f"{key}.camera", camera)
+            camera = _build_camera(maker.scene_file, f"{key}.camera", section.camera, size)
+            _require_unfolded(maker.scene_file, f"{key}.camera", camera)
     problems.raise_any()
-
-    def color(value: Color) -> Tensor:
-        """[1] or [3]"""
-        return torch.tensor(value, dtype=dtype, device=device).view(-1)
-
     background = pictures.get("background")
     if background is None and isinstance(section.background, float | tuple):
-        background = color(section.background).view(-1, 1, 1)
-    lens = camera.distortion
+        background = maker.tensor(section.background).view(-1, 1, 1)
+    lens = None if camera.distortion is None else maker.tensor(camera.distortion)
+    noise = section.noise
     return View(
         section.name,
-        replace(
-            camera,
-            pose=camera.pose.to(device, dtype),
-            distortion=None if lens is None else lens.to(device, dtype),
-        ),
+        replace(camera, pose=maker.tensor(camera.pose), distortion=lens),
         image,
         pictures["mask"][0] if "mask" in pictures else None,
         section.split == "test",
         section.weight,
-        None if section.exposure == 1 else color(section.exposure),
-        None if section.offset == 0 else color(section.offset),
+        None if section.exposure == 1 else maker.tensor(section.exposure).view(-1),
+        None if section.offset == 0 else maker.tensor(section.offset).view(-1),
         background,
         step,
-        None if section.noise is None else Noise(section.noise.read, section.noise.shot, step),
+        None if noise is None else Noise(noise.read, noise.shot, step),
     )
 
 
@@ -203,10 +191,10 @@ def explain_blindness(blind: Sequence[Camera], cameras: Sequence[Camera], grid: 
     unit = _explain_unit(cameras, grid)
     if all(_looks_at(camera, grid) for camera in blind):
         return f"it is in the picture, but smaller than a pixel: {unit or SAME_UNIT}"
-    for what, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
+    for convention, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
         turned = [replace(camera, pose=convert(camera.pose)) for camera in cameras]
         if all(_looks_at(camera, grid) for camera in turned):
-            return f"it would with matrices read otherwise; they seem to be {what}"
+            return f"it would with matrices read otherwise; they seem to be {convention}"
     if unit:
         return unit
     pose = blind[0].pose.double()

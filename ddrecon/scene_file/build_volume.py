@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import DataWarning, FormatError, Problems, UsageError
+from ddrecon.errors import DataWarning, FormatError, Problems, SceneError, UsageError, gather
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
@@ -27,13 +27,14 @@ from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
+from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     Bounds,
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
     Profile,
-    SceneTree,
+    RayleighSection,
     TableSection,
     TwoLobeSection,
     Water,
@@ -55,149 +56,182 @@ FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
 
 
-def build_media(
-    scene_file: SceneFile, dtype: torch.dtype, device: torch.device
-) -> dict[str, Volume]:
-    """The media of the scene in `dtype` on `device`, by name, "" where there is one.
+def build_media(maker: Maker) -> dict[str, Volume]:
+    """The media of the scene by name, "" where there is one.
 
     A density that is the same everywhere takes no memory yet. Raises SceneError with all their
     problems, or FormatError.
     """
-    media, problems = dict[str, _Medium](), Problems()
-    for name, section in scene_file.tree.media.items():
-        prefix = f"media.{name}." if name else ""
-        with problems.collecting():
-            fields = _read_fields(scene_file, prefix, section)
-            media[name] = _Medium(scene_file.tree, prefix, section, fields)
-    problems.raise_any()
-    grid = _agree_on_grid(
-        scene_file, dict(at for each in media.values() for at in each.fields.values())
-    )
-    for each in media.values():
-        with problems.collecting():
-            each.fields.update(_spread_profiles(scene_file, each, grid))
-    problems.raise_any()
-    return {
-        name: each.build(grid, _build_phase(scene_file, each, dtype, device), dtype, device)
-        for name, each in media.items()
+    media = {
+        name: _Medium(maker, f"media.{name}." if name else "", section)
+        for name, section in maker.tree.media.items()
     }
+    gather(_Medium.read_fields, media.values())
+    fields = dict(entry for medium in media.values() for entry in medium.fields.values())
+    grid = _agree_on_grid(maker.scene_file, fields)
+    gather(lambda medium: medium.spread_profiles(grid), media.values())
+    return {name: medium.build(grid) for name, medium in media.items()}
 
 
-@dataclass(frozen=True)
 class _Medium:
-    """What the scene `tree` says of a medium, names in which begin with `prefix`.
+    """What a scene says in `section` of a medium, names in which begin with `prefix`.
 
-    `fields` are those of its files and profiles by variable, and where the scene names them.
+    `quantities` may differ from cell to cell: by variable, the key in `section` and the value.
+    `fields` are those that do, with the key at which the scene names them.
     """
 
-    tree: SceneTree
-    prefix: str
-    section: MediumSection
-    fields: dict[str, tuple[str, Field]]
+    def __init__(self, maker: Maker, prefix: str, section: MediumSection):
+        self.maker, self.prefix, self.section = maker, prefix, section
+        self.fields: dict[str, tuple[str, Field]] = {}
+        names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
+        self.quantities: dict[str, tuple[str, Any]] = {
+            name: (name, getattr(section, name)) for name in names
+        }
+        match phase := section.phase:
+            case HenyeyGreensteinSection():
+                self.quantities["g"] = "phase.g", phase.g
+            case TwoLobeSection():
+                self.quantities["phase.weight"] = "phase.weight", phase.weight
+            case MieSection():
+                by_cell = getattr(section, RADIUS, None)
+                radius = phase.effective_radius if by_cell is None else by_cell
+                self.quantities[RADIUS] = RADIUS, radius
+
+    def refused(self, key: str, fault: str) -> SceneError:
+        """The error that says what is wrong at `key` of the medium."""
+        return self.maker.scene_file.refused(f"volume.{self.prefix}{key}", fault)
+
+    def read_fields(self) -> None:
+        """Reads the quantities that files give cell by cell; raises SceneError or FormatError."""
+        files = [
+            name for name, (_, value) in self.quantities.items() if isinstance(value, FieldFile)
+        ]
+        self.fields |= dict(zip(files, gather(self.read_field, files), strict=True))
+
+    def read_field(self, variable: str) -> tuple[str, Field]:
+        """The key at which the scene names the file of `variable`, and its content."""
+        water, (name, value) = self.section.sigma_t, self.quantities[variable]
+        called = value.name or variable.removeprefix(PHASE)
+        is_free = variable == "density" and not isinstance(water, Water)
+        unit = None if is_free else UNITS.get(variable)
+        read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
+        key = f"volume.{self.prefix}{name}.file"
+        field = read_referenced(self.maker.scene_file, key, value.file, read)
+        if isinstance(water, Water) and field.meters not in (None, water.meters):
+            fault = f"but u of {value.file.name} has {field.meters:g} m"
+            raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
+        return key, field
+
+    def spread_profiles(self, grid: Grid) -> None:
+        """Evaluates the quantities that are given by height at the centers of cells of `grid`."""
+        axis = "zyx".index(self.maker.tree.volume.up)
+        centers = grid.lower[axis] + grid.spacing[axis] * (np.arange(grid.shape[axis]) + 0.5)
+        for variable, (name, value) in self.quantities.items():
+            if not isinstance(value, Profile):
+                continue
+            key, kind = f"{name}.values", kind_of(_kind_name(variable))
+            colors = [np.ravel(color) for color in value.values]
+            if not kind.is_color and max(map(len, colors)) > 1:
+                raise self.refused(key, "expected numbers: colors belong to the cross sections")
+            known = np.stack(np.broadcast_arrays(*colors), 1)
+            if not kind.allows(torch.from_numpy(known)):
+                raise self.refused(key, f"must be {kind.limits}")
+            column = np.stack([np.interp(centers, value.heights, color) for color in known], -1)
+            sides = [size for side, size in enumerate(grid.shape) if side != axis]
+            cells = np.moveaxis(np.broadcast_to(column, (*sides, *column.shape)), 2, axis).copy()
+            field = Field(cells[..., 0] if len(known) == 1 else cells)
+            self.fields[variable] = f"volume.{self.prefix}{key}", field
 
     def values(self, name: str) -> Tensor:
         """The quantity `name`, float64 [C] or [C, z, y, x]."""
         if name in self.fields:
             return cells_of(self.fields[name][1]).double()
-        value = _quantities(self.section)[name][1]
+        value = self.quantities[name][1]
         if isinstance(value, Water):
             radius = self.values(RADIUS)
             return torch.where(radius > 0, EXTINCTION * value.meters / radius, 0.0)
-        value = self.tree.share_color(self.prefix + name, value)
+        value = self.maker.tree.share_color(self.prefix + name, value)
         return torch.tensor(value, dtype=torch.float64).view(-1)
 
-    def build(
-        self, grid: Grid, phase: PhaseFunction, dtype: torch.dtype, device: torch.device
-    ) -> Volume:
+    def build(self, grid: Grid) -> Volume:
         """The medium as tensors."""
-        if self.section.sigma_t is None:
+        section, tensor, phase = self.section, self.maker.tensor, self.build_phase()
+        if section.sigma_t is None:
             sigmas = self.values("sigma_a"), self.values("sigma_s")
         else:
             sigmas = cross_sections(self.values("sigma_t"), self.values("albedo"))
         colors = max(*map(len, sigmas), phase.colors)
         sigma_a, sigma_s = (
-            sigma.expand(colors, *sigma.shape[1:]).contiguous().to(device, dtype)
-            for sigma in sigmas
+            tensor(sigma.expand(colors, *sigma.shape[1:]).contiguous()) for sigma in sigmas
         )
-        density = self.values("density").to(device, dtype)[0].expand(grid.shape)
+        density = tensor(self.values("density"))[0].expand(grid.shape)
         emission = black_body = None
-        if self.tree.glows and getattr(self.section, "temperature", None) is not None:
-            black_body = black_body_radiance(self.values("temperature")[0]).to(device, dtype)
-        elif self.tree.glows and getattr(self.section, "emission", None) is not None:
-            emission = self.values("emission").to(device, dtype)
-        elif not self.prefix and self.tree.may_change("emission"):
+        if self.maker.tree.glows and getattr(section, "temperature", None) is not None:
+            black_body = tensor(black_body_radiance(self.values("temperature")[0]))
+        elif self.maker.tree.glows and getattr(section, "emission", None) is not None:
+            emission = tensor(self.values("emission"))
+        elif not self.prefix and self.maker.tree.may_change("emission"):
             emission = sigma_a.new_zeros(3)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
-        index = getattr(self.section, "index", 1.0)
+        index = getattr(section, "index", 1.0)
         return replace(medium, emission=emission, black_body=black_body, index=index)
 
+    def build_phase(self) -> PhaseFunction:
+        """The phase function; MissingExtraError for droplets without miepython."""
+        match section := self.section.phase:
+            case None | HenyeyGreensteinSection():
+                return HenyeyGreenstein(self.number("g"))
+            case TwoLobeSection():
+                return TwoLobe(self.maker.tensor(section.g), self.number("phase.weight"))
+            case TableSection():
+                return Tabulated(self.maker.tensor(self.read_table(section)))
+            case RayleighSection():
+                return Rayleigh(self.maker.tensor(0.0))
+        radius = self.values(RADIUS).squeeze(0)
+        known = radius[radius > 0]
+        if not len(known) or known.max() > 100:
+            fault = f"must be above 0 somewhere and at most 100, found {float(radius.max()):g}"
+            raise self.refused(RADIUS, fault)
+        least, most = float(known.min()), float(known.max())
+        smallest = Tabulated(self.maker.tensor(_scatter(section, least)))
+        if least == most:
+            return smallest
+        largest = Tabulated(self.maker.tensor(_scatter(section, most)))
+        # Where there are none, as large as elsewhere in the mean.
+        inverse = 1 / torch.where(radius > 0, radius, known.mean())
+        weight = (inverse - 1 / most) / (1 / least - 1 / most)
+        return Blend(smallest, largest, self.maker.tensor(weight))
 
-def _read_fields(
-    scene_file: SceneFile, prefix: str, section: MediumSection
-) -> dict[str, tuple[str, Field]]:
-    """The quantities that files give cell by cell, by variable; and where the scene says so."""
-    problems, found = Problems(), {}
-    for variable, (name, value) in _quantities(section).items():
-        if isinstance(value, FieldFile):
-            called = value.name or variable.removeprefix(PHASE)
-            is_free = variable == "density" and not isinstance(section.sigma_t, Water)
-            unit = None if is_free else UNITS.get(variable)
-            read = partial(read_quantity, name=_kind_name(variable), called=called, unit=unit)
-            with problems.collecting():
-                at = f"volume.{prefix}{name}.file"
-                field = read_referenced(scene_file, at, value.file, read)
-                found[variable] = at, field
-                if isinstance(section.sigma_t, Water):
-                    said = section.sigma_t.meters
-                    if field.meters not in (None, said):
-                        what = f"is {said:g}, but u of {value.file.name} has {field.meters:g} m"
-                        raise scene_file.refused(f"volume.{prefix}sigma_t.meters", what)
-    problems.raise_any()
-    return found
+    def number(self, name: str) -> Tensor:
+        """The number `name` of a phase function: [], a color [3], or a field."""
+        if name in self.fields:
+            return self.maker.tensor(self.values(name))
+        value = self.quantities[name][1]
+        return self.maker.tensor(self.maker.tree.share_color(self.prefix + name, value))
 
-
-def _quantities(section: MediumSection) -> dict[str, tuple[str, Any]]:
-    """What may differ from cell to cell, by variable: its key in `section`, and its value."""
-    names = (name for name in (*FIELDS, "temperature") if hasattr(section, name))
-    given = {name: (name, getattr(section, name)) for name in names}
-    if isinstance(section.phase, HenyeyGreensteinSection):
-        given["g"] = "phase.g", section.phase.g
-    elif isinstance(section.phase, TwoLobeSection):
-        given["phase.weight"] = "phase.weight", section.phase.weight
-    elif isinstance(section.phase, MieSection):
-        by_cell, same = getattr(section, RADIUS, None), section.phase.effective_radius
-        given[RADIUS] = RADIUS, same if by_cell is None else by_cell
-    return given
+    def read_table(self, section: TableSection) -> Tensor:
+        """Values at even angles, [C, steps + 1]."""
+        key = f"volume.{self.prefix}phase.file"
+        table = read_referenced(self.maker.scene_file, key, section.file, read_phase_table)
+        values = torch.from_numpy(at_even_angles(*table))
+        means = Tabulated(values).mean
+        if bool(((means - 1).abs() > FAR_OFF).any()):
+            words = ", ".join(f"{mean:.4g}" for mean in means.tolist())
+            fault = f"its mean over the sphere is {words}; it is divided by that"
+            warnings.warn(f"{section.file}: {fault}", DataWarning, 4)
+        return values
 
 
 def _kind_name(variable: str) -> str:
-    """That of its kind: of others than variables that of density, a number a cell, none below 0."""
+    """The variable whose kind `variable` is: density's, one number a cell, where it is none."""
     return variable if variable in FIELDS else "density"
 
 
-def _spread_profiles(
-    scene_file: SceneFile, medium: _Medium, grid: Grid
-) -> dict[str, tuple[str, Field]]:
-    """The quantities that `medium` has by height, at the centers of the cells of `grid`."""
-    axis, found = "zyx".index(scene_file.tree.volume.up), {}
-    low, size = grid.lower[axis], grid.spacing[axis]
-    centers = low + size * (np.arange(grid.shape[axis]) + 0.5)
-    for variable, (name, value) in _quantities(medium.section).items():
-        if not isinstance(value, Profile):
-            continue
-        at, kind = f"volume.{medium.prefix}{name}.values", kind_of(_kind_name(variable))
-        colors = [np.ravel(one) for one in value.values]
-        if not kind.is_color and max(map(len, colors)) > 1:
-            raise scene_file.refused(at, "expected numbers: colors belong to the cross sections")
-        if not all(((kind.low <= one) & (one <= kind.high)).all() for one in colors):
-            limits = f"at least {kind.low:g} and at most {kind.high:g}"
-            raise scene_file.refused(at, f"must be {limits}")
-        known = np.stack(np.broadcast_arrays(*colors), 1)
-        column = np.stack([np.interp(centers, value.heights, one) for one in known], -1)
-        level = [size for other, size in enumerate(grid.shape) if other != axis]
-        cells = np.moveaxis(np.broadcast_to(column, (*level, *column.shape)), 2, axis).copy()
-        found[variable] = at, Field(cells[..., 0] if len(known) == 1 else cells)
-    return found
+def _scatter(section: MieSection, radius: float) -> np.ndarray:
+    """Values at even angles of droplets of this effective radius, [C, steps + 1]."""
+    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
+    sizes = radius, section.effective_variance
+    return np.stack([scatter_droplets(float(length), float(n), *sizes) for length, n in colors])
 
 
 def cells_of(field: Field) -> Tensor:
@@ -230,8 +264,8 @@ def read_quantity(
         place = tuple(np.argwhere(beyond)[0])
         side = f"below {low:g}" if field.values[place] < low else f"above {high:g}"
         z, y, x = place[:3]
-        what = f"{called} is {side} at cell (x, y, z) = ({x}, {y}, {z}): {field.values[place]:g}"
-        raise FormatError(path, what)
+        fault = f"{called} is {side} at cell (x, y, z) = ({x}, {y}, {z}): {field.values[place]:g}"
+        raise FormatError(path, fault)
     return field
 
 
@@ -246,19 +280,19 @@ def _agree_on_grid(scene_file: SceneFile, fields: Mapping[str, Field]) -> Grid:
         box = np.array([section.bounds.min, section.bounds.max])
     sizes = {"volume.resolution": size} | {key: field.resolution for key, field in fields.items()}
     boxes = {"volume.bounds": box} | {key: field.bounds for key, field in fields.items()}
-    for what, given in (("resolution", sizes), ("bounds", boxes)):
-        known = {key: np.array(value) for key, value in given.items() if value is not None}
+    for word, values in (("resolution", sizes), ("bounds", boxes)):
+        known = {key: np.array(value) for key, value in values.items() if value is not None}
         if not known:
-            missing = f"missing key {what!r}, which no field file gives either"
-            problems.note(scene_file.refused("volume", missing))
+            fault = f"missing key {word!r}, which no field file gives either"
+            problems.note(scene_file.refused("volume", fault))
             continue
         first, right = next(iter(known.items()))
         # Files may hold bounds in single precision.
-        tolerance = 1e-5 * np.ptp(right, axis=0) if what == "bounds" else 0
+        tolerance = 1e-5 * np.ptp(right, axis=0) if word == "bounds" else 0
         for key, value in known.items():
             if (np.abs(value - right) > tolerance).any():
-                words = f"has the {what} {_show(value)}, but {first} has {_show(right)}"
-                problems.note(scene_file.refused(key, words))
+                fault = f"has the {word} {_show(value)}, but {first} has {_show(right)}"
+                problems.note(scene_file.refused(key, fault))
     problems.raise_any()
     size = next(size for size in sizes.values() if size is not None)
     low, high = next(box for box in boxes.values() if box is not None).tolist()
@@ -273,60 +307,3 @@ def _show(value: np.ndarray) -> str:
     if value.ndim == 1:
         return " x ".join(map(str, value))
     return " to ".join(f"({', '.join(f'{side:g}' for side in corner)})" for corner in value)
-
-
-def _build_phase(
-    scene_file: SceneFile, medium: _Medium, dtype: torch.dtype, device: torch.device
-) -> PhaseFunction:
-    """The phase function of `medium`; MissingExtraError for droplets without miepython."""
-
-    def tensor(value: Any, name: str = "") -> Tensor:
-        if isinstance(value, FieldFile | Profile):
-            return medium.values(name).to(device, dtype)
-        value = medium.tree.share_color(f"{medium.prefix}{name}", value)
-        return torch.as_tensor(value, dtype=dtype, device=device)
-
-    match section := medium.section.phase:
-        case None:
-            return HenyeyGreenstein(tensor(medium.section.g, "g"))
-        case HenyeyGreensteinSection():
-            return HenyeyGreenstein(tensor(section.g, "g"))
-        case TwoLobeSection():
-            return TwoLobe(tensor(section.g), tensor(section.weight, "phase.weight"))
-        case TableSection():
-            key = f"volume.{medium.prefix}phase.file"
-            return Tabulated(tensor(_table(scene_file, section, key)))
-        case MieSection():
-            radius = medium.values(RADIUS).squeeze(0)
-            known = radius[radius > 0]
-            if not len(known) or known.max() > 100:
-                what = f"must be above 0 somewhere and at most 100, found {float(radius.max()):g}"
-                raise scene_file.refused(f"volume.{medium.prefix}{RADIUS}", what)
-            least, most = float(known.min()), float(known.max())
-            smallest = Tabulated(tensor(_droplets(section, least)))
-            if least == most:
-                return smallest
-            # Where there are none, as large as elsewhere in the mean.
-            inverse = 1 / torch.where(radius > 0, radius, known.mean())
-            weight = tensor((inverse - 1 / most) / (1 / least - 1 / most))
-            return Blend(smallest, Tabulated(tensor(_droplets(section, most))), weight)
-    return Rayleigh(tensor(0.0))
-
-
-def _droplets(section: MieSection, radius: float) -> np.ndarray:
-    """Values at even angles, [C, steps + 1]."""
-    colors = np.broadcast(np.atleast_1d(section.wavelength), section.refractive_index)
-    sizes = radius, section.effective_variance
-    return np.stack([scatter_droplets(float(length), float(n), *sizes) for length, n in colors])
-
-
-def _table(scene_file: SceneFile, section: TableSection, key: str) -> Tensor:
-    """Values at even angles, [C, steps + 1]."""
-    read = read_referenced(scene_file, key, section.file, read_phase_table)
-    values = torch.from_numpy(at_even_angles(*read))
-    means = Tabulated(values).mean
-    if bool(((means - 1).abs() > FAR_OFF).any()):
-        found = ", ".join(f"{mean:.4g}" for mean in means.tolist())
-        what = f"its mean over the sphere is {found}; it is divided by that"
-        warnings.warn(f"{section.file}: {what}", DataWarning, 4)
-    return values

@@ -5,6 +5,8 @@ Most come of lengths in different units: bounds in millimeters, cameras in meter
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -44,7 +46,7 @@ def find_doubts(scene: Scene) -> list[str]:
     ]
 
 
-def _doubt_depth(volume: Volume, extinction: Tensor) -> list[str]:
+def _doubt_depth(volume: Volume, extinction: Tensor) -> Iterator[str]:
     density, where = volume.density, "through the densest part"
     if not bool(density.any()):
         density, where = torch.ones_like(density), "at a density of 1"
@@ -52,22 +54,21 @@ def _doubt_depth(volume: Volume, extinction: Tensor) -> list[str]:
     lines = [float((extinction * density).sum(axis).max()) for axis in range(3)]
     depths = [line * size for line, size in zip(lines, volume.grid.spacing, strict=True)]
     if min(depths) > THICKEST or max(depths) < THINNEST:
-        return [f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"]
-    return []
+        yield f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"
 
 
-def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings) -> list[str]:
+def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings) -> Iterator[str]:
     """Whether a medium that scatters is thick in cells at the faces of the box.
 
     What counts is the depth without the forward peak, and more of it where light is absorbed.
     """
     if not bool((volume.sigma_s > 0).any()):
-        return []
+        return
     medium = scale_medium(volume, settings.angles)
     finer = volume.grid.refine(settings.times, settings.refine_along)
     lost = medium.extinction.value
     lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
-    thickest, whole = (
+    thickest, depth = (
         max(
             float(field.select(axis - 3, end).max()) * size
             for axis, size in enumerate(finer.spacing)
@@ -75,20 +76,17 @@ def _doubt_faces(volume: Volume, extinction: Tensor, settings: DiffusionSettings
         )
         for field in (lost, extinction * volume.density)
     )
-    if thickest <= THICK_FACES:
-        return []
-    times, g = thickest / THICK_FACES, float(medium.g.max())
-    advice = f"take cells {times:.1f} times smaller, and leave a layer of empty ones"
-    if g >= FORWARD:
-        advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
-    return [
-        f"volume: cells at the faces of the box are up to {whole:.3g} optical depths thick; images "
-        f"may be off by a fifth and more: {advice}"
-    ]
+    if thickest > THICK_FACES:
+        times, g = thickest / THICK_FACES, float(medium.g.max())
+        advice = f"take cells {times:.1f} times smaller, and leave a layer of empty ones"
+        if g >= FORWARD:
+            advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
+        cells = f"cells at the faces of the box are up to {depth:.3g} optical depths thick"
+        yield f"volume: {cells}; images may be off by a fifth and more: {advice}"
 
 
-def _doubt_cameras(scene: Scene) -> list[str]:
-    doubted: dict[str, list[str]] = {}
+def _doubt_cameras(scene: Scene) -> Iterator[str]:
+    small, inside = list[str](), list[str]()
     for view in scene.views:
         camera, place = view.camera, view.camera.pose[:, 3].double()
         low, high = (place.new_tensor(corner) for corner in scene.volume.grid.bounds_xyz)
@@ -96,27 +94,25 @@ def _doubt_cameras(scene: Scene) -> list[str]:
         # The diagonal of the box, seen from the side, takes hardly any pixels.
         width = 2 * float(camera.half_width) * distance
         if float(torch.dist(low, high)) * camera.size[1] < SMALLEST * width:
-            doubted.setdefault("the box is smaller than a pixel or two to", []).append(view.name)
+            small.append(view.name)
         if camera.is_perspective and bool(((low < place) & (place < high)).all()):
-            doubted.setdefault("within the box, not outside of it:", []).append(view.name)
-    return [
-        f"views: {what} camera {names[0]}"
-        f"{f' and {len(names) - 1} more' if len(names) > 1 else ''}; {UNITS}"
-        for what, names in doubted.items()
-    ]
+            inside.append(view.name)
+    faults = ("the box is smaller than a pixel or two to", small), ("inside the box:", inside)
+    for fault, names in faults:
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            yield f"views: {fault} camera {names[0]}{more}; {UNITS}"
 
 
-def _doubt_ground(scene: Scene) -> list[str]:
+def _doubt_ground(scene: Scene) -> Iterator[str]:
     """Lights that a ground hides, and cameras that lie on their side."""
     if scene.ground is None:
-        return []
+        return
     plane, up = scene.ground.plane, 2 - scene.ground.plane.axis
-    tilted = [view.name for view in scene.views if abs(float(view.camera.pose[up, 0])) > UPRIGHT]
-    tilted = [
-        f"ground: volume.up is {'xyz'[up]}, and camera {it} lies on its side" for it in tilted
-    ]
-    return tilted[:1] + [
-        f"lights.{index}: shines from below the ground at {plane.height:g}, and is not seen"
-        for index, light in enumerate(scene.lights)
-        if not isinstance(light, EnvironmentLight) and not stay_above([light], plane)
-    ]
+    tilted = [v.name for v in scene.views if abs(float(v.camera.pose[up, 0])) > UPRIGHT]
+    if tilted:
+        yield f"ground: volume.up is {'xyz'[up]}, and camera {tilted[0]} lies on its side"
+    for index, light in enumerate(scene.lights):
+        if not isinstance(light, EnvironmentLight) and not stay_above([light], plane):
+            below = f"below the ground at {plane.height:g}"
+            yield f"lights.{index}: shines from {below}, and is not seen"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +11,13 @@ from ddrecon.errors import Problems
 from ddrecon.io.images.films import FILMS, frame_times, nearest_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.scene_file.load import SceneFile, require
-from ddrecon.scene_file.schema import FRAME, ViewSection
+from ddrecon.scene_file.view_schema import FRAME, ViewSection
 
 
 def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
     """The scene of the frame `number` of a film."""
 
-    def own(view: ViewSection) -> ViewSection:
+    def of_frame(view: ViewSection) -> ViewSection:
         frame = number + view.frame
 
         def name(path: Path | None) -> Path | None:
@@ -25,7 +26,8 @@ def at_frame(scene_file: SceneFile, number: int) -> SceneFile:
         return replace(view, image=name(view.image), mask=name(view.mask), frame=frame)
 
     tree = scene_file.tree
-    return replace(scene_file, tree=replace(tree, views=tuple(map(own, tree.views)), frames=None))
+    views = tuple(map(of_frame, tree.views))
+    return replace(scene_file, tree=replace(tree, views=views, frames=None))
 
 
 def each_frame(scene_file: SceneFile) -> list[SceneFile]:
@@ -40,38 +42,44 @@ def require_frames(scene_file: SceneFile) -> None:
     FormatError for films that end before.
     """
     problems, frames = Problems(), each_frame(scene_file)
-    for one in frames:
-        for index, view in enumerate(one.tree.views):
-            for key, path in (("image", view.image), ("mask", view.mask)):
-                if path is not None and not problems.are_many:
-                    with problems.collecting():
-                        require(one, f"views.{index}.{key}", path)
-                        is_end = one is frames[0] or one is frames[-1]
-                        if is_end and path.suffix.lower() in FILMS:
-                            read_image(path, view.frame, view.time)
+    for frame in frames:
+        is_end = frame is frames[0] or frame is frames[-1]
+        for key, view, path in _pictures(frame):
+            if not problems.are_many:
+                with problems.collecting():
+                    require(frame, key, path)
+                    if is_end and path.suffix.lower() in FILMS:
+                        read_image(path, view.frame, view.time)
     problems.raise_any()
     _require_one_rate(scene_file)
+
+
+def _pictures(scene_file: SceneFile) -> Iterator[tuple[str, ViewSection, Path]]:
+    """The images and masks that the scene names: the key, the view and the path of each."""
+    for index, view in enumerate(scene_file.tree.views):
+        for key, path in (("image", view.image), ("mask", view.mask)):
+            if path is not None:
+                yield f"views.{index}.{key}", view, path
 
 
 def _require_one_rate(scene_file: SceneFile) -> None:
     """Raises SceneError where films that are counted together do not show them together."""
     paces = list[tuple[Path, float, list[float]]]()
     numbers = scene_file.tree.frames.numbers if scene_file.tree.frames else ()
-    for index, view in enumerate(scene_file.tree.views):
-        for key, path in (("image", view.image), ("mask", view.mask)):
-            if not numbers or path is None or path.suffix.lower() not in FILMS:
-                continue
-            times = frame_times(path)
-            first = nearest_frame(times, view.time) + view.frame
-            rate = (len(times) - 1) / (times[-1] - times[0] or math.inf)
-            begin = times[first] if first >= 0 else times[0] + first / (rate or math.inf)
-            paces.append((path, rate, [times[first + number] - begin for number in numbers]))
-            film, usual, pace = paces[0]
-            apart = max(abs(a - b) for a, b in zip(pace, paces[-1][2], strict=True))
-            if apart * usual > 0.5 or (rate and usual and not 0.99 < rate / usual < 1.01):
-                what = (
-                    f"{path.name} has {rate:.5g} frames a second and {film.name} {usual:.5g}: "
-                    f"frames of the same number come to be {apart:.2g} s apart; give films of one "
-                    f"constant rate (ffmpeg -i {path.name} -r {usual:.5g} ...)"
-                )
-                raise scene_file.refused(f"views.{index}.{key}", what)
+    for key, view, path in _pictures(scene_file):
+        if not numbers or path.suffix.lower() not in FILMS:
+            continue
+        times = frame_times(path)
+        first = nearest_frame(times, view.time) + view.frame
+        rate = (len(times) - 1) / (times[-1] - times[0] or math.inf)
+        begin = times[first] if first >= 0 else times[0] + first / (rate or math.inf)
+        paces.append((path, rate, [times[first + number] - begin for number in numbers]))
+        film, usual, pace = paces[0]
+        apart = max(abs(a - b) for a, b in zip(pace, paces[-1][2], strict=True))
+        if apart * usual > 0.5 or (rate and usual and not 0.99 < rate / usual < 1.01):
+            fault = (
+                f"{path.name} has {rate:.5g} frames a second and {film.name} {usual:.5g}: "
+                f"frames of the same number come to be {apart:.2g} s apart; give films of one "
+                f"constant rate (ffmpeg -i {path.name} -r {usual:.5g} ...)"
+            )
+            raise scene_file.refused(key, fault)

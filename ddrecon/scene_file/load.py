@@ -20,9 +20,9 @@ from ddrecon.io.files.reading import require_stored
 from ddrecon.records import Violation
 from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse, resolve
 from ddrecon.scene_file.read import Rule, read_record
-from ddrecon.scene_file.schema import SceneTree, ViewSection, ViewSource
+from ddrecon.scene_file.schema import SceneTree
 from ddrecon.scene_file.transforms import node_of
-from ddrecon.scene_file.view_sources import name_listed, views_of
+from ddrecon.scene_file.view_sources import views_of
 from ddrecon.settings import AUTO, ParameterSettings
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -52,15 +52,15 @@ class SceneFile:
     path: Path
     marks: Mapping[str, str]
 
-    def refused(self, key: str, what: str) -> SceneError:
-        """The error that says `what` is wrong with the value at `key`.
+    def refused(self, key: str, fault: str) -> SceneError:
+        """The error that says what is wrong with the value at `key`.
 
         It points to the nearest value above it where it was not written itself.
         """
         nearest = key
         while nearest and nearest not in self.marks:
             nearest = nearest.rpartition(".")[0]
-        return SceneError(f"{self.marks[nearest]}: {key}: {what}")
+        return SceneError(f"{self.marks[nearest]}: {key}: {fault}")
 
 
 def read_scene(
@@ -81,7 +81,7 @@ def read_scene(
     if not all(isinstance(text, str) for text in changes):
         raise UsageError(f'overrides: expected a list, ["key.path=value"], found {overrides!r}')
     path, problems = Path(path), Problems()
-    found = None
+    scene_file = None
     with problems.collecting():
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
         if root.value is None:
@@ -89,14 +89,14 @@ def read_scene(
         for text in changes:
             with problems.collecting():
                 override(root, text, problems, options.get(text, f"-D {text}"))
-        found = _scene_of(root, path)
+        scene_file = _scene_of(root, path)
     problems.raise_any()
-    assert found is not None
-    if AUTO in (found.tree.volume.bounds, found.tree.volume.resolution):
+    assert scene_file is not None
+    if AUTO in (scene_file.tree.volume.bounds, scene_file.tree.volume.resolution):
         from ddrecon.scene_file.box import fit_volume  # here, as it loads torch
 
-        return fit_volume(found)
-    return found
+        return fit_volume(scene_file)
+    return scene_file
 
 
 def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
@@ -108,7 +108,7 @@ def read_described(described: Mapping[str, Any], path: Path) -> SceneFile:
 
 
 def _scene_of(root: Node, path: Path) -> SceneFile:
-    finish = FINISH | {ViewSource: partial(views_of, up=_up_of(root))}
+    finish: Any = {PARAMETERS: require_parameters, "views": partial(views_of, up=_up_of(root))}
     tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, finish))
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
@@ -116,8 +116,8 @@ def _scene_of(root: Node, path: Path) -> SceneFile:
 def _up_of(root: Node) -> Triple:
     """The unit vector along `volume.up`, of a scene that is not read yet."""
     volume = root.entries().get("volume")
-    said = volume.value.get("up") if volume and isinstance(volume.value, dict) else None
-    up = said.value if said and said.value in ("x", "z") else "y"
+    entry = volume.value.get("up") if volume and isinstance(volume.value, dict) else None
+    up = entry.value if entry and entry.value in ("x", "z") else "y"
     return float(up == "x"), float(up == "y"), float(up == "z")
 
 
@@ -154,51 +154,51 @@ def override(root: Node, text: str, problems: Problems, where: str) -> None:
     parent = root
     while path:
         name, path = _step(parent, path, where)
-        key = parent.child_key(name)
-        child = Node(key, where, where, {} if path else None)
+        node = Node(parent.child_key(name), where, where, {} if path else None)
         if not path and value.strip():
-            child = parse(value, lambda line, column: where, problems, key)
-            child.folder = Path.cwd()
-        if isinstance(parent.value, list):
-            at = int(name)
-            parent.value[at] = child if not path else parent.value[at]
-            parent = parent.value[at]
-        elif isinstance(parent.value, dict):
-            parent.value[name] = child if not path else parent.value.get(name, child)
-            parent = parent.value[name]
+            node = parse(value, lambda line, column: where, problems, node.key)
+            node.folder = Path.cwd()
+        entries: Any = parent.value
+        place = int(name) if isinstance(entries, list) else name
+        if not path:
+            entries[place] = node
+        elif isinstance(entries, dict):
+            entries.setdefault(name, node)
+        parent = entries[place]
 
 
 def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
-    """The part of `path` that leads to a child of `parent`, and what is left of it."""
-    parts, what = path.split("."), ""
+    """The beginning of `path` that leads to a child of `parent`, and what is left of it."""
+    names, fault = path.split("."), ""
     if isinstance(parent.value, dict):
-        for count in range(len(parts), 0, -1):
-            name = ".".join(parts[:count])
+        for count in range(len(names), 0, -1):
+            name = ".".join(names[:count])
             if name in parent.value or (parent.key == PARAMETERS and pattern_of(name) in KINDS):
-                return name, ".".join(parts[count:])
+                return name, ".".join(names[count:])
     elif not isinstance(parent.value, list):
-        what = f"{parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
-    elif not re.fullmatch("[0-9]{1,9}", parts[0]) or int(parts[0]) >= len(parent.value):
-        what = f"no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
-    if what:
-        raise SceneError(f"{where}: {parent.child_key(parts[0])}: {what}")
-    return parts[0], ".".join(parts[1:])
+        fault = f"{parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
+    elif not re.fullmatch("[0-9]{1,9}", names[0]) or int(names[0]) >= len(parent.value):
+        fault = f"no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
+    if fault:
+        raise SceneError(f"{where}: {parent.child_key(names[0])}: {fault}")
+    return names[0], ".".join(names[1:])
 
 
 def require_parameters(
-    node: Node, parameters: dict[str, ParameterSettings], folder: Path
+    section: Node, parameters: dict[str, ParameterSettings], folder: Path
 ) -> dict[str, ParameterSettings]:
-    """`parameters` of `node`, by names of variables, of one pair of cross sections at most.
+    """`parameters` of `section`, by names of variables, of one pair of cross sections at most.
 
     Raises SceneError with all that is wrong with them.
     """
-    problems, entries = Problems(), node.entries()
+    problems, entries = Problems(), section.entries()
     if not parameters:
-        raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
+        raise section.refused(f"names no parameter; known: {', '.join(KINDS)}")
     for name, settings in parameters.items():
-        own = entries[name]
-        for key, what in _violations(name, settings, parameters):
-            problems.note(own.entries()[key].refused(what) if key else own.key_refused(what))
+        node = entries[name]
+        for key, fault in _violations(name, settings, parameters):
+            error = node.entries()[key].refused(fault) if key else node.key_refused(fault)
+            problems.note(error)
     problems.raise_any()
     return parameters
 
@@ -215,25 +215,17 @@ def _violations(
         yield "support", f"{settings.support!r} is for density alone"
     for key in ("min", "max", "init"):
         value = getattr(settings, key)
-        for one in value if isinstance(value, tuple) else [value]:
-            if isinstance(one, float) and not kind.low <= one <= kind.high:
-                limits = f"at least {kind.low:g} and at most {kind.high:g}"
-                yield key, f"must be {limits}, found {one:g}"
-                break
+        numbers = value if isinstance(value, tuple) else (value,)
+        beyond = [x for x in numbers if isinstance(x, float) and not kind.low <= x <= kind.high]
+        if beyond:
+            yield key, f"must be {kind.limits}, found {beyond[0]:g}"
     for key in ("field", "tv"):
         if getattr(settings, key) and not kind.is_cellwise:
             yield key, "it is not a field, so it has none"
-    others = [medium + other for other in CROSS_SECTIONS if medium + other in parameters]
-    if last in EXTINCTION_AND_ALBEDO and others:
+    pair = [medium + sigma for sigma in CROSS_SECTIONS if medium + sigma in parameters]
+    if last in EXTINCTION_AND_ALBEDO and pair:
         pairs = "take sigma_a and sigma_s, or sigma_t and albedo"
-        yield "", f"cannot be optimized beside {others[0]}: {pairs}"
-
-
-FINISH: dict[Any, Callable[[Node, Any, Path], Any]] = {
-    (Mapping, ParameterSettings): require_parameters,
-    (tuple, ViewSection): name_listed,
-}
-"""What is made of all records of a list or mapping, or of one that stands for others."""
+        yield "", f"cannot be optimized beside {pair[0]}: {pairs}"
 
 
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:
@@ -250,15 +242,15 @@ def require(scene_file: SceneFile, key: str, path: Path) -> None:
     try:
         is_file, exists = path.is_file(), path.exists()
     except OSError as error:
-        what = f"{path} cannot be reached: {error.strerror or error}"
-        raise scene_file.refused(key, what) from error
+        fault = f"{path} cannot be reached: {error.strerror or error}"
+        raise scene_file.refused(key, fault) from error
     if not is_file:
         raise scene_file.refused(key, f"{path} {'is not a file' if exists else 'does not exist'}")
 
 
 def referenced_files(scene_file: SceneFile) -> list[Path]:
     """Every file that the scene names, each once, in the order of the scene."""
-    return list(dict.fromkeys(one for _, one in walk(scene_file.tree) if isinstance(one, Path)))
+    return list(dict.fromkeys(file for _, file in walk(scene_file.tree) if isinstance(file, Path)))
 
 
 def find_expert_keys(tree: SceneTree) -> dict[str, Any]:
@@ -298,28 +290,22 @@ def dump_scene(described: dict[str, Any], path: Path) -> None:
 
 def scene_text(described: dict[str, Any]) -> str:
     """What `dump_scene` writes."""
-    text: str = yaml.dump(
-        described,
-        Dumper=_Dumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=10**6,
-        default_flow_style=None,
-    )
+    layout: Any = {"sort_keys": False, "allow_unicode": True, "default_flow_style": None}
+    text: str = yaml.dump(described, Dumper=_Dumper, width=10**6, **layout)
     return text
 
 
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         tag = {"type": value.type} if hasattr(value, "type") else {}
-        given = {field.name: getattr(value, field.name) for field in fields(value)}
+        entries = {key.name: getattr(value, key.name) for key in fields(value)}
         # Nor what belongs to an alternative that was not taken.
         groups = getattr(value, "ALTERNATIVES", ())
-        left_out = {name for group in groups if given[group[0]] is None for name in group}
-        left_out |= {"g"} if given.get("phase") is not None else set()
+        left_out = {name for group in groups if entries[group[0]] is None for name in group}
+        left_out |= {"g"} if entries.get("phase") is not None else set()
         return tag | {
             name: _plain(entry)
-            for name, entry in given.items()
+            for name, entry in entries.items()
             if entry is not None and name not in left_out
         }
     if isinstance(value, Mapping):
@@ -330,7 +316,10 @@ def _plain(value: Any) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that would be read as something else; PyYAML itself goes by YAML 1.1."""
+    """Quotes text that would be read as something else, as PyYAML goes by YAML 1.1; no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
 _Dumper.add_representer(

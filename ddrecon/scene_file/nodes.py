@@ -1,15 +1,15 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
-The strict part of YAML: one document of mappings, lists and scalars; no tags or repeated keys.
-Aliases are written out. What plain scalars mean is the core schema of
-YAML 1.2 (section 10.3.2), which has no merge key `<<`: `1e-3` is a number, `yes` is text.
+The strict part of YAML: one document of mappings, lists and scalars, no tags, aliases or repeated
+keys. Plain scalars mean what the core schema of YAML 1.2 (section 10.3.2) says, without octal and
+hexadecimal numbers: `1e-3` is a number, `yes` is text.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,6 @@ from ddrecon.errors import Problems, SceneError
 Scalar = None | bool | int | float | str
 
 MAX_DEPTH = 32
-TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
-MAX_NODES = 100_000
-"""A few aliases could stand for billions of values."""
-TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
-"""Those that nodes have of which a file says none."""
 LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
 
@@ -46,13 +41,13 @@ class Node:
     value: Scalar | list[Node] | dict[str, Node]
     folder: Path | None = None
 
-    def refused(self, what: str) -> SceneError:
-        """The error that says `what` is wrong with this value."""
-        return SceneError(": ".join(filter(None, (self.where, self.key, what))))
+    def refused(self, fault: str) -> SceneError:
+        """The error that says what is wrong with this value."""
+        return SceneError(": ".join(filter(None, (self.where, self.key, fault))))
 
-    def key_refused(self, what: str) -> SceneError:
-        """The error that says `what` is wrong with the key of this value."""
-        return SceneError(f"{self.key_where}: {self.key}: {what}")
+    def key_refused(self, fault: str) -> SceneError:
+        """The error that says what is wrong with the key of this value."""
+        return SceneError(f"{self.key_where}: {self.key}: {fault}")
 
     def child_key(self, name: object) -> str:
         """The path of the child called `name`."""
@@ -99,30 +94,17 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
-        _require_shallow(text, locate)
-        if (source := yaml.compose(text, Loader=LOADER)) is None:
-            raise SceneError(f"{locate(1, 1)}: is empty")
-        return _Builder(locate, problems).build(source, key, None, 0)
+        return _Composer(text, locate, problems).compose_document(key)
     except yaml.MarkedYAMLError as error:
         where = _place(locate, error.problem_mark or error.context_mark)
-        what = ", ".join(filter(None, (error.context, error.problem)))
+        fault = ", ".join(filter(None, (error.context, error.problem)))
     except UnicodeEncodeError:
-        where, what = locate(1, 1), "its text is not UTF-8"
+        where, fault = locate(1, 1), "its text is not UTF-8"
     except yaml.reader.ReaderError as error:
         before = text.encode(errors="replace")[: error.position].decode(errors="ignore")
         where = locate(before.count("\n") + 1, len(before) - before.rfind("\n"))
-        what = f"the character {error.character!r} is not allowed"
-    raise SceneError(f"{where}: not YAML: {what}")
-
-
-def _require_shallow(text: str, locate: Locate) -> None:
-    """Raises SceneError where `text` is nested so deep that composing it might end the process."""
-    depth = 0
-    for event in yaml.parse(text, Loader=LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise SceneError(f"{_place(locate, event.start_mark)}: {TOO_DEEP}")
+        fault = f"the character {error.character!r} is not allowed"
+    raise SceneError(f"{where}: not YAML: {fault}")
 
 
 def _place(locate: Locate, mark: Any) -> str:
@@ -130,43 +112,53 @@ def _place(locate: Locate, mark: Any) -> str:
     return locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
 
 
-class _Builder:
-    """Makes nodes of those of PyYAML; what an alias stands for is copied, and `count` of nodes."""
+class _Composer:
+    """Makes nodes of the events that PyYAML parses a text into."""
 
-    def __init__(self, locate: Locate, problems: Problems):
+    def __init__(self, text: str, locate: Locate, problems: Problems):
+        self.events = yaml.parse(text, Loader=LOADER)
         self.locate, self.problems = locate, problems
-        self.count = 0
 
-    def build(self, source: yaml.Node, key: str, key_where: str | None, depth: int) -> Node:
-        """The node at `key` for `source`, within so many others."""
-        where = self.where(source)
+    def compose_document(self, key: str) -> Node:
+        """The node at `key` of the only document."""
+        next(self.events)
+        if isinstance(next(self.events), yaml.StreamEndEvent):
+            raise SceneError(f"{self.locate(1, 1)}: is empty")
+        root = self.compose(next(self.events), key, None, 0)
+        next(self.events)
+        if not isinstance(after := next(self.events), yaml.StreamEndEvent):
+            raise SceneError(f"{self.where(after)}: not YAML: expected a single document")
+        return root
+
+    def compose(self, event: Any, key: str, key_where: str | None, depth: int) -> Node:
+        """The node at `key` that begins with `event`, within `depth` others."""
+        where = self.where(event)
         node = Node(key, where, key_where or where, None)
-        self.count += 1
-        if depth > MAX_DEPTH:
-            raise node.refused(TOO_DEEP)
-        if self.count > MAX_NODES:
-            raise node.refused(f"holds more than {MAX_NODES:,} values, those of aliases counted")
-        if source.tag not in TAGS:
-            raise node.refused(f"tags such as {source.tag!r} are not supported")
-        if isinstance(source, yaml.ScalarNode):
-            node.value = source.value if source.style else resolve(source.value)
-        elif isinstance(source, yaml.SequenceNode):
-            node.value = [
-                self.build(entry, node.child_key(index), None, depth + 1)
-                for index, entry in enumerate(source.value)
-            ]
+        if isinstance(event, yaml.AliasEvent):
+            raise node.refused("aliases such as *name are not supported; write the value again")
+        if event.tag:
+            raise node.refused(f"tags such as {event.tag!r} are not supported")
+        if isinstance(event, yaml.ScalarEvent):
+            node.value = event.value if event.style else resolve(event.value)
+        elif depth == MAX_DEPTH:
+            raise node.refused(f"nested more than {MAX_DEPTH} deep")
+        elif isinstance(event, yaml.SequenceStartEvent):
+            node.value = entries = list[Node]()
+            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
+                entries.append(self.compose(event, node.child_key(len(entries)), None, depth + 1))
         else:
-            node.value = self.entries(source, node, depth)
+            node.value = self.compose_entries(node, depth)
         return node
 
-    def entries(self, source: yaml.Node, parent: Node, depth: int) -> dict[str, Node]:
+    def compose_entries(self, parent: Node, depth: int) -> dict[str, Node]:
+        """The entries of the mapping `parent`, which has begun."""
         entries = dict[str, Node]()
-        for named, value in source.value:
-            where = self.where(named)
-            if not isinstance(named, yaml.ScalarNode):
+        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
+            where = self.where(event)
+            if not isinstance(event, yaml.ScalarEvent):
                 raise SceneError(f"{where}: {parent.child_key('?')}: a key must be plain text")
-            name = named.value if named.value.isprintable() else repr(named.value)
-            child = self.build(value, parent.child_key(name), where, depth + 1)
+            name = event.value if event.value.isprintable() else repr(event.value)
+            child = self.compose(next(self.events), parent.child_key(name), where, depth + 1)
             if name in entries:
                 place = entries[name].key_where
                 self.problems.note(child.key_refused(f"repeated key; it is already at {place}"))
@@ -174,8 +166,9 @@ class _Builder:
                 entries[name] = child
         return entries
 
-    def where(self, source: yaml.Node) -> str:
-        return _place(self.locate, source.start_mark)
+    def where(self, event: Any) -> str:
+        """The place at which `event` begins."""
+        return _place(self.locate, event.start_mark)
 
 
 _WORDS: dict[str, Scalar] = {
@@ -186,17 +179,13 @@ _WORDS: dict[str, Scalar] = {
     **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), math.inf),
     **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), -math.inf),
 }
-_NUMBERS: Mapping[str, Callable[[str], Scalar]] = {
-    r"[-+]?[0-9]{1,30}": int,
-    r"0x[0-9a-fA-F]{1,30}": lambda text: int(text, 16),
-    r"0o[0-7]{1,30}": lambda text: int(text, 8),
-    r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?": float,
-}
 
 
 def resolve(text: str) -> Scalar:
     """The value of the unquoted scalar `text`."""
     if text in _WORDS:
         return _WORDS[text]
-    read = next((read for form, read in _NUMBERS.items() if re.fullmatch(form, text)), str)
-    return read(text)
+    if re.fullmatch(r"[-+]?[0-9]{1,30}", text):
+        return int(text)
+    is_number = re.fullmatch(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", text)
+    return float(text) if is_number else text

@@ -1,22 +1,22 @@
 """Reading values by their types: records from mappings, tuples from lists, numbers and text.
 
 A type may have alternatives: the kind of a YAML node, a mapping, list, text or number, tells which
-of them it is. Records are told apart by their `type`, others by their first key.
+of them it is. Records are told apart by their `type`, others by their first required key.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields, is_dataclass
-from functools import reduce
+from dataclasses import Field, fields, is_dataclass
+from functools import partial, reduce
 from operator import or_
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
-from ddrecon.errors import Problems, suggestion
-from ddrecon.records import LIMITS, alternatives, type_hints
+from ddrecon.errors import Problems, gather, nearest, suggestion
+from ddrecon.records import WORDS, alternatives, find_excess, is_required, type_hints
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.settings import FieldFile
 
@@ -24,30 +24,32 @@ R = TypeVar("R")
 
 LARGEST = 3e38
 """The largest magnitude that single precision holds, roughly."""
-WORDS = {
-    float: "a number",
-    int: "a whole number",
-    bool: "true or false",
-    str: "text",
-    Path: "a file",
-}
 PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numbers": "rows of 4"}
 
 
 class Rule(NamedTuple):
     """What a value must be: of the type `hint`, within `limits`; relative paths start at `folder`.
 
-    `finish[kind](node, record, folder)` is what a record of that kind stands for, and
-    `finish[tuple, kind]` or `finish[Mapping, kind]` looks at all of a list or mapping together.
+    `finish[key](node, value, folder)` is what the value at `key` stands for.
     """
 
     hint: Any
     folder: Path
     limits: Mapping[str, Any]
-    finish: Mapping[Any, Callable[[Node, Any, Path], Any]]
+    finish: Mapping[str, Callable[[Node, Any, Path], Any]]
+
+    @property
+    def kinds(self) -> tuple[Any, ...]:
+        """The types of which a value may be."""
+        return alternatives(self.hint)
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values that are legal, where the limits name them."""
+        return self.limits.get("choices", ()) if {str, int} & set(self.kinds) else ()
 
 
-def read_as(node: Node, hint: Any, folder: Path, **limits: float) -> Any:
+def read_as(node: Node, hint: Any, folder: Path = Path(), **limits: float) -> Any:
     """The value of `node`, of the type `hint` within `limits`."""
     return read_value(node, Rule(hint, folder, limits, {}))
 
@@ -73,77 +75,72 @@ def _describe(kind: Any, kinds: Sequence[Any]) -> str:
         return f"a list of {count}{PLURALS.get(inner, inner)}"
     if is_dataclass(kind) and float in kinds:
         return f"{{{fields(kind)[0].name}: ...}}"
-    return WORDS.get(kind, "a mapping")
+    return "a file" if kind is Path else WORDS.get(kind, "a mapping")
 
 
 def read_value(node: Node, rule: Rule) -> Any:
     """The value of `node` by `rule`; raises SceneError with everything wrong in it."""
-    kinds, rule = alternatives(rule.hint), rule._replace(folder=node.folder or rule.folder)
+    rule = rule._replace(folder=node.folder or rule.folder)
+    value = _read_kind(node, rule)
+    return rule.finish[node.key](node, value, rule.folder) if node.key in rule.finish else value
+
+
+def _read_kind(node: Node, rule: Rule) -> Any:
+    kinds = rule.kinds
     match node.value:
         case None if NoneType in kinds:
             return None
         case dict():
-            return _read_mapping(node, kinds, rule)
+            return _read_mapping(node, rule)
         case list():
-            return _read_list(node, kinds, rule)
+            return _read_list(node, rule)
         case str():
-            return _read_text(node, kinds, rule)
+            return _read_text(node, rule)
         case bool() if bool in kinds:
             return node.value
         case bool() | None:
-            raise _refused(node, rule)
+            pass
         case int() if int in kinds:
-            _check_limits(node, node.value, rule.limits)
-            _check_choice(node, rule.limits.get("choices", ()), rule)
-            return node.value
+            return _read_number(node, node.value, rule)
         case int() | float() if float in kinds:
-            if not -LARGEST <= node.value <= LARGEST:
-                raise node.refused(
-                    f"expected a finite number of single precision, found {describe_found(node)}"
-                )
-            _check_limits(node, node.value, rule.limits)
-            return float(node.value)
+            return float(_read_number(node, node.value, rule))
     raise _refused(node, rule)
 
 
 def _refused(node: Node, rule: Rule) -> Exception:
-    kinds = alternatives(rule.hint)
-    if str in kinds and node.value is not None:
-        _check_choice(node, rule.limits.get("choices", ()), rule)
-    is_number = {str, Path} & set(kinds) and isinstance(node.value, int | float)
-    found = describe_found(node) + (" (put it in quotes)" if is_number else "")
-    return node.refused(f"expected {describe_type(rule.hint)}, found {found}")
+    choices = [str(choice) for choice in rule.choices]
+    expected = f"one of {', '.join(choices)}" if choices else describe_type(rule.hint)
+    description = describe_found(node)
+    if isinstance(node.value, str):
+        description += nearest(node.value, choices)
+    elif isinstance(node.value, int | float) and {str, Path} & set(rule.kinds) and not choices:
+        description += " (put it in quotes)"
+    return node.refused(f"expected {expected}, found {description}")
 
 
-def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
-    for name, (words, is_within) in LIMITS.items():
-        if limits.get(name) is not None and not is_within(value, limits[name]):
-            raise node.refused(f"must be {words} {limits[name]:g}, found {value:g}")
+def _read_number(node: Node, number: float, rule: Rule) -> float:
+    if not -LARGEST <= number <= LARGEST:
+        expected = "expected a finite number of single precision"
+        raise node.refused(f"{expected}, found {describe_found(node)}")
+    if rule.choices and number not in rule.choices:
+        raise _refused(node, rule)
+    if fault := find_excess(number, rule.limits):
+        raise node.refused(fault)
+    return number
 
 
-def _check_choice(node: Node, choices: Sequence[Any], rule: Rule) -> None:
-    if choices and node.value not in choices:
-        words = list(map(str, choices))
-        near = suggestion(str(node.value), words) if len(words) > 1 else ""
-        raise node.refused(
-            f"expected one of {', '.join(words)}, found {describe_found(node)}"
-            f"{near if 'did you' in near else ''}"
-        )
-
-
-def _read_text(node: Node, kinds: Sequence[Any], rule: Rule) -> str | Path:
+def _read_text(node: Node, rule: Rule) -> str | Path:
     """Text, one of the choices where there are such, or the path of a file, made absolute."""
-    choices = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
-    if not choices and not {str, Path} & set(kinds):
+    words = [word for kind in rule.kinds if get_origin(kind) is Literal for word in get_args(kind)]
+    if not words and not {str, Path} & set(rule.kinds):
         raise _refused(node, rule)
     text = str(node.value)
     if not text or not text.isprintable():
         raise node.refused(f"expected text that can be printed, found {describe_found(node)}")
-    if Path in kinds:
+    if Path in rule.kinds:
         return path_in(rule.folder, text)
-    if choices and text not in choices:
+    if (choices := words or rule.choices) and text not in choices:
         raise _refused(node, rule)
-    _check_choice(node, choices or rule.limits.get("choices", ()), rule)
     return text
 
 
@@ -156,58 +153,50 @@ def path_in(folder: Path, text: str) -> Path:
     return (folder / (text if is_there else text.replace("\\", "/"))).absolute()
 
 
-def _read_list(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
+def _read_list(node: Node, rule: Rule) -> Any:
     """As many entries as the tuple among `kinds` has, or any number.
 
     Of others than numbers that is at least one, unless the field `may_be_empty`.
     """
     entries = node.children()
-    for arguments in (get_args(kind) for kind in kinds if get_origin(kind) is tuple):
+    for arguments in (get_args(kind) for kind in rule.kinds if get_origin(kind) is tuple):
         may_be_empty = arguments[0] is float or rule.limits.get("may_be_empty")
         is_open = arguments[-1] is Ellipsis and (entries or may_be_empty)
         if is_open or len(entries) == len(arguments):
-            values = read_each(entries, rule._replace(hint=arguments[0]))
-            return _finish(node, (tuple, arguments[0]), values, rule)
+            values = gather(partial(read_value, rule=rule._replace(hint=arguments[0])), entries)
+            if rule.limits.get("is_nonzero") and not any(values):
+                raise node.refused("must not be zero")
+            return tuple(values)
     raise _refused(node, rule)
 
 
-def read_each(nodes: Sequence[Node], rule: Rule) -> tuple[Any, ...]:
-    """The value of each node by `rule`; raises SceneError with the problems of all."""
-    problems, values = Problems(), []
-    for node in nodes:
-        with problems.collecting():
-            values.append(read_value(node, rule))
-        if problems.are_many:
-            break
-    problems.raise_any()
-    return tuple(values)
-
-
-def _read_mapping(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
+def _read_mapping(node: Node, rule: Rule) -> Any:
     """A record, or a mapping of names to records; `{constant: number}` stands for the number."""
-    entries = node.entries()
+    entries, kinds = node.entries(), rule.kinds
     if FieldFile in kinds and float in kinds and set(entries) == {"constant"}:
         return read_value(entries["constant"], rule._replace(hint=float))
     if records := [kind for kind in kinds if is_dataclass(kind)]:
-        kind = _pick(node, records, rule)
-        return _finish(node, kind, read_record(node, kind, rule), rule)
+        return read_record(node, _pick(node, records, rule), rule)
     for kind in kinds:
         if get_origin(kind) is Mapping:
-            each = get_args(kind)[1]
-            values = read_each(node.children(), rule._replace(hint=each))
-            return _finish(node, (Mapping, each), dict(zip(entries, values, strict=True)), rule)
+            read = partial(read_value, rule=rule._replace(hint=get_args(kind)[1]))
+            values = gather(read, node.children())
+            return dict(zip(entries, values, strict=True))
     raise _refused(node, rule)
 
 
-def _finish(node: Node, kind: Any, value: Any, rule: Rule) -> Any:
-    return rule.finish[kind](node, value, rule.folder) if kind in rule.finish else value
-
-
 def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
-    """That of `kinds` which the mapping `node` is, by its `type` or the first key of the record."""
+    """That of `kinds` which the mapping `node` is, by its `type` or first required key."""
     entries = node.entries()
     if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
-        return next((kind for kind in kinds if fields(kind)[0].name in entries), kinds[0])
+        return next(
+            (
+                kind
+                for kind in kinds
+                if any(is_required(key) and key.name in entries for key in fields(kind))
+            ),
+            kinds[0],
+        )
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}
@@ -220,8 +209,8 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
     declared = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
     problems, values = Problems(), {}
-    for what in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
-        problems.note(node.refused(what))
+    for fault in _absences(declared, getattr(kind, "ALTERNATIVES", ()), entries):
+        problems.note(node.refused(fault))
     for name, child in entries.items():
         with problems.collecting():
             if name not in known:
@@ -234,8 +223,8 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
             break
     problems.raise_any()
     record = kind(**values)
-    for name, what in getattr(record, "violations", tuple)():
-        problems.note(entries.get(name, node).refused(what))
+    for name, fault in getattr(record, "violations", tuple)():
+        problems.note(entries.get(name, node).refused(fault))
     problems.raise_any()
     return record
 
@@ -245,22 +234,18 @@ def _absences(
     groups: Sequence[tuple[str, ...]],
     entries: Mapping[str, Node],
 ) -> list[str]:
-    """What is wrong with the set of keys given: required ones and one of the alternative `groups`.
+    """What is wrong with the set of keys: required ones and one of the alternative `groups`.
 
     Of a group, what has no default is required with it.
     """
-    given = {name for name, entry in entries.items() if entry.value is not None}
+    present = {name for name, entry in entries.items() if entry.value is not None}
     needed = [[name for name in group if declared[name].default is None] for group in groups]
-    chosen = [names for group, names in zip(groups, needed, strict=True) if given & set(group)]
-    absent = [
-        name
-        for name, field in declared.items()
-        if field.default is field.default_factory is MISSING and name not in entries
-    ]
+    chosen = [names for group, names in zip(groups, needed, strict=True) if present & set(group)]
+    absent = [name for name, key in declared.items() if is_required(key) and name not in entries]
     if len(chosen) == 1:
-        absent += [name for name in chosen[0] if name not in given]
-    wrong = [f"missing key {name!r}" for name in absent]
+        absent += [name for name in chosen[0] if name not in present]
+    faults = [f"missing key {name!r}" for name in absent]
     if groups and len(chosen) != 1:
         words = " or ".join(" and ".join(names) for names in needed)
-        wrong.append(f"{'give only one of' if chosen else 'missing'} {words}")
-    return wrong
+        faults.append(f"{'give only one of' if chosen else 'missing'} {words}")
+    return faults

@@ -15,16 +15,18 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ddrecon.errors import FormatError, Problems, SceneError
+from ddrecon.errors import FormatError, SceneError, gather
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.read import read_as
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.view_schema import (
     FisheyeSection,
     LensSection,
     Matrix,
@@ -79,23 +81,22 @@ def read_transforms(
     A file that does not say which are test views has one in `test_every`. Raises SceneError or
     FormatError.
     """
-    problems, views = Problems(), list[ViewSection]()
-    for path in paths:
-        with problems.collecting():
-            if not path.is_file():
-                raise node.refused(f"{path} does not exist, or is not a file")
-            with guard_reading(path):
-                if path.stat().st_size > MAX_BYTES:
-                    most = f"{MAX_BYTES // 2**20} MiB"
-                    raise FormatError(path, f"is larger than {most}; it holds more than cameras")
-                try:
-                    document = node_of("", str(path), json.loads(path.read_bytes()))
-                except (ValueError, RecursionError) as error:
-                    raise FormatError(path, f"not JSON: {error}") from error
-            with in_file(path):
-                views += _file_views(document, path, test_every)
-    problems.raise_any()
-    return tuple(views)
+
+    def read(path: Path) -> list[ViewSection]:
+        if not path.is_file():
+            raise node.refused(f"{path} does not exist, or is not a file")
+        with guard_reading(path):
+            if path.stat().st_size > MAX_BYTES:
+                most = f"{MAX_BYTES // 2**20} MiB"
+                raise FormatError(path, f"is larger than {most}; it holds more than cameras")
+            try:
+                document = node_of("", str(path), json.loads(path.read_bytes()))
+            except (ValueError, RecursionError) as error:
+                raise FormatError(path, f"not JSON: {error}") from error
+        with in_file(path):
+            return _file_views(document, path, test_every)
+
+    return tuple(chain.from_iterable(gather(read, paths)))
 
 
 @contextmanager
@@ -112,11 +113,9 @@ def node_of(key: str, where: str, value: Any) -> Node:
     """`value`, as JSON has it, as a node at `key` and all those below it."""
     node = Node(key, where, where, value)
     if isinstance(value, dict):
-        node.value = {
-            name: node_of(node.child_key(name), where, one) for name, one in value.items()
-        }
+        node.value = {n: node_of(node.child_key(n), where, entry) for n, entry in value.items()}
     elif isinstance(value, list):
-        node.value = [node_of(node.child_key(index), where, one) for index, one in enumerate(value)]
+        node.value = [node_of(node.child_key(i), where, entry) for i, entry in enumerate(value)]
     return node
 
 
@@ -128,45 +127,39 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
     frames, folder = root.value["frames"], path.absolute().parent
     if not isinstance(frames.value, list) or not frames.value:
         raise frames.refused("expected a list with at least one frame")
-    splits = _listed_splits(root, frames.value)
-    problems, views = Problems(), []
-    for frame, split in zip(frames.value, splits or [""] * len(frames.value), strict=True):
-        if split is not None:
-            with problems.collecting():
-                view = _frame_view(frame, root.value, folder)
-                views.append(replace(view, split=split) if split else view)
-    problems.raise_any()
+    splits = _listed_splits(root.value, frames.value)
+    read = partial(_frame_view, shared=root.value, folder=folder)
+    if splits:
+        listed = [
+            (frame, split) for frame, split in zip(frames.value, splits, strict=True) if split
+        ]
+        views = gather(lambda entry: replace(read(entry[0]), split=entry[1]), listed)
+    else:
+        views = gather(read, frames.value)
+    if not views:
+        raise root.refused("its lists of files name no frame")
     if is_test := TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem):
         test_every = 1 if is_test.re is TEST_NAME else None
     return views if splits else split_views(views, test_every)
 
 
-def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
+def _listed_splits(entries: Entries, frames: Sequence[Node]) -> list[str | None]:
     """The split of each frame by the lists of the file, where it has any.
 
     It is None for one that they leave out, as nerfstudio does.
     """
-    lists = {name: root.entries()[name] for name in LISTS if name in root.entries()}
-    if not lists:
-        return []
+    lists = {name: entries[name] for name in LISTS if name in entries}
     named = [isinstance(frame.value, dict) and frame.value.get("file_path") for frame in frames]
-    paths = [Path(str(one.value).replace("\\", "/")) if one else None for one in named]
-    listed = {name: set[Path]() for name in LISTS}
+    paths = [node and Path(str(node.value).replace("\\", "/")) for node in named]
+    listed = dict[Path, str]()
     for name, node in lists.items():
         for entry in node.children():
-            path = Path(read_as(entry, str, Path()).replace("\\", "/"))
+            path = Path(read_as(entry, str).replace("\\", "/"))
             if path not in paths:
                 raise entry.refused(f"no frame has the file_path {entry.value!r}")
-            listed[name].add(path)
-    train, *tests = listed.values()
-    splits = list[str | None]()
-    for own in paths:
-        is_train = own is None or own in train or LISTS[0] not in lists
-        is_test = own is not None and own in set.union(*tests)
-        splits.append("test" if is_test else "train" if is_train else None)
-    if not any(splits):
-        raise root.refused("its lists of files name no frame")
-    return splits
+            listed[path] = "train" if name == LISTS[0] else "test"
+    unlisted = None if LISTS[0] in lists else "train"
+    return [listed.get(path, unlisted) if path else "train" for path in paths if lists]
 
 
 def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
@@ -174,14 +167,16 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     from ddrecon.io.images.films import FILMS
     from ddrecon.io.images.table import READERS  # here, as it loads numpy
 
-    own = frame.entries()
-    image, mask = (
-        read_as(own[name], Path, folder) if name in own else None
-        for name in ("file_path", "mask_path")
-    )
-    if (matrices := own.keys() & set(MATRICES)) and not own.keys() & set(FOCAL):
-        raise own[min(matrices)].refused("is not read: write fl_x, fl_y, cx, cy, w and h instead")
-    camera = read_camera(frame, _override(shared, own), folder)
+    entries = frame.entries()
+
+    def read(name: str, hint: Any, default: Any = None) -> Any:
+        return read_as(entries[name], hint, folder) if name in entries else default
+
+    image, mask = read("file_path", Path), read("mask_path", Path)
+    has_focal = not entries.keys().isdisjoint(FOCAL)
+    if (matrices := entries.keys() & set(MATRICES)) and not has_focal:
+        raise entries[min(matrices)].refused("is not read: write fl_x, fl_y, cx, cy, w and h")
+    camera = read_camera(frame, _override(shared, entries), folder)
     if image is None and camera.resolution is None:
         raise frame.refused(
             "has neither file_path nor w and h, so that its number of pixels is unknown"
@@ -191,19 +186,19 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
         with_suffix = Path(f"{image}.png")
         if with_suffix.is_file() or not re.fullmatch(r"\.[A-Za-z]\w*", image.suffix):
             image = with_suffix
-    number = read_as(own["frame"], int, folder) if "frame" in own else 0
     # Of pictures, others call a time what lies between 0 and 1.
     is_film = image is not None and image.suffix.lower() in FILMS
-    time = read_as(own["time"], float, folder) if is_film and "time" in own else 0.0
+    time = read("time", float, 0.0) if is_film else 0.0
+    number = read("frame", int, 0)
     return ViewSection(camera=camera, image=image, mask=mask, frame=number, time=time)
 
 
-def _override(shared: Entries, own: Entries) -> Entries:
-    """What holds for a frame: its `own` entries, and those `shared` ones that they leave alone."""
-    replaced = {name for group in GROUPS if own.keys() & set(group) for name in group}
-    if "camera_model" in own and "PINHOLE" in str(own["camera_model"].value).upper():
+def _override(shared: Entries, entries: Entries) -> Entries:
+    """What holds for a frame: its `entries`, and those `shared` ones that they leave alone."""
+    replaced = {name for group in GROUPS if entries.keys() & set(group) for name in group}
+    if "camera_model" in entries and "PINHOLE" in str(entries["camera_model"].value).upper():
         replaced |= set(GROUPS[1])
-    return {name: node for name, node in shared.items() if name not in replaced} | dict(own)
+    return {name: node for name, node in shared.items() if name not in replaced} | dict(entries)
 
 
 def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
@@ -213,8 +208,8 @@ def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSecti
     matrix = read_as(entries["transform_matrix"], Matrix, folder)
     lens = _intrinsics(frame, entries) | {"distortion": _distortion(entries)}
     camera = PerspectiveSection(matrix=matrix, **lens)
-    for _, what in camera.violations():
-        raise entries["transform_matrix"].refused(what)
+    for _, fault in camera.violations():
+        raise entries["transform_matrix"].refused(fault)
     return camera
 
 
@@ -233,82 +228,78 @@ def _intrinsics(frame: Node, entries: Entries) -> dict[str, Any]:
 
     That is `resolution`, `principal_point` and `pixel_aspect`.
     """
-    given = {
+    numbers: dict[str, float] = {
         name: read_as(entries[name], float, Path(), **limits)
         for name, limits in NUMBERS.items()
         if name in entries
     }
-    if not set(FOCAL) & set(given):
+    if numbers.keys().isdisjoint(FOCAL):
         raise frame.refused("has neither fl_x nor camera_angle_x")
-    if not {"w", "h"} <= set(given):
-        if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in given]:
-            raise entries[needing[0]].refused(
-                "is in pixels, but w and h do not say how many there are"
-            )
-        if "x_fov" not in given and "camera_angle_x" not in given:
+    if not {"w", "h"} <= numbers.keys():
+        for name in ("fl_x", "fl_y", "cx", "cy"):
+            if name in numbers:
+                raise entries[name].refused(
+                    "is in pixels, but w and h do not say how many there are"
+                )
+        if "x_fov" not in numbers and "camera_angle_x" not in numbers:
             raise frame.refused("says how high its picture is, but not how wide: give w and h")
-        return {"fov": given.get("x_fov") or math.degrees(given["camera_angle_x"])}
-    width, height = given["w"], given["h"]
+        return {"fov": numbers.get("x_fov") or math.degrees(numbers["camera_angle_x"])}
+    width, height = numbers["w"], numbers["h"]
     for name in ("w", "h"):
-        if not given[name].is_integer():
-            raise entries[name].refused(f"expected a whole number, found {given[name]:g}")
-    focal_x, focal_y = _focal(given, "x", width), _focal(given, "y", height)
+        if not numbers[name].is_integer():
+            raise entries[name].refused(f"expected a whole number, found {numbers[name]:g}")
+    focal_x, focal_y = _focal(numbers, "x", width), _focal(numbers, "y", height)
     focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
+    center = numbers.get("cx", width / 2) / width, numbers.get("cy", height / 2) / height
     return {
         "fov": 2 * math.degrees(math.atan(width / 2 / focal_x)),
         "resolution": (int(width), int(height)),
-        "principal_point": (
-            given.get("cx", width / 2) / width,
-            given.get("cy", height / 2) / height,
-        ),
+        "principal_point": center,
         "pixel_aspect": focal_x / focal_y,
     }
 
 
-def _focal(given: Mapping[str, float], axis: str, pixels: float) -> float:
+def _focal(numbers: Mapping[str, float], axis: str, pixels: float) -> float:
     """The focal length along `axis` of so many `pixels`; 0 where nothing says it."""
-    if f"{axis}_fov" in given:
-        return pixels / 2 / math.tan(math.radians(given[f"{axis}_fov"]) / 2)
-    if f"fl_{axis}" in given or f"camera_angle_{axis}" not in given:
-        return given.get(f"fl_{axis}", 0.0)
-    return pixels / 2 / math.tan(given[f"camera_angle_{axis}"] / 2)
+    if f"{axis}_fov" in numbers:
+        return pixels / 2 / math.tan(math.radians(numbers[f"{axis}_fov"]) / 2)
+    if f"fl_{axis}" in numbers or f"camera_angle_{axis}" not in numbers:
+        return numbers.get(f"fl_{axis}", 0.0)
+    return pixels / 2 / math.tan(numbers[f"camera_angle_{axis}"] / 2)
 
 
 def _distortion(entries: Entries) -> LensSection | None:
     """The lens; None for a pinhole. Raises SceneError for a model that is not known."""
-    model = ""
+    model, is_fisheye = "", False
     if "camera_model" in entries:
-        model = read_as(entries["camera_model"], str, Path()).upper()
+        model = read_as(entries["camera_model"], str).upper()
         if model not in (*OPENCV, *FISHEYE):
-            raise entries["camera_model"].refused(
-                f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
-            )
+            fault = f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
+            raise entries["camera_model"].refused(fault)
     for name in (*UNKNOWN, *UNNAMED):
         if name in entries and any(
             leaf.value for leaf in entries[name].walk() if not leaf.children()
         ):
-            what = f"is of a lens that is not modeled; {REMEDY}"
+            fault = f"is of a lens that is not modeled; {REMEDY}"
             raise entries[name].refused(
-                what if name in UNKNOWN else "is not read: write k1, k2, ..."
+                fault if name in UNKNOWN else "is not read: write k1, k2, ..."
             )
-    is_fisheye = model in FISHEYE or (
-        "is_fisheye" in entries and read_as(entries["is_fisheye"], bool | int, Path())
-    )
+    if "is_fisheye" in entries:
+        is_fisheye = bool(read_as(entries["is_fisheye"], bool | int))
+    is_fisheye = is_fisheye or model in FISHEYE
     section = FisheyeSection if is_fisheye else OpencvSection
-    given = {name: entries[name] for name in COEFFICIENTS if name in entries}
+    nodes = {name: entries[name] for name in COEFFICIENTS if name in entries}
     if "distortion_params" in entries:
         # as in nerfstudio; OpenCV's own order is another
-        if len(listed := entries["distortion_params"].children()) not in (
-            6,
-            4 if is_fisheye else 6,
-        ):
-            what = f"expected k1, k2, k3, k4, p1, p2, found {len(listed)} numbers"
-            raise entries["distortion_params"].refused(what)
-        given |= dict(zip(COEFFICIENTS, listed, strict=False))
-    lens = {name: read_as(node, float, Path()) for name, node in given.items()}
+        listed = entries["distortion_params"].children()
+        if len(listed) != 6 and not (is_fisheye and len(listed) == 4):
+            fault = f"expected k1, k2, k3, k4, p1, p2, found {len(listed)} numbers"
+            raise entries["distortion_params"].refused(fault)
+        nodes |= dict(zip(COEFFICIENTS, listed, strict=False))
+    lens = {name: read_as(node, float) for name, node in nodes.items()}
     for name in set(lens) - set(LENSES[section.type]):
         if (value := lens.pop(name)) != 0:
-            raise given[name].refused(f"{name} = {value:g} is not modeled; {REMEDY}")
+            raise nodes[name].refused(f"{name} = {value:g} is not modeled; {REMEDY}")
     return section(**lens) if is_fisheye or any(lens.values()) else None
 
 

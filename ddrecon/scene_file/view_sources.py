@@ -21,7 +21,8 @@ from ddrecon.grid import Triple
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.read import path_in
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera, read_transforms
+from ddrecon.scene_file.view_schema import (
     FRAME,
     PerspectiveSection,
     RingSection,
@@ -29,7 +30,6 @@ from ddrecon.scene_file.schema import (
     ViewSource,
     split_views,
 )
-from ddrecon.scene_file.transforms import REMEDY, in_file, node_of, read_camera, read_transforms
 
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -60,13 +60,16 @@ Posed = tuple[str, int, Sequence[float]]
 """An image of a model: its name, its camera's number, and the rotation and shift to it."""
 
 
-def views_of(node: Node, source: ViewSource, folder: Path, up: Triple) -> tuple[ViewSection, ...]:
-    """The views that `source` stands for, which `node` of a scene in `folder` says.
+def views_of(
+    node: Node, source: ViewSource | tuple[ViewSection, ...], folder: Path, up: Triple
+) -> tuple[ViewSection, ...]:
+    """The named views that `source` lists or stands for, which `node` of a scene in `folder` says.
 
     `up` points up in the scene.
     """
-    entries = node.entries()
-    every = source.test_every
+    if isinstance(source, tuple):
+        return name_listed(node, source)
+    entries, every = node.entries(), source.test_every
     if "images" in entries:
         folder = entries["images"].folder or folder
     if source.transforms is not None:
@@ -104,9 +107,7 @@ def in_order(name: str, number: str = "[0-9]+") -> tuple[list[float | str], str]
     return [float(word) if index % 2 else word for index, word in enumerate(words)], name
 
 
-def name_listed(
-    node: Node, views: tuple[ViewSection, ...], folder: Path
-) -> tuple[ViewSection, ...]:
+def name_listed(node: Node, views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     """The `views` of `node`, nameless ones called by their place; SceneError for equal names."""
     problems, first = Problems(), dict[str, int]()
     names = [view.name or f"view_{index:02d}" for index, view in enumerate(views)]
@@ -235,8 +236,8 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            lens = model, (int(width), int(height)), [float(word) for word in parameters]
             index = int(camera)
+            lens = model, (int(width), int(height)), [*map(float, parameters)]
         except ValueError as error:
             raise FormatError(
                 path, f"line {number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line!r}"
@@ -276,7 +277,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
     lengths = {name: len(names) for name, names in MODELS.items()} | OTHERS
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
-            number, model, width, height = _unpack(path, stream, "<iiQQ")
+            number, model, width, height = _unpack(path, stream, "<IiQQ")
             if not 0 <= model < len(lengths):
                 raise FormatError(path, f"camera {number}: lens model {model} is not known")
             name = [*lengths][model]
@@ -286,11 +287,13 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 def _binary_images(path: Path) -> Iterator[Posed]:
     with path.open("rb") as stream:
         for _ in range(*_unpack(path, stream, "<Q")):
-            _, *pose, camera = _unpack(path, stream, "<i7di")
+            _, *pose, camera = _unpack(path, stream, "<I7dI")
             name = bytearray()
             while (letter := _unpack(path, stream, "c")[0]) != b"\0":
                 name += letter
             (points,) = _unpack(path, stream, "<Q")
+            if 24 * points > path.stat().st_size - stream.tell():
+                raise FormatError(path, "ends too soon")
             stream.seek(24 * points, 1)
             yield name.decode(), camera, pose
 

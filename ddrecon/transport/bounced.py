@@ -58,7 +58,10 @@ def follow_inside(medium: Medium, beam: RefractedBeam, most: int = TURNS) -> Ite
     for turns in range(most + 1):
         turned: dict[tuple[int, ...], dict[int, Tensor]] = {}
         for signs, ends in flows.items():
-            if max(float(one.detach().abs().max()) for one in ends.values()) < LEAST * strongest:
+            if (
+                max(float(light.detach().abs().max()) for light in ends.values())
+                < LEAST * strongest
+            ):
                 continue
             way = travel * travel.new_tensor(signs)
             course = Characteristic.along(grid, way)
@@ -82,7 +85,7 @@ def follow_inside(medium: Medium, beam: RefractedBeam, most: int = TURNS) -> Ite
 def _pass(value: Tensor, course: Characteristic, ends: dict[int, Tensor]) -> tuple[Tensor, Ends]:
     """The mean in cells of extinction `value` of light that enters at `ends`, and what leaves."""
     depth = course.lay(value * course.step)
-    colors = next(one.shape[int(place > 0)] for place, one in ends.items())
+    colors = next(light.shape[int(place > 0)] for place, light in ends.items())
     source = torch.zeros_like(depth).expand(-1, colors, -1, -1)
     slices, _, rows, columns = source.shape
     shapes = (colors, rows, columns), (slices, colors, columns), (slices, colors, rows)
@@ -100,12 +103,12 @@ def reflected_light(cells: Medium, lights: Sequence[Source], degree: int) -> Ten
 
     Of `lights` in `cells`; skies' light is not followed beyond the faces it comes to.
     """
-    found = [torch.zeros_like(cells.extinction.value)[None]]
+    moments = [torch.zeros_like(cells.extinction.value)[None]]
     for light in lights:
         if isinstance(light, DirectionalLight | BeamLight):
             for beam in enter_faces(cells.grid, cells.index, light):
-                for one in follow_inside(cells, beam):
-                    if one.turns:
-                        mean = one.irradiance / (4 * math.pi)
-                        found.append(beam_moments(mean, one.direction, degree))
-    return functools.reduce(add, found)
+                for transit in follow_inside(cells, beam):
+                    if transit.turns:
+                        mean = transit.irradiance / (4 * math.pi)
+                        moments.append(beam_moments(mean, transit.direction, degree))
+    return functools.reduce(add, moments)

@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.shear import cross_grid
-from ddrecon.medium.coefficients import Medium
+from ddrecon.light.shear import slice_along
 from ddrecon.numerics.constants import constant
 from ddrecon.numerics.decay import decay_terms
 from ddrecon.numerics.slicing import NEARLY, Slicing, across
@@ -66,7 +65,7 @@ class Characteristic:
         ]
         slicing = Slicing.of(speed, grid.periodic)
         fastest = abs(speed[slicing.axis])
-        drifts = (speed[other] / fastest for other in across(slicing.axis))
+        drifts = (speed[axis] / fastest for axis in across(slicing.axis))
         row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
         slices, rows, columns = (
             slicing.order[dim] - 1 in grid.periodic for dim in (SLICES, ROWS, COLUMNS)
@@ -78,7 +77,7 @@ class Characteristic:
     @staticmethod
     def along(grid: Grid, direction: Tensor) -> Characteristic:
         """The same of unit `direction` [3], which may be varied."""
-        slicing, (row, column), step = cross_grid(grid, direction)
+        slicing, (row, column), step = slice_along(grid, direction)
         forward = -1 if slicing.is_reversed else 1
         return Characteristic(slicing.order, forward, (row, column), step, grid.shape[slicing.axis])
 
@@ -104,41 +103,27 @@ class Characteristic:
 
 
 def radiance_along(
-    medium: Medium,
-    scatters: Tensor,
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
     gradient: Tensor,
-    inflow: Tensor | None,
     direction: Direction,
     ends: Ends | None = None,
 ) -> tuple[Tensor, Ends]:
     """I along `direction` (E2.9): its mean in each cell [C, z, y, x], and what leaves the box.
 
-    `ends` is what enters it besides `inflow`.
-
-    `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
-    `medium` adds (1 - f) kappa_s a unit length; `gradient` [3, C, z, y, x]: by how much q rises
-    from cell to cell; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none, from
-    which what leaves is counted.
+    `direction`: the unit vector of travel (array order); `extinction` [C or 1, z, y, x]: kappa_t;
+    `emitted` [C, z, y, x]: E, what cells add to radiance in a unit of length; `gradient`
+    [3, C, z, y, x]: by how much it rises from cell to cell; `ends`: what enters the box.
     """
-    course = Characteristic.of(medium.grid, direction)
-    depth, strength = (
-        course.lay(one.value * course.step) for one in (medium.extinction, medium.remaining)
-    )
-    # what the cell emits along the ray, and by how much more at its end than at its beginning
+    course = Characteristic.of(grid, direction)
     rise = torch.tensordot(constant(course.moved, gradient), gradient, 1)
-    e, r = strength * course.lay(scatters), strength * course.lay(rise)
+    depth, e, r = (course.lay(field * course.step) for field in (extinction, emitted, rise))
     phi, psi, eta = decay_terms(depth)
-    passed, source, own = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
-    if inflow is not None:
-        # Light from outside is there without a medium. The rest, I - inflow, is zero where rays
-        # enter and loses inflow * lost on every way: a white furnace stays exact.
-        outside = inflow.view(1, -1, 1, 1)
-        source = source - outside * -torch.expm1(-depth)
-        own = own - outside * (1 - phi)
-    passed, source, own, phi = torch.broadcast_tensors(passed, source, own, phi)
+    passed, source, within = torch.exp(-depth), e * phi + r * (depth * eta), e * psi - r * eta
+    passed, source, within, phi = torch.broadcast_tensors(passed, source, within, phi)
     arriving, gone = follow(passed, source, course, ends)
-    mean = course.lift(torch.addcmul(own, arriving, phi))
-    return mean if inflow is None else mean + inflow, gone
+    return course.lift(torch.addcmul(within, arriving, phi)), gone
 
 
 def follow(
@@ -171,25 +156,42 @@ def _follow_once(
 ) -> tuple[list[Tensor], Ends]:
     """I_in by slice, for what is `arriving` at the first; and what leaves the box."""
     entered, gone = list[Tensor](), (list[Tensor](), list[Tensor]())
-    ways = list(zip((1, 2), sides, gone, course.drift, course.wraps[1:], strict=True))
     # All slices at once: the adjoint of one by its number is an array of zeros as large as all.
     sources, shares = source.unbind(), passed.unbind()
     for k in range(len(source))[:: course.forward]:
         entered.append(arriving)
-        arriving = torch.addcmul(sources[k], shares[k], arriving)
-        # Part of each row goes on to the next, and of the last leaves the box; so of columns.
-        for dim, side, beyond, drift, is_around in ways:
-            if drift:
-                way, size = 1 if drift > 0 else -1, arriving.shape[dim]
-                last = arriving.select(dim, size - 1 if drift > 0 else 0)
-                beyond.append(last)
-                kept = arriving.narrow(dim, int(drift < 0), size - 1)
-                edge = last if is_around else torch.zeros_like(last) if side is None else side[k]
-                behind = torch.cat([edge.unsqueeze(dim), kept][::way], dim)
-                arriving = torch.lerp(arriving, behind, abs(drift))
-    nothing = torch.zeros_like(source[0])
-    rows, columns = (torch.stack(one[:: course.forward]) if one else nothing for one in gone)
+        light = torch.addcmul(sources[k], shares[k], arriving)
+        arriving, *beyond = drift(
+            light, [None if side is None else side[k] for side in sides], course
+        )
+        for layers, layer in zip(gone, beyond, strict=True):
+            layers.append(layer)
+    rows, columns = (torch.stack(layers[:: course.forward]) for layers in gone)
     return entered, (arriving, rows, columns)
+
+
+def drift(
+    light: Tensor, sides: Sequence[Tensor | None], course: Characteristic
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`light` [..., rows, columns] that leaves the cells of a slice, as it comes to the next.
+
+    A part of each row goes on to the next row, and so do parts of columns. `sides` [..., columns]
+    and [..., rows] are what enters the first, None for nothing. With what leaves the last ones.
+    """
+    gone = list[Tensor]()
+    for dim, side, moved, is_around in zip(
+        (-2, -1), sides, course.drift, course.wraps[1:], strict=True
+    ):
+        size = light.shape[dim]
+        last = light.select(dim, size - 1 if moved > 0 else 0)
+        gone.append(last if moved else torch.zeros_like(last))
+        if moved:
+            remaining = light.narrow(dim, int(moved < 0), size - 1)
+            edge = last if is_around else torch.zeros_like(last) if side is None else side
+            sense = 1 if moved > 0 else -1
+            behind = torch.cat([edge.unsqueeze(dim), remaining][::sense], dim)
+            light = torch.lerp(light, behind, abs(moved))
+    return light, gone[0], gone[1]
 
 
 def enter_again(
@@ -209,19 +211,20 @@ def enter_again(
             break
         before, after = entering, leave(entering)
         entering = [
-            old if rest else new for old, new, rest in zip(before, after, rests, strict=True)
+            old if is_steady else new
+            for old, new, is_steady in zip(before, after, rests, strict=True)
         ]
         rests = [
-            rest or _is_at_rest(old, new)
-            for rest, old, new in zip(rests, before, after, strict=True)
+            is_steady or _is_at_rest(old, new)
+            for is_steady, old, new in zip(rests, before, after, strict=True)
         ]
     if not any(is_whole):
         return entering
     # Rays stay apart: what enters is b + a (b + a (...)), each term so many cells further.
-    shares = leave([torch.ones_like(one) for one in nothing], is_dark=True)
+    shares = leave([torch.ones_like(dark) for dark in nothing], is_dark=True)
     return [
-        _double(one, share, course) if is_so else slanted
-        for one, share, course, is_so, slanted in zip(
+        _double(light, share, course) if is_parallel else slanted
+        for light, share, course, is_parallel, slanted in zip(
             first, shares, courses, is_whole, entering, strict=True
         )
     ]

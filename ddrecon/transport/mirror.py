@@ -40,8 +40,11 @@ class Mirror:
     def __post_init__(self) -> None:
         numbers = {tuple(direction): n for n, direction in enumerate(self.directions)}
         self.images = [
-            [numbers[tuple(-c if a == axis else c for a, c in enumerate(one))] for axis in range(3)]
-            for one in self.directions
+            [
+                numbers[tuple(-c if a == axis else c for a, c in enumerate(direction))]
+                for axis in range(3)
+            ]
+            for direction in self.directions
         ]
         self.reflected = quadrature_reflectances(self.index, len(self.directions)).tolist()
 
@@ -52,12 +55,12 @@ class Mirror:
         """
         self.before, self.left = self.left, []
         if light is None:
-            self.more = [torch.zeros_like(one) for one in self.more]
+            self.more = [torch.zeros_like(layer) for layer in self.more]
             return
         self.more = _layers(light)
-        for one in (self, self.besides):
-            if self.before and one is not None:
-                self.more = [m - s for m, s in zip(self.more, one.swept, strict=True)]
+        for mirror in (self, self.besides):
+            if self.before and mirror is not None:
+                self.more = [m - s for m, s in zip(self.more, mirror.swept, strict=True)]
 
     def entering(self, number: int) -> Ends:
         """What enters along direction `number`."""
@@ -67,9 +70,9 @@ class Mirror:
             image = self.images[number][axis]
             layer = self.more[2 * axis + (direction[axis] < 0)]
             layer = lay_face(torch.tensordot(self.values[image].to(layer), layer, 1), place, course)
-            for one in (self.before, self.besides.left if self.besides and self.before else []):
-                if one and course.moved[axis]:
-                    layer = layer + one[image][place]
+            for earlier in (self.before, self.besides.left if self.besides and self.before else []):
+                if earlier and course.moved[axis]:
+                    layer = layer + earlier[image][place]
             ends.append(self.reflected[number][axis] * layer)
         return ends[0], ends[1], ends[2]
 
@@ -81,8 +84,8 @@ class Mirror:
         """What goes out of the box along direction `number` after the last sweep."""
         axes = Characteristic.of(self.grid, self.directions[number]).axes
         gone = (
-            (1 - self.reflected[number][axis]) * one
-            for axis, one in zip(axes, self.left[number], strict=True)
+            (1 - self.reflected[number][axis]) * layer
+            for axis, layer in zip(axes, self.left[number], strict=True)
         )
         across, rows, columns = gone
         return across, rows, columns
@@ -93,8 +96,8 @@ def _layers(light: Tensor) -> list[Tensor]:
 
 
 def lay_face(layer: Tensor, place: int, course: Characteristic) -> Tensor:
-    """`layer` [C, ...] of a face, its other axes in array order, as that at a `place` in `Ends`."""
+    """`layer` [C, ...] of a face, its axes in array order, as that at a `place` in `Ends`."""
     if place == 0:
         return layer
-    slices, other = course.axes[0], course.axes[3 - place]
-    return layer.movedim(2 if other < slices else 1, 0)
+    slices, along = course.axes[0], course.axes[3 - place]
+    return layer.movedim(2 if along < slices else 1, 0)

@@ -79,8 +79,8 @@ def run_rounds(
 def _residual(new: Tensor, old: Tensor) -> Tensor:
     """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
     squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
-    changed, whole = squares
-    return (changed / whole.clamp(min=1e-300)).amax().sqrt()
+    change, size = squares
+    return (change / size.clamp(min=1e-300)).amax().sqrt()
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:
@@ -138,7 +138,9 @@ def _round(
     off, start = None, light[0].detach()[0]
     if round_index > 1:
         mean, first = mean_and_first(light[0])
-        off = _imbalance(operator, right, mean), problem.flux(mean, begun=first, sign=-1)
+        flux = problem.flux(mean)
+        off_first = None if first is None or flux is None else first - flux
+        off = recompute(_imbalance, operator, right, mean), off_first
     gain, source, turned = _gain(medium, low, off, directions, cosine)
     solve_round = replace(rounds.solve, round_index=round_index, start=start)
     u = problem.solved(solve_round, problem.right_side(source, turned))
@@ -213,10 +215,6 @@ def _gain(
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
-    return recompute(_plain_imbalance, operator, right, mean)
-
-
-def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     return right - operator.apply(mean)
 
 

@@ -38,62 +38,43 @@ def count_directions(degree: int, rounds: int) -> int:
 
 
 def sweep(
-    medium: Medium,
-    source: Tensor,
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
     gradient: Tensor,
-    inflow: Tensor | None,
     directions: int,
     mirror: Mirror | None = None,
 ) -> Tensor:
-    """The moments [K, C, z, y, x] of the radiance that `source` scatters (E2.9, E2.8).
+    """The moments [K, C, z, y, x] of the radiance that cells add to (E2.9, E2.8).
 
-    `source` [K, C, z, y, x]: moments of what scatters, to some degree; `gradient` [3, C, z, y, x]:
-    of the first, as of `steep_gradient`; `inflow`: light from outside, as of `radiance_along`;
-    `directions`: how many (`count_directions`); `mirror`: what faces reflect, None for nothing.
+    `extinction` [C or 1, z, y, x]; `emitted` [K, C, z, y, x]: as of `emitted_light`; `gradient`
+    [3, C, z, y, x]: as of `steep_gradient`; `directions`: how many (`count_directions`); `mirror`:
+    what faces reflect, None for nothing.
     """
-    grid, (count, colors) = medium.grid, source.shape[:2]
+    count, *shape = emitted.shape
+    extinction, gradient = extinction.expand(shape), gradient.expand(3, *shape)
     if is_fused():
-        return _sweep_fused(medium, source, gradient, inflow, directions, mirror)
+        from ddrecon.transport.fused.faces import sweep_fused
+
+        return sweep_fused(grid, extinction, emitted, gradient, directions, mirror)
     courses, weights, values = sweep_rule(directions, count)
-    values = values.to(source)
-    moments = source.new_zeros(count, colors * grid.cells)
+    values = values.to(emitted)
+    moments = emitted.new_zeros(count, math.prod(shape))
     for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
         row, ends = values[number], None if mirror is None else mirror.entering(number)
 
         def follow(
             row: Tensor = row, direction: Direction = direction, ends: Ends | None = ends
         ) -> tuple[Tensor, Ends]:
-            # I (E2.9), of the sum over moments of this direction's harmonics
-            scatters = torch.tensordot(row, source, 1)
-            return radiance_along(medium, scatters, gradient, inflow, direction, ends)
+            # E, of the sum over moments of this direction's harmonics
+            along = torch.tensordot(row, emitted, 1)
+            return radiance_along(grid, extinction, along, gradient, direction, ends)
 
         radiance, gone = recompute(follow)
         if mirror is not None:
             mirror.left.append(gone)
         moments.addr_(weight * row, radiance.flatten())
-    return moments.view(count, colors, *grid.shape)
-
-
-def _sweep_fused(
-    medium: Medium,
-    source: Tensor,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    directions: int,
-    mirror: Mirror | None,
-) -> Tensor:
-    """The same by fused kernels."""
-    from ddrecon.transport.fused.faces import sweep_faces
-    from ddrecon.transport.fused.sweep import sweep_fused
-
-    given = medium, source, gradient, inflow, directions
-    if mirror is None:
-        if not medium.grid.periodic:
-            return sweep_fused(*given)
-        return sweep_faces(*given, None)[0]
-    moments, gone = sweep_faces(*given, [mirror.entering(n) for n in range(directions)])
-    mirror.left.extend(gone)
-    return moments
+    return moments.view(count, *shape)
 
 
 def sweep_change(
@@ -107,63 +88,85 @@ def sweep_change(
     """By how much moments of degree 0 and 1 change in a sweep, and all those of higher degree.
 
     It scatters `light` and `source`, p_l phi_k + Q_k (E2.8), of which moments that are missing are
-    zero. What follows is as of `sweep`.
+    zero. `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none; `directions` and
+    `mirror`: as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    scatters = fill(_scatter(light, source, factors), medium.degree)
+    scatters = _scatter(light, source, factors)
     # p_0 is 1: the first moment is L0 + Q0.
-    gradient = steep_gradient(medium, scatters[0], directions)
+    gradient = steep_gradient(medium, scatters[0][0], directions)
+    emitted = fill(emitted_light(medium, scatters, inflow), medium.degree)
+    outside = None if inflow is None else fill(inflow[None], medium.degree)
     if mirror is not None:
-        mirror.begin(_without(fill(join(light), medium.degree), inflow))
-    swept = sweep(medium, scatters, gradient, inflow, directions, mirror)
+        before = fill(join(light), medium.degree)
+        mirror.begin(before if outside is None else before - outside)
+    swept = sweep(medium.grid, medium.extinction.value, emitted, gradient, directions, mirror)
     if mirror is not None:
-        mirror.end(_without(swept, inflow))
+        mirror.end(swept)
     low, high = cut(swept)
+    low = low if outside is None else low + cut(outside)[0]
     return low - light[0] if len(low) == len(light[0]) else add(low, -light[0]), high
 
 
-def _scatter(light: Cut, source: Cut, factors: Tensor) -> Tensor:
-    """p_l phi_k + Q_k (E2.8), [K, C, z, y, x]; moments that one of them lacks are zero there."""
-    parts = list[Tensor]()
-    by_part = cut(by_harmonic(factors, len(factors) - 1))
-    for phi, q, factor in zip(light, source, by_part, strict=True):
+def _scatter(light: Cut, source: Cut, factors: Tensor) -> Cut:
+    """p_l phi_k + Q_k (E2.8); moments that one of them lacks are zero there."""
+    scatters = list[Tensor]()
+    factors_cut = cut(by_harmonic(factors, len(factors) - 1))
+    for phi, q, p in zip(light, source, factors_cut, strict=True):
         few = min(len(phi), len(q))
-        both = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, factor, phi))
-        parts.append(torch.addcmul(*both) if few else phi[:0])
-        parts.append(q[few:] if len(q) > few else factor[few : len(phi)] * phi[few:])
-    parts = [part.expand(-1, *light[0].shape[1:]) for part in parts if len(part)]
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
+        known = (tensor if len(tensor) == few else tensor[:few] for tensor in (q, p, phi))
+        pieces = [torch.addcmul(*known)] if few else []
+        pieces += [q[few:]] if len(q) > few else []
+        pieces += [p[few : len(phi)] * phi[few:]] if len(phi) > few else []
+        scatters.append(torch.cat(pieces) if len(pieces) > 1 else (*pieces, phi[:0])[0])
+    return scatters[0], scatters[1]
 
 
-def _without(light: Tensor, inflow: Tensor | None) -> Tensor:
-    """`light` [K, C, z, y, x] less what enters without a medium."""
-    return light if inflow is None else torch.cat([light[:1] - inflow, light[1:]])
+def emitted_light(medium: Medium, scatters: Cut, inflow: Tensor | None = None) -> Tensor:
+    """The moments [K, C, z, y, x] of E, which cells add to radiance in a unit of length (E2.9).
+
+    That is (1 - f) kappa_s times what `scatters`, less kappa_t `inflow`: light from outside is
+    there without a medium, and what is swept is the rest, I - inflow. So a white furnace is exact.
+    """
+    fields = [medium.remaining.value * moments for moments in scatters if len(moments)]
+    if inflow is not None:
+        mean, first = fields[0][:1], fields[0][1:]
+        fields[:1] = [mean - medium.extinction.value * inflow, first]
+    if len(fields) == 1:
+        return fields[0]
+    # In gray light of a gray medium some moments have fewer colors than what comes from outside.
+    colors = max(field.shape[1] for field in fields)
+    return torch.cat([field.expand(-1, colors, *field.shape[2:]) for field in fields])
 
 
 def steep_gradient(medium: Medium, q: Tensor, directions: int) -> Tensor:
-    """`cell_gradient` of `q` in `medium`, steeper by what makes smooth light diffuse as it should,
-    though it goes on to several cells (E2.16).
+    """By how much (1 - f) kappa_s `q` rises from cell to cell where kappa_s is even (E2.9).
+
+    Steeper than `cell_gradient` by what makes smooth light diffuse as it should, though it goes on
+    to several cells (E2.16).
     """
     gradient = apply_around(cell_gradient, q, medium.grid)
     shares, steps = _spread(medium.grid, directions)
-    extinction = medium.extinction
-    if not any(shares):
-        return gradient
+    extinction, scattering = medium.extinction, medium.remaining
     if is_fused():
         from ddrecon.kernels.cell_function import apply_cell
 
-        scale = extinction.scale.view(1, -1)
-        depths = constant(steps, scale)[:, None] * scale
-        numbers = torch.cat([depths, (2 * constant(shares, scale)[:, None]).expand_as(depths)])
+        depths = constant(steps, extinction.scale)[:, None] * extinction.scale.view(1, -1)
+        twice = constant([2 * share for share in shares], depths)[:, None]
+        rows = depths, twice, scattering.scale.view(1, -1)
+        colors = max(row.shape[1] for row in rows)
+        numbers = torch.cat([row.expand(-1, colors) for row in rows])
         name = "transport/fused/steep.h", "Steep", 3
-        return torch.stack(apply_cell(*name, numbers, extinction.field, *gradient))
+        return torch.stack(
+            apply_cell(*name, numbers, extinction.field, scattering.field, *gradient)
+        )
 
     def steepen() -> Tensor:
         depths = (step * extinction.value for step in steps)
-        return torch.stack(
+        return scattering.value * torch.stack(
             [
                 along * (1 + 2 * share * d * (36 + d * d).sqrt() / (d * d + 0.01))
                 for along, share, d in zip(gradient, shares, depths, strict=True)
@@ -179,8 +182,8 @@ def _spread(grid: Grid, directions: int) -> tuple[list[float], list[float]]:
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
     speed = (points / points.new_tensor(grid.spacing)).abs()
     step = 1 / speed.amax(1)
-    part = step[:, None] * speed
-    over = weights / step @ (part * (1 - part) * points.new_tensor(grid.spacing) ** 2)
+    moved = step[:, None] * speed
+    over = weights / step @ (moved * (1 - moved) * points.new_tensor(grid.spacing) ** 2)
     first, second = (weights * power @ points**2 for power in (step, step**2))
     share = 0.5 * over / first
     return torch.where(share > NEARLY, share, 0.0).tolist(), (second / first).tolist()

@@ -67,7 +67,8 @@ def drive_uncertainty(
     try:
         _experiment(experiments, request.experiments, keep, is_quiet)
     except RanksError as error:
-        raise error.with_advice("what was done is kept: go on with --resume") from error
+        error.advise("what was done is kept: go on with --resume")
+        raise
     # What is left the first rank does by itself.
     leave_ranks()
     seconds = perf_counter() - began

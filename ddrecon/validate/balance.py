@@ -23,7 +23,7 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.ground import UPWARDS, hemisphere, look_up_texels, stay_above
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import add, fill, weigh
+from ddrecon.light.moments import add, cut, fill, weigh
 from ddrecon.light.pairs import ReversedBeam
 from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.refracted import enter_faces
@@ -42,26 +42,26 @@ from ddrecon.settings import RenderSettings
 from ddrecon.transport.bounced import TURNS, follow_inside
 from ddrecon.transport.characteristics import Characteristic, radiance_along
 from ddrecon.transport.rounds import face_mirror
-from ddrecon.transport.sweep import DIRECTIONS, cell_gradient, steep_gradient, sweep_rule
+from ddrecon.transport.sweep import DIRECTIONS, emitted_light, steep_gradient, sweep_rule
 
 FACES = "-z", "+z", "-y", "+y", "-x", "+x"
-"""Of the box, in array order."""
+"""The faces of the box, in array order."""
 SWEEPS = 12
-"""So often light is swept where faces reflect it inside."""
+"""Sweeps of light that faces reflect inside."""
 RAY_BY_RAY = RenderSettings(tolerance=0.0)
 
 
 @torch.no_grad()
 def find_balance(scene: Scene) -> dict[str, Any]:
-    """What power `enters` the box of `scene` of each light, is `absorbed` there, and `leaves`.
+    """The power that `enters` the box of `scene` by each light, is `absorbed` there, and `leaves`
+    by each face, as unscattered and as scattered light.
 
-    By each face, as unscattered and as scattered light. What a ground sends up and what the medium
-    emits enters as well; `into_ground` is what of all that leaves falls on the ground. Where faces
-    refract light, what is `reflected` by them from outside counts as entering, too. `fractions` are
-    the same of all that enters; `defect_percent` is what enters and neither is absorbed nor leaves.
-    Of what repeats it is the balance of one period, whose sides nothing crosses. Of one color each
-    is a number, else a list of three. Raises UsageError where no light enters, or where nobody
-    follows light that is scattered.
+    What a ground sends up and what the medium emits enters as well; `into_ground` is what of all
+    that leaves falls on the ground. Where faces refract light, what is `reflected` by them from
+    outside counts as entering, too. `fractions` are the same of all that enters; `defect_percent`
+    is what enters and neither is absorbed nor leaves. Of a volume that repeats it is the balance of
+    one period, whose sides nothing crosses. Powers are numbers of one color, else lists of three.
+    Raises UsageError where no light enters, or where nobody follows light that is scattered.
     """
     light_field, settings = solve_light(scene, SolveMemory()), scene.diffusion
     medium, lit, received = light_field.medium, light_field.ground, light_field.received.source
@@ -70,7 +70,7 @@ def find_balance(scene: Scene) -> dict[str, Any]:
     # Of light that a forward peak has scattered the light field says that it was not (E8.4).
     as_it_is = refine_medium(keep_medium(scene.volume), settings.times, settings.refine_along)
     box = _Box((medium, as_it_is), DIRECTIONS[settings.angles], lit)
-    crossings = _cross_each(scene, box)
+    crossings = box.cross_each(scene)
     enters = {name: crossing[:2].sum((0, 1, 2)) for name, crossing in crossings.items()}
     if not any(bool((power > 0).any()) for power in enters.values()):
         raise UsageError("lights: none enters the volume, so there is nothing to balance")
@@ -115,19 +115,6 @@ def _plain(value: Any, unit: Tensor) -> Any:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _cross_each(scene: Scene, box: _Box) -> dict[str, Tensor]:
-    """What crosses the `box` of each light of `scene`, of its ground and of its emission."""
-    medium = box.media[0]
-    lights = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
-    crossings = {name: box.cross(sources) for name, sources in lights.items()}
-    if box.lit:
-        ambient = ambient_radiance([*chain(*lights.values())], medium.g).flatten()
-        crossings["ground"] = box.cross_upwards(ambient)
-    if medium.emission is not None:
-        crossings["emission"] = box.cross_out()
-    return crossings
-
-
 @dataclass(frozen=True)
 class _Box:
     """A box with the medium as light is followed in it, and as it is, over the ground `lit`.
@@ -148,12 +135,23 @@ class _Box:
 
     @property
     def areas(self) -> list[float]:
-        """Those of the faces across each axis, 0 where there are none: what repeats has no end."""
+        """Areas of the faces across each axis; 0 along a period, which has none."""
         grid = self.media[0].grid
         sides = enumerate(grid.extent)
         return [(axis not in grid.periodic) * math.prod(grid.extent) / side for axis, side in sides]
 
-    def cross(self, sources: Sequence[Source]) -> Tensor:
+    def cross_each(self, scene: Scene) -> dict[str, Tensor]:
+        """What crosses of each light of `scene`, of its ground and of its emission."""
+        lights = {f"lights.{i}": decompose_lights([light]) for i, light in enumerate(scene.lights)}
+        crossings = {name: self._cross(sources) for name, sources in lights.items()}
+        if self.lit:
+            ambient = ambient_radiance([*chain(*lights.values())], self.media[0].g).flatten()
+            crossings["ground"] = self._cross_upwards(ambient)
+        if self.media[0].emission is not None:
+            crossings["emission"] = self._cross_out()
+        return crossings
+
+    def _cross(self, sources: Sequence[Source]) -> Tensor:
         """What crosses of the `sources` of a light that the ground does not hide."""
         sources = stay_above(sources, self.lit.ground.plane) if self.lit else sources
         crossing = self.media[0].g.new_zeros(4, 2, len(FACES), 1, dtype=torch.float64)
@@ -168,7 +166,7 @@ class _Box:
                 crossing = crossing + self._follow(source)
         return crossing
 
-    def cross_upwards(self, ambient: Tensor) -> Tensor:
+    def _cross_upwards(self, ambient: Tensor) -> Tensor:
         """What crosses of the ground's light: `ambient` light [C], and what that sends more."""
         crossing = self._cross_evenly(ambient, (False, True))
         for direction, angle in zip(*hemisphere(self.up, UPWARDS, 1.0), strict=True):
@@ -176,15 +174,14 @@ class _Box:
             crossing = crossing + self._follow(light, ambient)
         return crossing
 
-    def cross_out(self) -> Tensor:
+    def _cross_out(self) -> Tensor:
         """What crosses of emission; in an empty box it would leave, no matter where."""
         medium = self.media[0]
         emission = average_cells(medium).emitting.remaining.value
         power = 4 * math.pi * math.prod(medium.grid.spacing) * emission.double().sum((1, 2, 3))
         empty = power / (2 * len(FACES))
         even = torch.ones_like(medium.extinction.value)
-        source = even[None], cell_gradient(even)
-        leaving = (self.sweep_out(medium.emitting, *source) for medium in self.media)
+        leaving = (self.sweep_out(medium.emitting, even[None]) for medium in self.media)
         return torch.stack(torch.broadcast_tensors(empty, 0 * empty, *leaving))
 
     def _cross_evenly(self, radiance: Tensor, sides: tuple[bool, bool]) -> Tensor:
@@ -194,10 +191,12 @@ class _Box:
         halves[:, 2 * self.up : 2 * self.up + 2] = torch.eye(2)
         areas = torch.tensor(self.areas, dtype=torch.float64).repeat_interleave(2)
         falling = math.pi * (halves * areas)[..., None].to(radiance.device) * radiance
-        index, source = self.media[0].index, (nothing[None], cell_gradient(nothing))
+        index = self.media[0].index
         empty = falling if index == 1 else transmitted_moments(index)[0] * index**2 * falling
         inflow = index**2 * radiance.view(-1, 1, 1, 1)
-        leaving = (empty + self.sweep_out(medium, *source, inflow) for medium in self.media)
+        leaving = (
+            empty + self.sweep_out(medium, nothing[None], None, inflow) for medium in self.media
+        )
         crossing = torch.stack(torch.broadcast_tensors(empty, falling - empty, *leaving))
         return crossing * crossing.new_tensor(sides).view(2, 1, 1)
 
@@ -254,17 +253,20 @@ class _Box:
         self,
         medium: Medium,
         source: Tensor,
-        rise: Tensor,
+        gradient: Tensor | None = None,
         inflow: Tensor | None = None,
         light: Tensor | None = None,
     ) -> Tensor:
         """The power that leaves in one sweep of light that `source` phi scatters in `medium`.
 
-        `rise` is `cell_gradient` of what scatters. With `inflow` it is less what that would be in
-        an empty box. Where faces reflect light inside, it is swept until that has come to rest,
-        from `light` on, None for none.
+        `gradient` is `steep_gradient` of what scatters, None for zero. With `inflow` it is less
+        what that would be in an empty box. Light that faces reflect inside is swept until it has
+        come to rest, from `light` on, None for none.
         """
-        grid, moments, cells = medium.grid, fill(source, medium.degree), average_cells(medium)
+        grid, cells = medium.grid, average_cells(medium)
+        extinction, moments = cells.extinction.value, fill(source, medium.degree)
+        moments = emitted_light(cells, cut(moments), inflow)
+        gradient = torch.zeros_like(moments[:1]) if gradient is None else gradient
         courses, weights, values = sweep_rule(self.directions, len(moments))
         mirror, rows = face_mirror(medium, self.directions), values.to(moments)
         begun = 0 * moments if light is None else fill(light, medium.degree)
@@ -273,16 +275,15 @@ class _Box:
                 mirror.begin(begun if sweep == 0 else None)
             power = moments.new_zeros(2, len(FACES), 1, dtype=torch.float64)
             for number, (direction, weight) in enumerate(zip(courses, weights, strict=True)):
-                scatters = torch.tensordot(rows[number], moments, 1)
+                emitted = torch.tensordot(rows[number], moments, 1)
                 ends = None if mirror is None else mirror.entering(number)
-                _, out = radiance_along(cells, scatters, rise, inflow, direction, ends)
+                fields = extinction, emitted, gradient.expand(3, *emitted.shape)
+                _, out = radiance_along(grid, *fields, direction, ends)
                 if mirror is not None:
                     mirror.left.append(out)
                     out = mirror.released(number)
-                course, gone = (
-                    Characteristic.of(grid, direction),
-                    power.new_zeros(6, out[0].shape[-3]),
-                )
+                gone = power.new_zeros(len(FACES), out[0].shape[-3])
+                course = Characteristic.of(grid, direction)
                 scale = 4 * math.pi * weight * math.prod(grid.spacing) / course.step
                 for place, (axis, layer) in enumerate(zip(course.axes, out, strict=True)):
                     moved, across = course.moved[axis], [d for d in range(3) if d != bool(place)]
@@ -318,14 +319,14 @@ def lines(report: dict[str, Any]) -> list[str]:
     def text(value: float | list[float], form: str) -> str:
         return ", ".join(format(number, form) for number in torch.tensor(value).view(-1).tolist())
 
-    parts = report["fractions"]
-    told = [f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()]
-    if "reflected" in parts:
-        told.append(f"reflected from outside: {text(parts['reflected'], '.2%')}")
-    told.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(parts['absorbed'], '.2%')})")
-    for face, part in parts["leaves"].items():
-        straight, scattered = (text(part[key], ".2%") for key in ("unscattered", "scattered"))
-        told.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
-    if "into_ground" in parts:
-        told.append(f"into the ground: {text(parts['into_ground'], '.2%')}")
-    return [*told, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]
+    shares = report["fractions"]
+    texts = [f"enters by {name}: {text(power, '.4g')}" for name, power in report["enters"].items()]
+    if "reflected" in shares:
+        texts.append(f"reflected from outside: {text(shares['reflected'], '.2%')}")
+    texts.append(f"absorbed: {text(report['absorbed'], '.4g')} ({text(shares['absorbed'], '.2%')})")
+    for face, leaving in shares["leaves"].items():
+        straight, scattered = (text(leaving[key], ".2%") for key in ("unscattered", "scattered"))
+        texts.append(f"leaves by {face}: unscattered {straight}, scattered {scattered}")
+    if "into_ground" in shares:
+        texts.append(f"into the ground: {text(shares['into_ground'], '.2%')}")
+    return [*texts, f"neither absorbed nor left: {text(report['defect_percent'], '.2g')} %"]

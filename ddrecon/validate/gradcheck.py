@@ -2,11 +2,6 @@
 
 Everything runs in float64 with solves to nearly its precision, for every parameter alone and for
 all of them at once.
-
-Where the scene's density is the same everywhere, and above all where it is empty, the check is made
-at a random density, half of whose cells are empty: an empty volume would hide all but density from
-the camera. What moves rays or beams is moved a little at random: along the axes of the lattice they
-meet centers of cells, where interpolation has a slope to each side, and differences a mean of both.
 """
 
 from __future__ import annotations
@@ -39,18 +34,22 @@ from ddrecon.variables.values import (
     with_values,
 )
 
+TOLERANCE = 1e-13
+"""Relative residual of the solves."""
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
 CLOSE = 1e-8
-"""Where differences agree so closely, no shorter step is tried."""
+"""The error of a difference below which no shorter step is tried."""
 NEGLIGIBLE = 1e-6
 """Errors are relative to the derivative they are of, or to this part of the parameter's largest
 where that is more. What the last digits of the loss can make is no error.
 """
 SHORTER, MORE = 0.1, 3
-"""Where no step agrees, so many more are tried, each shorter than the last by this factor."""
+"""Factor from step to step, and how many more are tried where no step agrees."""
 TOGETHER = "all at once"
 """What the check of all parameters together is called."""
+
+TINY = torch.finfo(torch.float64).tiny
 
 Values = Mapping[str, Tensor]
 Loss = Callable[[Values], Tensor]
@@ -60,9 +59,9 @@ Loss = Callable[[Values], Tensor]
 class EntryCheck:
     """The derivative by one entry of a parameter, or along a random direction in it.
 
-    `adjoint` is the derivative by reverse mode, `difference` that by central differences with
-    `step`, and `error` their relative difference. Of several steps it is the one that agrees best:
-    larger ones suffer from truncation, smaller ones from rounding.
+    `adjoint`: by reverse mode; `difference`: by central differences with the `step` that agrees
+    best (larger ones suffer from truncation, smaller ones from rounding); `error`: their relative
+    difference.
     """
 
     entry: str
@@ -130,10 +129,12 @@ def check_parameters(
     """
     known = variable_names(scene)
     if unknown := [name for name in names if name not in known]:
-        lines = [
-            f"{name}: the scene has no such number{suggestion(name, known)}" for name in unknown
-        ]
-        raise UsageError([f"--parameter {line}" for line in lines])
+        raise UsageError(
+            [
+                f"--parameter {name}: the scene has no such number{suggestion(name, known)}"
+                for name in unknown
+            ]
+        )
     optimized = scene.optimize.parameters if scene.optimize else density_names(scene)
     names, generator = tuple(dict.fromkeys(names or optimized)), torch.Generator().manual_seed(seed)
     point = starting_point(scene, names, generator)
@@ -175,18 +176,24 @@ def _check(
     first = next(iter(steps.values()))
     shares = [step / first[0] for step in first]
     adjoint = float(sum((bar * direction[name]).sum() for name, (_, bar) in parameters.items()))
-    along = _check_along(loss, values, direction, adjoint, shares, 0.0)
-    entries = [EntryCheck("a random direction", None, adjoint, *along)]
+
+    def at(along: Values, step: float) -> float:
+        moved = {name: values[name] + step * change for name, change in along.items()}
+        with torch.no_grad():
+            return float(loss(moved))
+
+    compared = _compare(functools.partial(at, direction), adjoint, shares, 0.0)
+    entries = [EntryCheck("a random direction", None, adjoint, *compared)]
     for name, (value, bar) in parameters.items() if samples else ():
         floor = NEGLIGIBLE * float(bar.abs().max())
         for index in pick_entries(name, value, samples, generator):
             unit = torch.zeros_like(value)
             unit.view(-1)[index] = 1
-            slope, at = float(bar.flatten()[index]), float(value.flatten()[index])
-            numbers = _check_along(loss, values, {name: unit}, slope, steps[name], floor)
-            entries.append(EntryCheck(entry_name(name, value, index), at, slope, *numbers))
+            slope, number = float(bar.flatten()[index]), float(value.flatten()[index])
+            compared = _compare(functools.partial(at, {name: unit}), slope, steps[name], floor)
+            entries.append(EntryCheck(entry_name(name, value, index), number, slope, *compared))
     tangent = _tangent(loss, values, direction)
-    error = abs(tangent - adjoint) / max(abs(adjoint), torch.finfo(torch.float64).tiny)
+    error = abs(tangent - adjoint) / max(abs(adjoint), TINY)
     return GradientCheck(label, tangent, error, tuple(entries))
 
 
@@ -200,19 +207,16 @@ def _tangent(loss: Loss, values: Values, direction: Values) -> float:
     return 0.0 if tangent is None else float(tangent)
 
 
-def _check_along(
-    loss: Loss,
-    values: Values,
-    direction: Values,
-    adjoint: float,
-    steps: Sequence[float],
-    floor: float,
+def _compare(
+    at: Callable[[float], float], adjoint: float, steps: Sequence[float], floor: float
 ) -> tuple[float, float, float]:
-    """The difference along `direction` that agrees best, its step and its relative error.
+    """The central difference of `at` that agrees best, its step and its relative error.
 
-    Where none of `steps` agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all
-    of the usual ones may be too long. What rounding makes of those is no excuse. Errors are
-    relative to at least `floor`, and infinite where a difference is not a number.
+    It is of fourth order: f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h. Each of the 18 values
+    that this adds, counted by weight, may be off by one unit in the last place. Where none of
+    `steps` agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the usual
+    ones may be too long. What rounding makes of those is no excuse. Errors are relative to at least
+    `floor`, and infinite where a difference is not a number.
     """
     tried = list[tuple[float, float, float]]()
     shorter = [steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
@@ -222,34 +226,16 @@ def _check_along(
             break
         # A step that leaves what is physical may have no solution.
         with contextlib.suppress(SolveError):
-            difference, rounding = _difference(loss, values, direction, step)
+            ahead, back, far_ahead, far_back = (at(times * step) for times in (1, -1, 2, -2))
+            difference = (8 * (ahead - back) - (far_ahead - far_back)) / (12 * step)
+            largest = max(map(abs, (ahead, back, far_ahead, far_back)))
+            rounding = 18 * torch.finfo(torch.float64).eps * largest / (12 * step)
             allowed = rounding / AGREE_DIFFERENCES if is_usual else 0.0
-            sizes = abs(difference), abs(adjoint), floor, allowed, torch.finfo(torch.float64).tiny
-            error = abs(difference - adjoint) / max(sizes)
+            scale = max(abs(difference), abs(adjoint), floor, allowed, TINY)
+            error = abs(difference - adjoint) / scale
         tried.append((error if math.isfinite(error) else math.inf, step, difference))
     error, step, difference = min(tried)
     return difference, step, error
-
-
-def _difference(loss: Loss, values: Values, direction: Values, step: float) -> tuple[float, float]:
-    """The central difference of fourth order along `direction`, and the error of its rounding.
-
-    f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h; each of the 18 values that this adds, counted
-    by weight, may be off by one unit in the last place.
-    """
-
-    def shifted(steps: int) -> float:
-        moved = {name: values[name] + steps * step * way for name, way in direction.items()}
-        with torch.no_grad():
-            return float(loss(moved))
-
-    near, far = (shifted(1), shifted(-1)), (shifted(2), shifted(-2))
-    rounding = 18 * torch.finfo(torch.float64).eps * max(map(abs, (*near, *far)))
-    return (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * step), rounding / (12 * step)
-
-
-TOLERANCE = 1e-13
-"""Relative residual of the solves."""
 
 
 def starting_point(
@@ -257,9 +243,10 @@ def starting_point(
 ) -> dict[str, Tensor]:
     """The value of each optimized parameter, of each of `names`, and of density.
 
-    What moves rays or beams is changed by a random part of the variable's rate.
     Density is the scene's own; where that is the same everywhere, what it starts from; where that
-    is, too, random numbers of which half are empty.
+    is, too, random numbers of which half are empty: a volume without any hides all else. What moves
+    rays or beams is moved by a random share of the variable's rate: along the lattice rays meet
+    centers of cells, where interpolation has a slope to each side, and differences a mean of both.
     """
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
@@ -281,13 +268,10 @@ def starting_point(
     return point
 
 
-def loss_at(
-    scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator
-) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """The image loss of `scene` (float64), that it asks for or `l2`, as a function of parameters.
+def loss_at(scene: Scene, point: Values, generator: torch.Generator) -> Loss:
+    """The image loss of `scene` (float64), its own or `l2`, by parameters; others as in `point`.
 
-    The others are as in `point`. Targets are the images of the views that have them, else random
-    ones.
+    Targets are the images of the views that have them, else random ones.
     """
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
     kind = (scene.optimize.loss if scene.optimize else None) or "l2"
@@ -302,7 +286,7 @@ def loss_at(
     def light_at_point() -> LightField:
         return solve_light(with_values(exact, point), memory)
 
-    def loss(values: Mapping[str, Tensor]) -> Tensor:
+    def loss(values: Values) -> Tensor:
         changed = with_values(exact, {**point, **values})
         is_of_views = all(name.startswith("views.") for name in values)
         light = light_at_point() if is_of_views else solve_light(changed, memory)
@@ -326,14 +310,9 @@ def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Genera
 
 
 def entry_name(name: str, value: Tensor, index: int) -> str:
-    """What a user calls the entry at flat `index`, with its color.
-
-    It is a component, a cell (x, y, z) or a pixel (x, y).
-    """
+    """What a user calls the entry at flat `index`: a component, cell (x, y, z) or pixel (x, y)."""
     # The last axis of a tensor is x, and its first, if there is such, is that of colors.
-    place = [
-        int(number) for number in reversed(torch.unravel_index(torch.tensor(index), value.shape))
-    ]
+    place = [int(n) for n in reversed(torch.unravel_index(torch.tensor(index), value.shape))]
     components = component_names(name, value)
     color = f"{components[place.pop()]} " if components else ""
     if not components and value.ndim in (1, 4):

@@ -1,8 +1,8 @@
 """Small scenes at the edges of what is allowed, run and judged: `CASES` is the table.
 
-Scenes are written in double precision and rounded once, as the scene loader does it; shapes and
-sides are in array order (z, y, x). Results must be finite, the same in single and double precision,
-solved as far as rounding allows, lose no light and have no radiance below zero.
+Scenes are written in double precision and rounded once, as by the loader. Results must be finite,
+the same in single and double precision, solved as far as rounding allows, lose no light and have no
+radiance below zero.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.operator import AXES, boundary_loss, face_fluxes
+from ddrecon.diffusion.operator import boundary_loss
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.light.moments import cut, flux_along_axes, mean_and_first
+from ddrecon.light.moments import cut
 from ddrecon.light.reduced import ambient_radiance, receive_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import Volume, scale_medium
@@ -59,10 +59,8 @@ def layer(shape: Shape) -> Tensor:
 class HardCase:
     """A scene in words: a medium in a box about the origin, a sun, and a camera.
 
-    The box has `shape` cells and `sides` [u].
-
-    `depth`: optical depth of a cell of density 1 along its shortest side. `travel`, `eye` and
-    `target` are (x, y, z).
+    The box has `shape` cells and `sides` [u], in array order; `depth`: optical depth of a cell of
+    density 1 along its shortest side. `travel`, `eye` and `target` are (x, y, z).
     """
 
     density: Callable[[Shape], Tensor] = ball
@@ -212,9 +210,8 @@ class HardResult:
         failures = self.failures()
         verdict = f"FAIL: {', '.join(failures)}" if failures else "pass"
         numbers = [] if self.error else [f"{getattr(self, name):>14.1e}" for name in NUMBERS]
-        return " | ".join(
-            [f"| {self.case:<41}", f"{self.iterations:>10}", *numbers, f"{verdict} |"]
-        )
+        cells = [f"| {self.case:<41}", f"{self.iterations:>10}", *numbers, f"{verdict} |"]
+        return " | ".join(cells)
 
 
 NUMBERS = tuple(field.name for field in fields(HardResult))[3:]
@@ -236,16 +233,13 @@ def run_case(name: str, case: HardCase, device: torch.device) -> HardResult:
         return HardResult(name, str(error))
     return HardResult(
         name,
-        "",
-        iterations,
-        balance.residual,
-        balance.attainable,
-        relative_error(image, exact),
-        relative_error(gradient, exact_gradient),
-        float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
-        balance.energy,
-        exact_balance.energy,
-        case.depth * max(case.shape),
+        iterations=iterations,
+        **asdict(balance),
+        image_error=relative_error(image, exact),
+        gradient_error=relative_error(gradient, exact_gradient),
+        lowest=float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
+        energy_double=exact_balance.energy,
+        depth=case.depth * max(case.shape),
     )
 
 
@@ -253,7 +247,8 @@ def table(results: Sequence[HardResult]) -> list[str]:
     """The results as a table, and how many cases failed."""
     names = [f"{name.replace('_', ' '):>14}" for name in NUMBERS]
     header = " | ".join([f"| {'case':<41}", "iterations", *names, "verdict |"])
-    verdict = f"{len(results)} cases, {sum(bool(each.failures()) for each in results)} failed"
+    failed = sum(bool(result.failures()) for result in results)
+    verdict = f"{len(results)} cases, {failed} failed"
     rule = "|" + "---|" * (header.count("|") - 1)
     return [header, rule, *(result.row() for result in results), verdict]
 
@@ -281,21 +276,18 @@ def _render(
     return image.detach(), gradient, iterations, balance
 
 
-def relative_error(found: Tensor, exact: Tensor) -> float:
-    """The relative RMS error of `found`, absolute where `exact`, of float64, is zero."""
+def relative_error(rounded: Tensor, exact: Tensor) -> float:
+    """The relative RMS error of `rounded`, absolute where `exact`, of float64, is zero."""
     size = exact.norm()
-    return float((found.double() - exact).norm() / torch.where(size > 0, size, 1))
+    return float((rounded.double() - exact).norm() / torch.where(size > 0, size, 1))
 
 
 @dataclass(frozen=True)
 class Balance:
     """How far a solution is from balance (E2.4, E2.6, E2.7); all are 0 where there is no source.
 
-    Iterations update their residual rather than compute it, so that rounding hides from them; here
-    it is b - A u itself.
-
-    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by;
-    `attainable`: what rounding u makes of it;
+    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by, of b - A u
+    itself, which iterations update rather than compute; `attainable`: what rounding u makes of it;
     `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
     """
 
@@ -319,29 +311,14 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     operator, right = problem.system
     if not right.any():
         return Balance()
-    # What Q1 takes out of one cell it brings to the next, so it is no part of what is injected.
     escape = boundary_loss(problem.diffusion, grid)
     injected = medium.remaining_scattering * problem.source[0] + escape * problem.outside
-    total = injected.double().sum()
-    absorbed = (medium.absorption.value.double() * solution.double()).sum()
-    energy = float((total - (absorbed + _leak(problem, solution))).abs() / total)
+    # b sums to what is injected less what Q1 drives out of the box; between cells Q1 only moves.
+    lost = (medium.absorption.value.double() + escape.double()) * solution.double()
+    energy = float((right.double() - lost).sum().abs() / injected.double().sum())
     scale = operator.diagonal.rsqrt()
     size = (scale * right).norm()
     residual = float((scale * (right - operator.apply(solution))).norm() / size)
     # What rounding every entry of the solution by one unit in the last adds to it.
     rounding = torch.finfo(solution.dtype).eps * (scale * operator.diagonal * solution).norm()
     return Balance(residual, float(rounding / size), energy)
-
-
-def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
-    """What flows out through the faces of the box (E2.6), as for dark surroundings."""
-    grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
-    leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
-    _, first = mean_and_first(problem.source)
-    fluxes = [None] * 3 if first is None else flux_along_axes(first)
-    for axis, flux in zip(AXES, fluxes, strict=True):
-        scattered = None if flux is None else scattering * flux
-        faces = face_fluxes(solution, scattered, problem.diffusion, grid, axis).double()
-        outflow = (faces.select(axis, -1) - faces.select(axis, 0)).sum()
-        leaked = leaked + outflow / grid.spacing[axis - 1]
-    return leaked

@@ -46,15 +46,15 @@ def require_range(name: str, value: Tensor) -> None:
     """Raises UsageError where `value` is not finite, or out of range for the variable `name`."""
     kind = kind_of(name)
     least, most = (float(end) for end in value.detach().aminmax())
-    found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
+    range_found = f"found {least:g}" if least == most else f"found {least:g} to {most:g}"
     if not math.isfinite(least + most):
-        raise UsageError(f"{name}: must be finite, {found}")
+        raise UsageError(f"{name}: must be finite, {range_found}")
     if kind.high == STEEPEST_G and not -1 < least <= most < 1:
         # A scene may scatter further forward than a run makes it.
-        raise UsageError(f"{name}: must be above -1 and below 1, {found}")
+        raise UsageError(f"{name}: must be above -1 and below 1, {range_found}")
     if kind.high != STEEPEST_G and not kind.low <= least <= most <= kind.high:
         bounds = f"at least {kind.low:g}" if kind.high == math.inf else f"from 0 to {kind.high:g}"
-        raise UsageError(f"{name}: must be {bounds}, {found}")
+        raise UsageError(f"{name}: must be {bounds}, {range_found}")
     if kind.is_direction and least == most == 0:
         raise UsageError(f"{name}: must not be zero")
 

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
     from ddrecon.scene import Scene, View
 
 Rate = Callable[["Scene", str, "Tensor"], "float | Tensor"]
-"""The rate of a variable by the scene, the variable's name and the value that it starts from.
-
-It is one number, or one for each entry of the value.
-"""
+"""The rate of a variable, or of each entry, by the scene, its name and its value at the start."""
 
 DENSITY_STEP = 1.7
 """Optical depth that one step may lay across the box's shortest side."""
@@ -45,12 +42,10 @@ OFFSET_STEP = 0.01
 RELATIVE_STEP = 0.1
 """Change, in one step, of a quantity as a part of its mean, or of the box's shortest side."""
 LONG_STEPS = (1e-2, 1e-3, 1e-4)
-"""Changes by which finite differences are taken, as parts of the variable's largest value."""
+"""Changes for finite differences, as parts of the variable's largest value."""
 SHORT_STEPS = (1e-4, 1e-5, 1e-6)
-"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a
-short step crosses few, and for g, whose delta-Eddington scaling has a second derivative that jumps
-at 0.
-"""
+"""The same for what moves rays or beams, since interpolation has a kink at every cell center, and
+for g, whose delta-Eddington scaling has a second derivative that jumps at 0."""
 STEEPEST_G = 0.99
 """Beyond this mean cosine of scattering the phase function is all peak."""
 XYZ = ("x", "y", "z")
@@ -90,10 +85,9 @@ def offset_rate(scene: Scene, name: str, start: Tensor) -> float:
 def unit_of(scene: Scene, name: str) -> float:
     """The density, or cross section, of an optical depth of 1 across the box's shortest side.
 
-    `name` is the variable's: a density counts by the mean extinction of its own medium, where there
-    is any, a cross section by the largest density of its own, or by `SOUGHT_DEPTH` where that is
-    empty. 1 where neither is known, and for other variables. An emission counts by the pictures'
-    brightness.
+    A density counts by the mean extinction of the medium of `name`, where there is any, a cross
+    section by the largest density, or by `SOUGHT_DEPTH` where that is empty, an emission by the
+    pictures' brightness; 1 where that is not known, and for other variables.
     """
     volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
     if volume.media is not None and name.startswith("media."):
@@ -110,15 +104,20 @@ def unit_of(scene: Scene, name: str) -> float:
 
 
 def shown_emission(scene: Scene) -> float:
-    """The emission [radiance/u] that looks as bright as the pictures do, across the shortest side.
+    """The emission [radiance/u] that looks as bright as the pictures, across the shortest side.
 
-    That is the mean of the training views' pictures, weighted by themselves, so that black around
-    what shines does not count; 1 where there are none.
+    Pictures of training views are weighted by themselves: black around what shines does not count.
+    It is 1 where there are none.
     """
     shown = [view.seen for view in scene.views if view.image is not None and not view.is_test]
     total = sum(float(image.mean()) for image in shown)
     squares = sum(float(image.square().mean()) for image in shown)
     return (squares / total if total > 0 else 1.0) / _side(scene)
+
+
+def side_rate(scene: Scene, name: str, start: Tensor) -> float:
+    """A part of the box's shortest side [u]."""
+    return RELATIVE_STEP * _side(scene)
 
 
 def fixed_rate(rate: float) -> Rate:
@@ -144,9 +143,8 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components`:
     names of a vector's entries, which change one at a time. `is_direction`: only where a vector
     points matters, and a step keeps its length. `tv`: the default weight of total variation, of
-    `is_compressed` kinds that of the logarithm (E11.3); it is `alone` times as much where no other
-    field is sought, since it then only suppresses noise. `difference_steps`: those of finite
-    differences.
+    `is_compressed` kinds that of the logarithm (E11.3), times `alone` where no other field is
+    sought and it only suppresses noise. `difference_steps`: those of finite differences.
     """
 
     rate: Rate
@@ -161,12 +159,21 @@ class Kind:
     is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
 
+    @property
+    def limits(self) -> str:
+        """Within what values are kept, in words."""
+        return f"at least {self.low:g} and at most {self.high:g}"
+
+    def allows(self, values: Tensor) -> bool:
+        """Whether all `values` are within the limits."""
+        return bool(((values >= self.low) & (values <= self.high)).all())
+
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
+_SHARE = Kind(fixed_rate(0.02), low=0, high=1, is_color=True)
 _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
-_LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -189,10 +196,10 @@ KINDS: Mapping[str, Kind] = {
         alone=3.0,
         is_compressed=True,
     ),
-    "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
+    "albedo": replace(_SHARE, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": _MEAN_COSINE,
-    "phase.weight": _LOBE_WEIGHT,
+    "phase.weight": replace(_SHARE, is_cellwise=True, rate=fixed_rate(0.05)),
     # of one of two media: the weight of their blend differs from cell to cell, and no other number
     "media.NAME.g": _MEAN_COSINE,
     "lights.N.irradiance": _BRIGHTNESS,
@@ -209,17 +216,9 @@ KINDS: Mapping[str, Kind] = {
         is_direction=True,
         difference_steps=SHORT_STEPS,
     ),
-    "lights.N.position": Kind(
-        lambda scene, name, start: RELATIVE_STEP * _side(scene),
-        components=XYZ,
-        difference_steps=SHORT_STEPS,
-    ),
-    "ground.albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True),
-    "lights.N.radius": Kind(
-        lambda scene, name, start: RELATIVE_STEP * _side(scene),
-        low=0,
-        difference_steps=SHORT_STEPS,
-    ),
+    "lights.N.position": Kind(side_rate, components=XYZ, difference_steps=SHORT_STEPS),
+    "ground.albedo": _SHARE,
+    "lights.N.radius": Kind(side_rate, low=0, difference_steps=SHORT_STEPS),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
         pose_rate,

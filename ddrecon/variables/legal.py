@@ -16,7 +16,7 @@ from ddrecon.scene import Scene, View
 from ddrecon.settings import LENSES
 from ddrecon.variables.forms import require_form, require_range, require_shape
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, RESPONSE, split_name
-from ddrecon.variables.values import volume_names, volume_value
+from ddrecon.variables.values import stored_value, variable_names
 
 RIGID = 0.01
 """How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
@@ -42,8 +42,8 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
     faults = faults_of(scene)
     if view is not None:
         faults = chain(faults_of(scene, keys=KEYS), faults_of(views[0], f"views.{view}"))
-    for key, what in faults:
-        raise UsageError(f"{key}: {what}")
+    for key, fault in faults:
+        raise UsageError(f"{key}: {fault}")
     cells, density = scene.volume.grid.shape, scene.volume.density
     if density.is_meta:
         raise UsageError("density: has no numbers on the device meta")
@@ -59,14 +59,10 @@ def require_legal(scene: Scene, view: str | None = None) -> None:
 def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
     """All that can be varied of `scene` and its `views`, by name, as it is stored."""
     numbers: dict[str, object] = {
-        name: volume_value(scene.volume, name)
-        for name in volume_names(scene.volume)
-        if split_name(name)[1] not in EXTINCTION_AND_ALBEDO
+        name: stored_value(scene, name)
+        for name in variable_names(scene)
+        if not name.startswith("views.") and split_name(name)[1] not in EXTINCTION_AND_ALBEDO
     }
-    for index, light in enumerate(scene.lights):
-        numbers |= {f"lights.{index}.{key}": value for key, value in vars(light).items()}
-    if scene.ground is not None:
-        numbers["ground.albedo"] = scene.ground.albedo
     for view in views:
         camera, owner = view.camera, f"views.{view.name}."
         numbers |= {owner + key: getattr(view, key) for key in RESPONSE}
@@ -81,11 +77,11 @@ def _require_view(view: View) -> None:
     pose, half, size = camera.pose, torch.as_tensor(camera.half_width).detach(), camera.size
     require_shape(f"{owner}camera.pose", pose, (3, 4))
     if half.is_cpu and not 0 < float(half) < math.inf:
-        what = "half_width, 1 / (2 focal), must be above 0 and finite"
-        raise UsageError(f"{owner}camera: {what}, found {float(half):g}")
+        rule = "half_width, 1 / (2 focal), must be above 0 and finite"
+        raise UsageError(f"{owner}camera: {rule}, found {float(half):g}")
     if pose.is_cpu and not _is_rigid(pose.detach()):
-        what = "the first three columns of its pose must be of unit length and perpendicular"
-        raise UsageError(f"{owner}camera: {what}, and not mirror")
+        rule = "the first three columns of its pose must be of unit length and perpendicular"
+        raise UsageError(f"{owner}camera: {rule}, and not mirror")
     if (lens is None) != (camera.distortion is None):
         raise UsageError(f"{owner}camera: give both lens and distortion, or neither")
     if lens is not None:

@@ -1,9 +1,7 @@
-"""Derivative images: how every pixel changes with one number of the scene.
+"""Derivative images: how every pixel changes with one number of the scene (docs/theory.md E3.1).
 
-They solve the differential diffusion equation (docs/theory.md E3.1).
-
-One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
-in every cell.
+One forward-mode pass renders image and derivative together; a field changes by one unit in every
+cell.
 """
 
 from __future__ import annotations
@@ -22,9 +20,7 @@ from ddrecon.variables.values import component_names, value_of, variable_names, 
 
 
 def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
-    """The variable that `name` belongs to, and its change by one unit of what `name` names.
-
-    The change has the shape of the variable's value.
+    """The variable of `name`, and its change, of its value's shape, by one unit of `name`.
 
     `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
     or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
@@ -33,8 +29,8 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
     if name in variable_names(scene):
         value = value_of(scene, name)
         if components := kind_of(name).components:
-            parts = ", ".join(f"{name}.{component}" for component in components)
-            raise UsageError(f"{name} changes by component: {parts}")
+            names = ", ".join(f"{name}.{component}" for component in components)
+            raise UsageError(f"{name} changes by component: {names}")
         return name, torch.ones_like(value)
     owner, _, component = name.rpartition(".")
     if owner in variable_names(scene):
@@ -49,10 +45,9 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
 
 @contextmanager
 def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
-    """`scene` with `name`, as for `variation`, as a dual number, while the block lasts.
+    """`scene` in which `name`, as for `variation`, is a dual number while the block lasts, if any.
 
-    What is rendered of it has its derivative as a tangent. With None, `scene` itself. Raises
-    UsageError.
+    Images of it have their derivative as a tangent. Raises UsageError.
     """
     if name is None:
         yield scene

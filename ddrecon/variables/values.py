@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
+from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import remix
@@ -41,9 +42,10 @@ Settings = TypeVar("Settings")
 def variable_names(scene: Scene) -> list[str]:
     """The name of every variable of `scene`."""
     lights = [
-        f"lights.{index}.{name}"
+        f"lights.{index}.{key}"
         for index, light in enumerate(scene.lights)
-        for name in _tensors(light)
+        for key, value in vars(light).items()
+        if isinstance(value, Tensor)
     ]
     views = [f"views.{view.name}.{key}" for view in scene.views for key in _view_keys(view)]
     ground = [] if scene.ground is None else ["ground.albedo"]
@@ -70,20 +72,25 @@ def value_of(scene: Scene, name: str) -> Tensor:
     `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
     [1] or [3].
     """
-    if (known := _stored_name(scene.volume, name)) not in variable_names(scene):
+    stored = _stored_name(scene.volume, name)
+    if stored not in variable_names(scene):
         raise _unknown(scene, name)
-    if is_of_volume(known):
-        return volume_value(scene.volume, known)
-    if known == "ground.albedo":
+    return stored_value(scene, stored)
+
+
+def stored_value(scene: Scene, name: str) -> Tensor:
+    """The value of `name`, one of `variable_names(scene)`."""
+    section, _, path = name.partition(".")
+    owner, _, key = path.rpartition(".")
+    if section == "lights":
+        value: Tensor = getattr(scene.lights[int(owner)], key)
+        return value
+    if section == "views":
+        return _view_value(scene.view(owner), key)
+    if section == "ground":
         assert scene.ground is not None
         return scene.ground.albedo
-    section, _, path = name.partition(".")
-    if section == "views":
-        view, _, key = path.rpartition(".")
-        return _view_value(scene.view(view), key)
-    index, _, attribute = path.partition(".")
-    value: Tensor = getattr(scene.lights[int(index)], attribute)
-    return value
+    return volume_value(scene.volume, name)
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
@@ -95,30 +102,35 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     Raises UsageError for a name that is none, and for another shape, precision or device than the
     scene's.
     """
-    values = {_stored_name(scene.volume, name): value for name, value in values.items()}
-    known = variable_names(scene)
-    unknown = [name for name in values if name not in known]
-    if unknown:
-        raise _unknown(scene, unknown[0])
-    lights = [
-        _replace_light(light, f"lights.{index}.", values, scene)
+    named, known = dict[str, Tensor](), {*variable_names(scene)}
+    for name, value in values.items():
+        stored = _stored_name(scene.volume, name)
+        if stored not in known:
+            raise _unknown(scene, name)
+        owner, last = split_name(stored)
+        if last == "density" and isinstance(value, Tensor) and value.ndim == 0:
+            value = value.expand(scene.volume.grid.shape)
+        like = owner + "sigma_a" if last in EXTINCTION_AND_ALBEDO else stored
+        before = stored_value(scene, like)
+        require_form(stored, value, before, scene.volume.density, scene.volume.grid.shape)
+        named[stored] = value
+    of_volume = {name: value for name, value in named.items() if is_of_volume(name)}
+    lights: list[Light] = [
+        replace(light, **_within(f"lights.{index}.", named))  # type: ignore[arg-type]
         for index, light in enumerate(scene.lights)
     ]
-    views = [_replace_view(view, values, scene) for view in scene.views]
-    volume = _replace_volume(
-        scene.volume, {name: value for name, value in values.items() if is_of_volume(name)}
-    )
-    ground, albedo = scene.ground, values.get("ground.albedo")
-    if ground is not None and albedo is not None:
-        require_form("ground.albedo", albedo, ground.albedo, scene.volume.density, ())
-        ground = replace(ground, albedo=albedo)
+    ground = scene.ground
+    if ground is not None and "ground.albedo" in named:
+        ground = replace(ground, albedo=named["ground.albedo"])
+    views = [_replace_view(view, named, scene.volume.grid.center_xyz) for view in scene.views]
+    volume = _replace_volume(scene.volume, of_volume)
     return replace(scene, volume=volume, lights=lights, views=views, ground=ground)
 
 
 def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict[str, Settings]:
     """`parameters` with each name of all training views replaced by those of each of `views`.
 
-    These are the views to train on that have an image. What a view's own name says wins.
+    Views count that have an image and are not held out. What a view's own name says wins.
     """
     train = [view.name for view in views if view.image is not None and not view.is_test]
     named: dict[str, Settings] = {}
@@ -126,8 +138,8 @@ def name_each(parameters: Mapping[str, Settings], views: Sequence[View]) -> dict
         if not name.startswith(EVERY):
             named[name] = settings
             continue
-        key = name.removeprefix(EVERY)
-        for owner in (f"views.{view}.{key}" for view in train):
+        for view in train:
+            owner = f"views.{view}.{name.removeprefix(EVERY)}"
             named[owner] = parameters.get(owner, settings)
     return named
 
@@ -182,10 +194,6 @@ def _same_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def _tensors(light: Light) -> list[str]:
-    return [key.name for key in fields(light) if isinstance(getattr(light, key.name), Tensor)]
-
-
 def volume_names(volume: Volume) -> list[str]:
     """The variables of `volume`: its phase function has its own numbers, or g alone."""
     if volume.media is not None:
@@ -210,8 +218,8 @@ def _stored_name(volume: Volume, name: str) -> str:
 def volume_value(volume: Volume, name: str) -> Tensor:
     """The value of the variable `name` of `volume`."""
     if volume.media is not None:
-        _, medium, rest = name.split(".", 2)
-        return volume_value(volume.media[medium], rest)
+        _, medium, variable = name.split(".", 2)
+        return volume_value(volume.media[medium], variable)
     if name.startswith(PHASE):
         return volume.phase.variables[name.removeprefix(PHASE)]
     if name not in EXTINCTION_AND_ALBEDO:
@@ -231,12 +239,6 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
             for name, medium in volume.media.items()
         }
         return remix(volume, media)
-    density, cells = values.get("density"), volume.grid.shape
-    if isinstance(density, Tensor) and density.ndim == 0:
-        values = {**values, "density": density.expand(cells)}
-    for name, value in values.items():
-        like = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else volume_value(volume, name)
-        require_form(name, value, like, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
         sigma_t, albedo = (
@@ -257,14 +259,6 @@ def _within(owner: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {n.removeprefix(owner): value for n, value in values.items() if n.startswith(owner)}
 
 
-def _replace_light(light: Light, owner: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
-    tensors, volume = _within(owner, values), scene.volume
-    for key, value in tensors.items():
-        require_form(owner + key, value, getattr(light, key), volume.density, volume.grid.shape)
-    changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
-    return changed
-
-
 def _view_keys(view: View) -> list[str]:
     lens = ["focal", "principal_point"] if view.camera.is_perspective else []
     lens += ["distortion"] if view.camera.distortion is not None else []
@@ -282,19 +276,17 @@ def _view_value(view: View, key: str) -> Tensor:
     return torch.as_tensor(value, dtype=pose.dtype, device=pose.device)
 
 
-def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
+def _replace_view(view: View, values: Mapping[str, Tensor], center: Triple) -> View:
     owner = f"views.{view.name}."
     changes: dict[str, Any] = {
         key: values[owner + key] for key in _view_keys(view) if owner + key in values
     }
     if not changes:
         return view
-    for key, value in changes.items():
-        require_form(owner + key, value, _view_value(view, key), view.camera.pose, (0, 0, 0))
     response = {key: changes.pop(key) for key in RESPONSE if key in changes}
     camera = view.camera
     if "camera" in changes:
-        camera = twist(camera, changes.pop("camera"), scene.volume.grid.center_xyz)
+        camera = twist(camera, changes.pop("camera"), center)
     if "focal" in changes:
         changes["half_width"] = 1 / (2 * changes.pop("focal"))
     return replace(view, camera=replace(camera, **changes) if changes else camera, **response)

@@ -1,19 +1,21 @@
 """Multigrid's passes as kernels compute what PyTorch's operations compute, as often as those."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from media import assert_near, random_values
-from test_multigrid import FORMS, cycle_of, patchy, patchy_box, uneven
+from test_multigrid import FORMS, patchy, patchy_box, uneven
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solve import Solution, solve_by_multigrid
+from ddrecon.diffusion.solve import Solution, TensorSteps, solve_by_multigrid
 from ddrecon.engine import use_engine
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from as_on_a_gpu import ORDERS, as_on_a_gpu, headers_of
 
-from ddrecon.diffusion.fused.passes import KernelCycle
+from ddrecon.diffusion.fused.passes import KernelSteps
 
 pytestmark = pytest.mark.slow
 
@@ -24,18 +26,22 @@ def solve(
     engine: str, operator: Operator, source: Tensor, tolerance: float, guess: Tensor | None = None
 ) -> Solution:
     use_engine(engine)
-    return solve_by_multigrid(
-        Operator(operator.conductances, operator.loss, operator.periodic), source, guess, tolerance
-    )
+    return solve_by_multigrid(replace(operator, prepared={}), source, guess, tolerance)
 
 
-def assert_cycles_agree(operator: Operator, source: Tensor) -> None:
-    """V-cycles and products."""
-    cycle = KernelCycle(operator, source)
-    cycle.direction.copy_(source)
-    cycle.residual.copy_(source)
-    assert_near(cycle.product(), operator.apply(source), 1e-13)
-    assert_near(cycle.cycle(), cycle_of(operator)(source), 1e-12)
+def assert_steps_agree(operator: Operator, source: Tensor) -> None:
+    """Those of an iteration, one after another: V-cycle, direction and solution, and their sums."""
+    pairs = [KernelSteps(operator, source), TensorSteps(operator, source)]
+    factor = random_values(len(source), 1, 1, 1, seed=2)
+    for steps in pairs:
+        steps.residual.copy_(source)
+        steps.direction.copy_(source.flip(1))
+    fused, plain = ([s.precondition(), s.turn(factor), s.advance(factor)] for s in pairs)
+    names = "preconditioned", "direction", "product", "residual", "solution"
+    fused += [getattr(pairs[0], name) for name in names]
+    plain += [getattr(pairs[1], name) for name in names]
+    for value, expected in zip(fused, plain, strict=True):
+        assert_near(value, expected, 1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -44,8 +50,8 @@ def assert_cycles_agree(operator: Operator, source: Tensor) -> None:
 def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int, wraps: bool):
     operator = patchy_box(shape, wraps)
     faces = tuple(c[:colors] for c in operator.conductances)
-    operator = Operator(faces, operator.loss[:colors], operator.periodic)
-    assert_cycles_agree(operator, random_values(colors, *shape, seed=4) - 0.5)
+    operator = replace(operator, conductances=faces, loss=operator.loss[:colors])
+    assert_steps_agree(operator, random_values(colors, *shape, seed=4) - 0.5)
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -53,7 +59,7 @@ def test_a_cycle_is_that_of_torch(shape: tuple[int, int, int], colors: int, wrap
 def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
     operator, source = patchy_box((7, 8, 9), wraps), random_values(2, 7, 8, 9, seed=4) - 0.5
     with as_on_a_gpu(order) as launched:
-        assert_cycles_agree(operator, source)
+        assert_steps_agree(operator, source)
     assert "diffusion/fused/passes.h" in headers_of(launched)
 
 
@@ -61,7 +67,7 @@ def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
 def test_grids_are_those_of_torch(form: str):
     """The same axes are coarsened on every level, also where cells are not cubes."""
     shape, sides = FORMS[form]
-    assert_cycles_agree(uneven(shape, sides), random_values(2, *shape, seed=4) - 0.5)
+    assert_steps_agree(uneven(shape, sides), random_values(2, *shape, seed=4) - 0.5)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)

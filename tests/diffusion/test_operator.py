@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from manufactured import EXTENT, manufactured
 from media import box_grid, convergence_order, dense_matrix, make_operator, random_values, tensor
 from torch import Tensor
 
@@ -100,38 +101,14 @@ def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, dif
         assert not face_fluxes(inside, None, diffusion, grid, axis, radiance).any()
 
 
-D_AT_FACES = 0.2
-EXTENT = (1.0, 1.2, 0.8)
-
-
-def manufactured(position: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """u, D, kappa_a and the source that makes u the solution, at `position` (z, y, x).
-
-    Along each axis u is 1 + t (L - t) / (2 D L), so that u / 2 = -D du/dn on both faces; D departs
-    from D_AT_FACES inside only.
-    """
-    z, y, x = (axis.requires_grad_() for axis in position)
-
-    def fields() -> tuple[Tensor, Tensor]:
-        u, bump = torch.ones_like(z), torch.ones_like(z)
-        for t, length in zip((z, y, x), EXTENT, strict=True):
-            u = u * (1 + t * (length - t) / (2 * D_AT_FACES * length))
-            bump = bump * torch.sin(math.pi * t / length) ** 2
-        return u, D_AT_FACES * (1 + 3 * bump)
-
-    u, diffusion = fields()
-    divergence = torch.zeros_like(z)
-    slopes = torch.autograd.grad(u.sum(), (z, y, x), create_graph=True)
-    for axis, slope in zip((z, y, x), slopes, strict=True):
-        divergence += torch.autograd.grad((diffusion * slope).sum(), axis, retain_graph=True)[0]
-    absorption = 1 + torch.cos(z) * y
-    return tuple(t.detach() for t in (u, diffusion, absorption, absorption * u - divergence))
-
-
 def discrete_error(cells: int) -> float:
     grid = Grid((cells, cells, cells // 2), (0.0, 0.0, 0.0), EXTENT)
-    position = [axis.clone() for axis in torch.broadcast_tensors(*grid.centers(tensor(0)))]
-    u, diffusion, absorption, source = (field[None] for field in manufactured(position))
+    u, diffusion, absorption, source, *flux = manufactured(
+        torch.broadcast_tensors(*grid.centers(tensor(0)))
+    )
+    for axis in AXES:
+        faces = face_fluxes(None, flux[axis - 1], diffusion, grid, axis)
+        source = source - faces.diff(dim=axis) / grid.spacing[axis - 1]
     operator = make_operator(grid, diffusion, absorption)
     error = solve_by_multigrid(operator, source, None, 1e-11).value - u
     return float((error**2).mean().sqrt() / (u**2).mean().sqrt())

@@ -1,17 +1,23 @@
 """The manual of scene files says what the schema says, of every key."""
 
 import importlib.util
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from ddrecon import settings
-from ddrecon.scene_file import schema
+from ddrecon.scene_file import schema, view_schema
+from ddrecon.variables.kinds import DENSITY_STEP, KINDS
 
 DOCS = Path(__file__).parents[2] / "docs"
-ELSEWHERE = {schema.Bounds, schema.PoseSection, schema.SceneTree}
+WITHOUT_SECTION = {
+    schema.Bounds,
+    schema.BoxSection,
+    schema.SceneTree,
+    view_schema.PoseSection,
+}
 """Records whose keys are explained with those of others."""
 
 
@@ -29,16 +35,20 @@ def test_the_pages_are_what_the_schema_makes_of_them(manual: ModuleType) -> None
         assert (DOCS / name).read_text() == text, "run: python docs/make_scene_file.py"
 
 
-def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
-    modules = schema, settings
+def test_every_record_has_its_section_and_every_key_its_sentence(manual: ModuleType) -> None:
+    modules = schema, view_schema, settings
     names = [value for module in modules for value in vars(module).values()]
     records = {value for value in names if isinstance(value, type) and is_dataclass(value)}
-    explained = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
-    assert set(explained) == records - ELSEWHERE
-    pose = {field.name for field in fields(schema.PoseSection)}
-    for record, keys in explained.items():
-        known = {field.name for field in fields(record)}
-        assert keys == known - (pose if record is schema.OrthographicSection else set())
+    assert {record for _, record in manual.SECTIONS} == records - WITHOUT_SECTION
+    for record in records:
+        introduction, sentences = manual.explain(record)
+        assert introduction and all(text.endswith(".") for text in sentences.values())
+
+
+def test_numbers_in_sentences_are_those_of_the_program(manual: ModuleType) -> None:
+    _, sentences = manual.explain(settings.ParameterSettings)
+    assert f"an optical depth of {DENSITY_STEP:g} across" in sentences["lr"]
+    assert f"{KINDS['density'].tv:g} for density and emission" in sentences["tv"]
 
 
 def test_keys_for_experts_stand_on_their_page_alone(manual: ModuleType) -> None:

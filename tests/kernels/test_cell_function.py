@@ -16,7 +16,7 @@ GAIN = "transport/fused/gain.h"
 CELLS = [
     (GAIN, "Gain<1, 0, 1>", 10, 8, 6),
     (GAIN, "Gain<0, 1, 0>", 2, 2, 6),
-    ("transport/fused/steep.h", "Steep", 4, 3, 6),
+    ("transport/fused/steep.h", "Steep", 5, 3, 7),
     ("diffusion/fused/closure.h", "Geometric<2>", 3, 1, 2),
 ]
 """Header, function, fields, outs, numbers."""

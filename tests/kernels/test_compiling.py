@@ -53,10 +53,10 @@ def test_an_iteration_names_the_adjoints_that_it_launches(
     Reconstruction(load_scene(BALL, overrides=change)).step()
     named = {kernel.key for kernel, was_named in launched.items() if was_named}
     assert {kernel for kernel, _ in compiling._named} <= launched.keys()
-    assert {"ordinates_go_back", "transpose", "flow_cotangents"} < named
+    assert {"ordinates_back", "transpose", "flow_cotangents"} < named
     adjoints = ("back", "cotangents", "adjoint", "transpose")
     later = {one.key for one in launched if one.key.endswith(adjoints)}
-    assert named == later | {"multigrid_cycle", "multigrid_prepare", "ordinates_follow"}
+    assert named == later | {"multigrid_iterate", "multigrid_prepare", "ordinates_light"}
 
 
 def fill_kernels() -> list[TextKernel]:
@@ -112,26 +112,20 @@ def test_what_another_thread_cannot_compile_is_an_error_here(
             compiling.load(kernel, "cpu")
 
 
-def test_while_kernels_are_compiled_lines_say_how_far_that_is(
+def test_a_line_says_once_that_kernels_are_compiled(
     nothing_loaded: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Before the first is done, at a level that Python shows unasked, and not of what is cached."""
+    """While the first is, at a level that Python shows unasked, and not of what is cached."""
     use_engine("warp")
-    first, _, third = (kernel.kernel for kernel in fill_kernels())
-    is_told = threading.Semaphore(0)
+    is_announced = threading.Semaphore(0)
     monkeypatch.setattr(compiling, "COMPILED", 0.0)
-    monkeypatch.setattr(compiling, "PAUSE", 0.0)
-    monkeypatch.setattr(compiling, "_last_line", -1.0)
-    monkeypatch.setattr(compiling.wp, "load_module", lambda *_, **__: is_told.acquire(timeout=60))
-    real = compiling._tell
-    monkeypatch.setattr(compiling, "_tell", lambda *of: (real(*of), is_told.release()))
+    replace_compiler(monkeypatch, lambda module: is_announced.acquire(timeout=60))
+    compiling._announce.cache_clear()
+    announce = compiling._announce
+    monkeypatch.setattr(compiling, "_announce", lambda: (announce(), is_announced.release()))
+    kernels = fill_kernels()
     with caplog.at_level(logging.WARNING, LOG):
-        compiling.load(first, "cpu")
-        compiling.name_kernel(third, "cpu")
-        compiling._named[third, "cpu"].result()
-        lines = [record.getMessage() for record in caplog.records]
-        assert len(lines) == 2 and "once" in lines[0] and "fill_2" in lines[1]
-        assert "1 done, 1 or more to do" in lines[1]
-        for kernel in (first, third):
-            compiling.load(kernel, "cpu")
-    assert len(caplog.records) == 2
+        for kernel in (*kernels[:2], kernels[0]):
+            compiling.load(kernel.kernel, "cpu")
+    (record,) = caplog.records
+    assert "once" in record.getMessage()

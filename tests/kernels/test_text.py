@@ -21,19 +21,27 @@ for (int i = begin; i < end; ++i) {
     is_large[i] = sum > F(1);
 }
 """
-GIVEN = "int length, total; F shift, *fields[2], *out; double *weights; bool *is_large"
+DECLARED = "int length, total; F shift, *fields[2], *out; double *weights; bool *is_large"
+FIELDS, WEIGHTS = random_values(2, 37), random_values(2, seed=1)
 
 
 @pytest.fixture(scope="module")
 def kernel() -> TextKernel:
-    return TextKernel("weighted_sum", 64, TEXT, GIVEN, "out is_large")
+    return TextKernel("weighted_sum", 64, TEXT, DECLARED, "out is_large")
 
 
-def given(fields: list[torch.Tensor | None], weights: torch.Tensor, shift: float = 0.0) -> dict:
-    return {"total": 37, "fields": fields, "weights": weights, "shift": shift}
+def inputs(fields=FIELDS, shift: float = 0.0, length: int = 1) -> dict:
+    """For an item each, or for one with all 37."""
+    return {
+        "total": 37,
+        "fields": list(fields),
+        "weights": WEIGHTS,
+        "shift": shift,
+        "length": length,
+    }
 
 
-def made() -> dict[str, torch.Tensor]:
+def outputs() -> dict[str, torch.Tensor]:
     return {
         "out": torch.empty(37, dtype=torch.float64),
         "is_large": torch.empty(37, dtype=torch.bool),
@@ -43,30 +51,28 @@ def made() -> dict[str, torch.Tensor]:
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_arrays_numbers_and_lists_arrive(kernel, threads):
-    fields, weights = random_values(2, 37), random_values(2, seed=1)
-    items, length = cut(37, 4, weights)
-    found = made()
-    strided = [random_values(37, 2)[:, 0], fields[1].float()]  # copied and converted first
-    kernel.launch(items, given(strided, weights, 0.5) | {"length": length}, found, threads)
-    known = 0.5 + weights[0] * strided[0] + weights[1] * strided[1].double()
-    torch.testing.assert_close(found["out"], known, rtol=1e-14, atol=0)
-    assert torch.equal(found["is_large"], found["out"] > 1)
+    items, length = cut(37, 4, WEIGHTS)
+    results = outputs()
+    strided = [random_values(37, 2)[:, 0], FIELDS[1].float()]  # copied and converted first
+    kernel.launch(items, inputs(strided, 0.5, length), results, threads)
+    known = 0.5 + WEIGHTS[0] * strided[0] + WEIGHTS[1] * strided[1].double()
+    torch.testing.assert_close(results["out"], known, rtol=1e-14, atol=0)
+    assert torch.equal(results["is_large"], results["out"] > 1)
 
 
 @pytest.mark.slow
 def test_none_is_an_array_that_is_not_there(kernel):
-    fields, weights, found = random_values(2, 37), random_values(2, seed=1), made()
-    kernel.launch(1, given([None, fields[1]], weights) | {"length": 37}, found)
-    torch.testing.assert_close(found["out"], weights[1] * fields[1], rtol=1e-14, atol=0)
+    results = outputs()
+    kernel.launch(1, inputs([None, FIELDS[1]], length=37), results)
+    torch.testing.assert_close(results["out"], WEIGHTS[1] * FIELDS[1], rtol=1e-14, atol=0)
 
 
 @pytest.mark.slow
 def test_each_share_writes_to_its_own(kernel):
-    fields, weights = random_values(2, 37), random_values(2, seed=1)
-    own = [made() for _ in range(3)]
-    kernel.launch(37, given(list(fields), weights) | {"length": 1}, own[0], shares=own)
-    known, bounds = weights @ fields, [0, 12, 24, 37]
-    for share, first, last in zip(own, bounds, bounds[1:], strict=False):
+    shares = [outputs() for _ in range(3)]
+    kernel.launch(37, inputs(), shares[0], shares=shares)
+    known, bounds = WEIGHTS @ FIELDS, [0, 12, 24, 37]
+    for share, first, last in zip(shares, bounds, bounds[1:], strict=False):
         torch.testing.assert_close(share["out"][first:last], known[first:last])
 
 
@@ -75,9 +81,9 @@ def test_threads_launch_the_same_kernel_at_once(kernel):
     """Each has a recorded launch for itself while it lasts."""
 
     def run(seed: int) -> bool:
-        fields, weights, found = random_values(2, 37, seed=seed), random_values(2), made()
-        kernel.launch(37, given(list(fields), weights) | {"length": 1}, found, threads=1)
-        return torch.allclose(found["out"], weights @ fields, rtol=1e-14)
+        fields, results = random_values(2, 37, seed=seed), outputs()
+        kernel.launch(37, inputs(fields), results, threads=1)
+        return torch.allclose(results["out"], WEIGHTS @ fields, rtol=1e-14)
 
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(run, range(200)))
@@ -85,11 +91,11 @@ def test_threads_launch_the_same_kernel_at_once(kernel):
 
 @pytest.mark.slow
 def test_a_bound_kernel_takes_other_numbers(kernel):
-    fields, weights, found = random_values(2, 37), random_values(2, seed=1), made()
-    bound = kernel.bind(given(list(fields), weights) | {"length": 37}, found)
+    results = outputs()
+    bound = kernel.bind(inputs(length=37), results)
     for shift in (0.0, 2.0):
         bound.launch(1, shift=shift)
-        torch.testing.assert_close(found["out"], weights @ fields + shift)
+        torch.testing.assert_close(results["out"], WEIGHTS @ FIELDS + shift)
 
 
 @pytest.mark.parametrize(
@@ -104,17 +110,17 @@ def test_a_bound_kernel_takes_other_numbers(kernel):
 )
 def test_what_does_not_fit_is_refused(kernel, wrong, message):
     with pytest.raises(ValueError, match=message):
-        kernel.launch(1, given([None, None], random_values(2)) | {"length": 37}, made() | wrong)
+        kernel.launch(1, inputs(), outputs() | wrong)
 
 
-def test_what_it_writes_is_handed_over_as_made(kernel):
+def test_what_it_writes_is_handed_over_as_outputs(kernel):
     """A copy of it, were it not contiguous, would be written to in vain."""
-    found = made()
-    wrong = given([None, None], random_values(2)) | {"length": 37, "out": found.pop("out")}
+    results = outputs()
+    wrong = inputs() | {"out": results.pop("out")}
     with pytest.raises(ValueError, match="out"):
-        kernel.launch(1, wrong, found)
+        kernel.launch(1, wrong, results)
     with pytest.raises(ValueError, match="shift"):
-        kernel.launch(1, {"length": 37}, made() | {"shift": 3})
+        kernel.launch(1, {"length": 37}, outputs() | {"shift": 3})
 
 
 @pytest.mark.slow
@@ -128,7 +134,7 @@ def test_what_it_only_reads_it_cannot_write(capfd):
 
 @pytest.mark.slow
 def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
-    text = "Given<F> rays = {}; rays.ray_count = ray_count; place[item] = rays.row_of(row);"
+    text = "Arguments<F> rays = {}; rays.ray_count = ray_count; place[item] = rays.row_of(row);"
     found = torch.empty(1, dtype=torch.int64)
     given = "int ray_count, row; long *place"
     kernel = TextKernel("find_row", 32, text, given, "place", "march/fused/rays.h")
@@ -138,13 +144,12 @@ def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
 
 def test_where_the_package_lies_is_no_part_of_a_kernel():
     """So other checkouts find it compiled."""
-    given = vars(include("transport/fused/gain.h"))
-    assert str(Path(__file__).parents[2]) not in repr(given)
-    assert given["extra_cpu_preamble"].count("struct Dual {") == 1
+    options = vars(include("transport/fused/gain.h"))
+    assert str(Path(__file__).parents[2]) not in repr(options)
+    assert options["extra_cpu_preamble"].count("struct Dual {") == 1
 
 
 def test_counts_beyond_the_numbers_of_an_int_are_refused(kernel):
-    arrays = given([None, None], random_values(2)) | {"length": 37}
     for count, numbers in ((2**31, {}), (1, {"total": 2**32 + 1})):
         with pytest.raises(UsageError, match=r"2\^31"):
-            kernel.launch(count, arrays | numbers, made(), threads=1)
+            kernel.launch(count, inputs() | numbers, outputs(), threads=1)

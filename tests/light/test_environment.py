@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from media import random_values
+from media import light_of, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -19,13 +19,6 @@ from ddrecon.light.environment import (
 from ddrecon.light.lights import EnvironmentLight
 
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
-
-
-def light_of(
-    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, up: str = "y"
-) -> EnvironmentLight:
-    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
-    return EnvironmentLight(radiance, *numbers, up=up)
 
 
 def directions(count: int, seed: int = 0) -> Tensor:
@@ -75,9 +68,9 @@ def test_straight_up_and_down_are_the_first_and_last_row(up: str, way: tuple[int
 def test_turning_the_map_is_turning_the_viewer(up: str):
     radiance, ways = random_values(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0, up=up)
-    found = environment_radiance(light, array_order(rotate_directions(ways, light)))
+    radiances = environment_radiance(light, array_order(rotate_directions(ways, light)))
     known = environment_radiance(light_of(radiance), array_order(ways))
-    torch.testing.assert_close(found, known, rtol=1e-11, atol=1e-12)
+    torch.testing.assert_close(radiances, known, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
@@ -96,8 +89,10 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float, up: str):
         interaction = mitsuba.SurfaceInteraction3f()
         interaction.wi = mitsuba.Vector3f(*(-component for component in way))
         expected.append(list(environment.eval(interaction)))
-    found = environment_radiance(light_of(radiance, 1.5, rotation, up), array_order(ways))
-    torch.testing.assert_close(found, torch.tensor(expected).to(found).T, rtol=1e-5, atol=1e-5)
+    radiances = environment_radiance(light_of(radiance, 1.5, rotation, up=up), array_order(ways))
+    torch.testing.assert_close(
+        radiances, torch.tensor(expected).to(radiances).T, rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES, ids=str)
@@ -119,8 +114,8 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int):
     solid_angle = down.sin() * (math.pi / rows) * (2 * math.pi / columns)
     weight = environment_radiance(light, array_order(ways))[0] * solid_angle
     expected = torch.cat([weight.sum()[None], weight @ ways])
-    found = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
-    torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)
+    radiances = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
+    torch.testing.assert_close(radiances, expected, rtol=2e-4, atol=2e-4)
 
 
 @pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
@@ -128,8 +123,8 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
     radiance, ways = random_values(2, 7, 5), array_order(directions(100))
     fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
-    found, known = (environment_radiance(light_of(one), ways) for one in (fine, radiance))
-    torch.testing.assert_close(found, known, rtol=1e-11, atol=1e-12)
+    radiances, known = (environment_radiance(light_of(one), ways) for one in (fine, radiance))
+    torch.testing.assert_close(radiances, known, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])

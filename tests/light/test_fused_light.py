@@ -1,5 +1,6 @@
 """Light not yet scattered by fused kernels is torch's, in values and derivatives, also at kinks."""
 
+import itertools
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from graphics_cards import assert_compiles
-from media import half_empty, make_scene, random_values
+from media import half_empty, make_scene, random_values, tensor
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -27,7 +28,7 @@ from ddrecon.kernels.launch import launch
 from ddrecon.light.fused import receive
 from ddrecon.light.fused.point_light import way_kernel
 from ddrecon.light.fused.receive import receive_kernel
-from ddrecon.light.fused.shear import shear_kernels
+from ddrecon.light.fused.shear import _KERNELS, shear_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -39,39 +40,35 @@ DIRECTIONS = [
 SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
 
 
-def vector(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
-    return torch.tensor(values, dtype=dtype)
+def assert_all_near(fused: list[Tensor], known: list[Tensor], error: float) -> None:
+    for value, expected in zip(fused, known, strict=True):
+        scale = max(float(expected.abs().max()), 1e-3)
+        torch.testing.assert_close(value, expected, rtol=0, atol=error * scale)
 
 
-def assert_near(found: Tensor, known: Tensor, error: float) -> None:
-    assert found.shape == known.shape
-    assert float((found - known).abs().max()) <= error * max(float(known.abs().max()), 1e-3)
-
-
-def masses(
-    engine: str, grid: Grid, field: Tensor, direction: Tensor, bound: Tensor
-) -> tuple[Tensor, ...]:
+def masses(engine: str, grid: Grid, field: Tensor, heading: Tensor, bound: float) -> list[Tensor]:
     """Mass and path, and the derivatives of a random functional of both by all arguments."""
     use_engine(engine)
-    leaves = [each.detach().clone().requires_grad_() for each in (field, direction, bound)]
+    direction = torch.nn.functional.normalize(heading, dim=0)
+    leaves = [
+        value.detach().clone().requires_grad_() for value in (field, direction, tensor(bound)[0])
+    ]
     (entered,), (step,) = sum_masses(leaves[0], grid, leaves[1][None], leaves[2])
     loss = (entered * random_values(*entered.shape, seed=1).to(entered)).sum() + 0.7 * step
-    return entered.detach(), step.detach(), *torch.autograd.grad(loss, leaves)
+    return [entered.detach(), step.detach(), *torch.autograd.grad(loss, leaves)]
 
 
 @pytest.mark.parametrize("upper", ["cubes", "boxes"])
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
 def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...], upper: str):
     """Also where places lie exactly on cells' centers: there the slopes beyond them."""
-    heading = torch.nn.functional.normalize(vector(*direction), dim=0)
-    for shape in SHAPES:
+    for shape, bound in itertools.product(SHAPES, (0.0, 1.7)):
         corner = (1.25, 1.3, 0.9) if upper == "boxes" else tuple(0.2 * cells for cells in shape)
-        grid, field = Grid(shape, (0, 0, 0), corner), random_values(2, *shape)
-        for bound in (0.0, 1.7):
-            given = grid, field, heading, vector(bound).squeeze()
-            for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
-                # In one slice all cancels, and rounding is left.
-                torch.testing.assert_close(found, known, rtol=1e-12, atol=5e-13)
+        beam = Grid(shape, (0, 0, 0), corner), random_values(2, *shape), tensor(*direction), bound
+        # In one slice all cancels, and rounding is left.
+        torch.testing.assert_close(
+            masses("warp", *beam), masses("torch", *beam), rtol=1e-12, atol=5e-13
+        )
 
 
 @pytest.mark.parametrize("along", range(3))
@@ -81,10 +78,8 @@ def test_rows_longer_than_a_block(along: int):
     # Slopes that no small fraction is: through a center of a cell derivatives have a kink.
     direction = [0.2357, -0.3163, 0.4142]
     direction[along - 1] = 0.8191
-    heading = torch.nn.functional.normalize(vector(*direction), dim=0)
-    given = grid, random_values(1, *shape), heading, vector(0.5).squeeze()
-    for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
-        assert_near(found, known, 1e-11)
+    beam = grid, random_values(1, *shape), tensor(*direction), 0.5
+    assert_all_near(masses("warp", *beam), masses("torch", *beam), 1e-11)
 
 
 def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
@@ -126,24 +121,26 @@ def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int)
 def gradients(scene: Scene, names: list[str], engine: str, degree: int) -> list[Tensor]:
     """The light, and the derivatives of a random functional of it by `names`."""
     leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    found = fields_of(scene, leaves, engine, degree)
-    loss = sum((each * random_values(*each.shape, seed=3).to(each)).sum() for each in found)
-    return [each.detach() for each in found] + list(torch.autograd.grad(loss, [*leaves.values()]))
+    light = fields_of(scene, leaves, engine, degree)
+    loss = sum((field * random_values(*field.shape, seed=3).to(field)).sum() for field in light)
+    return [*(field.detach() for field in light), *torch.autograd.grad(loss, [*leaves.values()])]
 
 
 NUMBERS = ["density", "sigma_a", "sigma_s", "g", "lights.0.direction", "lights.0.irradiance"]
 NUMBERS += ["lights.1.irradiance", "lights.2.radiance", "lights.2.rotation"]
-each_kind = pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
 
 
-@each_kind
+def assert_as_torch(scene: Scene, names: list[str], degree: int, error: float) -> None:
+    fused, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
+    assert all(bool(torch.isfinite(value).all()) for value in fused)
+    assert_all_near(fused, known, error)
+
+
+@pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_light_and_its_derivatives_are_those_of_torch(kind: str, degree: int):
     names = NUMBERS if degree else [name for name in NUMBERS if name != "lights.2.rotation"]
-    scene = scene_of(kind)
-    found, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
-    for one, other in zip(found, known, strict=True):
-        assert_near(one, other, 1e-11)
+    assert_as_torch(scene_of(kind), names, degree, 1e-11)
 
 
 POSITIONS = {
@@ -159,27 +156,19 @@ POSITIONS = {
 def test_point_lights_are_those_of_torch(kind: str, place: str):
     """Also where ways run through cells' centers, at which interpolation has kinks."""
     scene = scene_of(kind)
-    position = vector(*POSITIONS[place])
-    scene.lights = [PointLight(position, vector(2.0)), *scene.lights]
-    names = ["density", "sigma_a", "g", "lights.0.intensity"]
-    found, known = (gradients(scene, names, engine, 1) for engine in ("warp", "torch"))
-    for one, other in zip(found, known, strict=True):
-        assert_near(one, other, 1e-11)
+    scene.lights = [PointLight(tensor(*POSITIONS[place]), tensor(2.0)), *scene.lights]
+    assert_as_torch(scene, ["density", "sigma_a", "g", "lights.0.intensity"], 1, 1e-11)
 
 
 def test_single_precision():
-    scene = scene_of("fields", torch.float32)
-    found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
-    for one, other in zip(found, known, strict=True):
-        assert_near(one, other, 2e-5)
+    assert_as_torch(scene_of("fields", torch.float32), NUMBERS, 1, 2e-5)
 
 
 def test_sums_of_a_part_of_the_cells_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch):
     scene = scene_of("colors")
     known = gradients(scene, NUMBERS, "warp", 3)
     monkeypatch.setattr(receive, "MOST_SUMS", 1)
-    for one, other in zip(gradients(scene, NUMBERS, "warp", 3), known, strict=True):
-        assert_near(one, other, 1e-12)
+    assert_all_near(gradients(scene, NUMBERS, "warp", 3), known, 1e-12)
 
 
 def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.MonkeyPatch):
@@ -205,17 +194,15 @@ def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.
 
 
 def test_opaque_and_empty_media_have_finite_derivatives():
-    scene = scene_of("colors")
     for factor in (0.0, 1e4):
-        scene.volume.density = factor * scene.volume.density
-        found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
-        for one, other in zip(found, known, strict=True):
-            assert bool(torch.isfinite(one).all())
-            assert_near(one, other, 1e-10)
         scene = scene_of("colors")
+        scene.volume.density = factor * scene.volume.density
+        assert_as_torch(scene, NUMBERS, 1, 1e-10)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    kernels = [*vars(shear_kernels(32)).values(), way_kernel(False, 32), way_kernel(True, 32)]
+    kernels = [shear_kernel(name, 32) for name in _KERNELS]
+    kernels += [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
+    kernels += [way_kernel(False, 32), way_kernel(True, 32)]
     kernels += [receive_kernel(kind, 32) for kind in ("receive", "tangent", "receive_back")]
     assert_compiles(kernels, tmp_path)

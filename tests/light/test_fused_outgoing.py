@@ -60,13 +60,13 @@ def test_radiance_and_cotangents_are_those_of_torch(shape: tuple[int, int, int],
     views = itertools.product((False, True), repeat=2)
     cases = [(*case, torch.float64, 1e-12) for case in itertools.product(views, (1, 3))]
     for view, colors, dtype, error in (*cases, (*cases[-1][:2], torch.float32, 1e-5)):
-        known, found = (
+        known, fused = (
             radiance_and_bars(engine, shape, colors, view, g, dtype) for engine in ("torch", "warp")
         )
-        for one, other in zip(found, known, strict=True):
+        for value, expected in zip(fused, known, strict=True):
             # Sums over cells cancel in part.
-            size = max(float(other.detach().norm()), 1e-3) * (1 if one.ndim > 1 else 30)
-            torch.testing.assert_close(one, other, rtol=0, atol=error * size)
+            size = max(float(expected.detach().norm()), 1e-3) * (1 if value.ndim > 1 else 30)
+            torch.testing.assert_close(value, expected, rtol=0, atol=error * size)
 
 
 def test_radiance_is_bent_somewhere():
@@ -91,12 +91,13 @@ def test_light_of_any_degree(degree: int, has_more: bool):
         leaf.requires_grad_()
     rays = Rays(leaves["eye"][None], -leaves["eye"][None], leaves["eye"])
     light, grid, more = leaves["light"], box_grid(shape), leaves.get("more")
-    found = scatter_fused(grid, light, leaves["factors"], rays, more)
+    fused = scatter_fused(grid, light, leaves["factors"], rays, more)
     known = radiance_along(weigh(light, leaves["factors"]), rays.towards_eye(grid), more)
     assert has_more or bool((known == 0).any())
-    torch.testing.assert_close(found, known, rtol=0, atol=1e-12)
+    torch.testing.assert_close(fused, known, rtol=0, atol=1e-12)
     bars = [
-        torch.autograd.grad(each, [*leaves.values()], 1 + known.detach()) for each in (found, known)
+        torch.autograd.grad(light, [*leaves.values()], 1 + known.detach())
+        for light in (fused, known)
     ]
     for one, other in zip(*bars, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11 * float(other.abs().max()))

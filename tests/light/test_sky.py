@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from media import half_empty, make_scene, random_values, tensor
+from media import half_empty, light_of, make_scene, random_values, tensor
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
@@ -20,13 +20,6 @@ from ddrecon.picture import render
 from ddrecon.scene import Scene
 
 SHAPE = (5, 4, 6)
-
-
-def light_of(
-    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48, up: str = "y"
-) -> EnvironmentLight:
-    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
-    return EnvironmentLight(radiance, *numbers, directions, up)
 
 
 def uneven(height: int, width: int, seed: int = 0) -> Tensor:

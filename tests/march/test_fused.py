@@ -6,17 +6,23 @@ import pytest
 import torch
 import torch.autograd.forward_ad as forward
 from graphics_cards import assert_compiles
-from media import assert_near, half_empty, make_camera, make_scene, random_values
+from media import (
+    assert_near,
+    half_empty,
+    image_gradients,
+    make_camera,
+    make_scene,
+    random_values,
+)
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.picture import render_each
+from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES, run_case
 from ddrecon.variables.values import value_of, with_values
@@ -38,85 +44,53 @@ POSE = ["views.view.camera"]
 def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:
     """A scene with a directional light, `kind` of medium and lights, seen by one camera."""
     density = half_empty(*SHAPE, dtype=dtype)
-    camera = make_camera(size=(size, size + 1), dtype=dtype, **view)
-    if kind == "gray":
-        return make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera)
-    if kind == "backward":
-        return make_scene(density, g=-0.4, ambient=(0.2, 0.1, 0.3), camera=camera)
-    if kind == "peaked":
-        return make_scene(density, g=0.5, camera=camera)
-    if kind == "lobes by color":
-        scene = make_scene(density, camera=camera)
-        lobes, weight = density.new_tensor([0.6, -0.4]), density.new_tensor([0.9, 0.5, 0.2])
-        scene.volume.phase = TwoLobe(lobes, weight)
-        outside = density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5])
-        scene.lights.append(PointLight(*outside))
-        return scene
-    if "by cell" in kind:
-        scene = make_scene(density, camera=camera)
-        scene.volume.phase = cellwise_phase(kind, density)
-        if kind == "weight by cell":
-            place = density.new_tensor([0.9, 0.7, 0.2])
-            scene.lights.append(PointLight(place, density.new_tensor([1.0, 2.0, 0.5])))
-        return scene
-    fields = {
-        name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
-        for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
-    }
-    scene = (
-        make_scene(density, g=-0.3, camera=camera)
-        if kind == "points"
-        else make_scene(density, g=0.5, camera=camera, **fields)
-    )
-    outside = PointLight(density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5]))
-    inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
-    scene.lights += [outside, inside]
+    tensor, camera = density.new_tensor, make_camera(size=(size, size + 1), dtype=dtype, **view)
+    sigma_a, sigma_s = (0.5 + random_values(3, *SHAPE, seed=k, dtype=dtype) for k in (1, 2))
+    outside = PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5]))
+    both = [outside, PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3]))]
+    medium, lights = {
+        "gray": ({"sigma_a": (1.0,), "sigma_s": (6.0,)}, []),
+        "backward": ({"g": -0.4, "ambient": (0.2, 0.1, 0.3)}, []),
+        "peaked": ({"g": 0.5}, []),
+        "points": ({"g": -0.3}, both),
+        "fields": ({"g": 0.5, "sigma_a": sigma_a, "sigma_s": 6 * sigma_s}, both),
+        "lobes by color": ({}, [outside]),
+        "weight by cell": ({}, [outside]),
+    }.get(kind, ({}, []))
+    scene = make_scene(density, camera=camera, **medium)
+    scene.lights += lights
+    scene.volume.phase = phases(density).get(kind, scene.volume.phase)
     return scene
 
 
-def cellwise_phase(kind: str, density: Tensor) -> PhaseFunction:
+def phases(density: Tensor) -> dict[str, PhaseFunction]:
     """Both signs of g; two lobes, by color or backward; or weights that colors share."""
-    numbers = random_values(*SHAPE, seed=7, dtype=density.dtype)
-    if kind == "g by cell":
-        return HenyeyGreenstein(1.6 * numbers - 0.7)
-    if kind == "weight by cell":
-        colors = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
-        return TwoLobe(density.new_tensor([0.6, -0.4]), colors)
-    if kind == "blend by cell":
-        air = Rayleigh(density.new_zeros(()))
-        return Blend(HenyeyGreenstein(density.new_tensor([0.6, 0.5, -0.3])), air, numbers)
-    return TwoLobe(density.new_tensor([-0.2, -0.5]), numbers)
-
-
-def images(scene: Scene, values: dict[str, Tensor], engine: str) -> list[Tensor]:
-    use_engine(engine)
-    changed = with_values(scene, values)
-    return render_each(changed, changed.views, SolveMemory())
-
-
-def weights_of(image: Tensor) -> Tensor:
-    """Those of a functional of `image` that asks nothing of its first two rows."""
-    weights = random_values(*image.shape, seed=3).to(image)
-    weights[..., :2, :] = 0
-    return weights
+    tensor, numbers = density.new_tensor, random_values(*SHAPE, seed=7, dtype=density.dtype)
+    by_color = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
+    haze, air = HenyeyGreenstein(tensor([0.6, 0.5, -0.3])), Rayleigh(density.new_zeros(()))
+    return {
+        "lobes by color": TwoLobe(tensor([0.6, -0.4]), tensor([0.9, 0.5, 0.2])),
+        "g by cell": HenyeyGreenstein(1.6 * numbers - 0.7),
+        "weight by cell": TwoLobe(tensor([0.6, -0.4]), by_color),
+        "blend by cell": Blend(haze, air, numbers),
+        "backward weight by cell": TwoLobe(tensor([-0.2, -0.5]), numbers),
+    }
 
 
 def gradients(scene: Scene, names: list[str], engine: str) -> tuple[Tensor, list[Tensor]]:
-    """The first image, and the derivatives of a random functional of all of them."""
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    rendered = images(scene, leaves, engine)
-    loss = sum((image * weights_of(image)).sum() for image in rendered)
-    return rendered[0].detach(), list(torch.autograd.grad(loss, list(leaves.values())))
+    use_engine(engine)
+    return image_gradients(scene, names)
 
 
 def tangent(scene: Scene, names: list[str], engine: str) -> Tensor:
+    use_engine(engine)
     with forward.dual_level():
         duals = {}
         for name in names:
             value = value_of(scene, name).detach()
             change = random_values(*value.shape, seed=5).to(value)
             duals[name] = forward.make_dual(value, change)
-        return forward.unpack_dual(images(scene, duals, engine)[0]).tangent
+        return forward.unpack_dual(render(with_values(scene, duals))[0]).tangent
 
 
 EMISSIONS = [
@@ -136,7 +110,7 @@ EMISSIONS = [
     ("blend by cell", OUTSIDE, ["density"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
-FORWARD = [one for one in EMISSIONS if one[0] == "lobes by color" or "by cell" in one[0]]
+FORWARD = [case for case in EMISSIONS if case[0] == "lobes by color" or "by cell" in case[0]]
 """Those whose tangents `tests/test_fused_tangents.py` does not try."""
 
 
@@ -219,24 +193,24 @@ def test_hard_cases_are_passed(name: str):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     """Some of all kernels: each takes seconds."""
-    one = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
+    layout = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)
     by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
     packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
     packets += [
-        kernels.tangent_kernel(one, Case(False, True, True)),
+        kernels.tangent_kernel(layout, Case(False, True)),
         kernels.adjoint_kernel(several, Case(False)),
     ]
     assert_compiles(packets, tmp_path)
 
 
 def test_places_beyond_the_numbers_of_an_int_are_refused():
-    planes, shape = torch.zeros(2), (3, 2048, 1024, 1024)
+    planes, rays, shape = torch.zeros(2), torch.zeros(1, 8), (3, 2048, 1024, 1024)
     order = torch.zeros(2, dtype=torch.int32)
-    assert Cells(planes, 0, order).strides(shape)["plane_stride"] == 2**20
+    assert Cells(planes, 0, order).arguments(rays, shape)["plane_stride"] == 2**20
     for cells in (Cells(planes), Cells(planes, 1, order)):
         with pytest.raises(UsageError, match=r"2\^31"):
-            cells.strides(shape)
+            cells.arguments(rays, shape)
 
 
 def test_empty_space_and_rays_that_miss():

@@ -6,7 +6,14 @@ from typing import Any
 import pytest
 import torch
 import torch.autograd.forward_ad as forward
-from media import half_empty, make_camera, make_scene, random_values
+from media import (
+    half_empty,
+    image_gradients,
+    make_camera,
+    make_scene,
+    random_values,
+    weights_of,
+)
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -42,13 +49,6 @@ def scene_with(support: Tensor | None, settings: dict, is_gray: bool = False, **
     return scene
 
 
-def gradients(scene: Scene, names: list[str]) -> tuple[Tensor, list[Tensor]]:
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    image = render(with_values(scene, leaves))
-    functional = (image * random_values(*image.shape, seed=3)).sum()
-    return image.detach(), list(torch.autograd.grad(functional, list(leaves.values())))
-
-
 def tangent(scene: Scene, name: str, change: Tensor) -> Tensor:
     with forward.dual_level():
         dual = forward.make_dual(value_of(scene, name).detach(), change)
@@ -67,7 +67,7 @@ def test_images_and_derivatives_are_those_without_it(engine: str, settings: dict
     use_engine(engine)
     support, size = two_blobs(), (30, 31) if settings == LATTICE else (9, 10)
     (known, (of_all, of_other)), (image, (of_density, of_same)) = (
-        gradients(scene_with(given, settings, names is RAYS, size=size), names)
+        image_gradients(scene_with(given, settings, names is RAYS, size=size), names)
         for given in (None, support)
     )
     assert bool((of_all * (1 - support)).any())
@@ -86,8 +86,8 @@ def test_tangent_and_adjoint_are_transposes_where_density_may_be(engine: str):
     assert torch.equal(along, tangent(scene, "density", change * support))
     known = tangent(scene_with(None, {}), "density", change * support)
     torch.testing.assert_close(along, known, rtol=1e-9, atol=1e-13)
-    gradient = gradients(scene, ["density"])[1][0]
-    weights = random_values(*along.shape, seed=3)
+    gradient = image_gradients(scene, ["density"])[1][0]
+    weights = weights_of(along)
     assert float((along * weights).sum()) == pytest.approx(float((gradient * change).sum()), 1e-9)
     pose = value_of(scene, "views.view.camera").detach()
     turn = random_values(*pose.shape, seed=6).to(pose)

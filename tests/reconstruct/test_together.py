@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from ddrecon import Scene, load_scene
-from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.together import Together
+from ddrecon.reconstruct.loop import Reconstruction, Together
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 

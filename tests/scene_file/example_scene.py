@@ -4,6 +4,8 @@ from typing import Any
 
 import yaml
 
+from ddrecon.scene_file.load import scene_text
+
 CAMERA = (
     "{type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28, resolution: [8, 6]}"
 )
@@ -26,6 +28,4 @@ views:
 def changed(**sections: Any) -> str:
     """`SCENE` with whole sections replaced, or, where the value is None, left out."""
     tree = yaml.safe_load(SCENE) | sections
-    return yaml.safe_dump(
-        {name: value for name, value in tree.items() if value is not None}, sort_keys=False
-    )
+    return scene_text({name: value for name, value in tree.items() if value is not None})

@@ -51,15 +51,17 @@ def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
     )
 
 
-def write_binary(folder: Path, model: str, name: str = "b c.png") -> None:
+def write_binary(
+    folder: Path, model: str, name: str = "b c.png", points: tuple[int, int] = (2, 0)
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     numbers = CAMERAS[model]
     header = struct.pack("<QiiQQ", 1, 7, list(MODELS).index(model), 8, 6)
     (folder / "cameras.bin").write_bytes(header + struct.pack(f"<{len(numbers)}d", *numbers))
     content = struct.pack("<Q", 2)
-    for index, label, points in ((3, name, 2), (4, "a.png", 0)):
+    for index, label, count in ((3, name, points[0]), (4, "a.png", points[1])):
         content += struct.pack("<i7di", index, *QUATERNION, *SHIFT, 7) + label.encode() + b"\0"
-        content += struct.pack("<Q", points) + bytes(24 * points)
+        content += struct.pack("<Q", count) + bytes(24 * count)
     (folder / "images.bin").write_bytes(content)
 
 
@@ -197,11 +199,11 @@ def test_a_damaged_text_is_refused(
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
 def test_a_damaged_binary_is_refused(read: Read, tmp_path: Path, file: str) -> None:
-    """Cut anywhere but where points are skipped, or claiming more than there is."""
-    write_binary(tmp_path / "sparse/0", "OPENCV")
+    """Cut anywhere, in points that are skipped as well, or claiming more than there is."""
+    write_binary(tmp_path / "sparse/0", "OPENCV", points=(0, 2))
     path = tmp_path / "sparse/0" / file
     whole = path.read_bytes()
-    for damaged in (whole[:5], whole[:30], whole[:60], b"\xff" * 8 + whole[8:], b""):
+    for damaged in (whole[:5], whole[:30], whole[:-5], b"\xff" * 8 + whole[8:], b""):
         path.write_bytes(damaged)
         with pytest.raises((FormatError, SceneError)) as caught:
             read(scene_text())

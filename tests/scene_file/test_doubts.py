@@ -26,7 +26,7 @@ def test_a_box_in_millimeters() -> None:
     """Where cameras are in meters, they stand within it; where sigma is, nothing shines through."""
     depth, inside = doubts(SIDES.format(500))
     assert "the optical depth across the box is 9.5e+03 at a density of 1" in depth
-    assert "within the box, not outside of it: camera" in inside
+    assert "views: inside the box: camera" in inside
     assert "same unit" in depth and "same unit" in inside
 
 

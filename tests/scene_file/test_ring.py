@@ -12,7 +12,7 @@ from example_scene import SCENE, changed
 
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
-from ddrecon.scene_file.schema import PerspectiveSection, RingSection
+from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
 from ddrecon.scene_file.view_sources import ring_cameras
 from ddrecon.turntable import upright_axis
 

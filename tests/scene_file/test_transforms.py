@@ -18,8 +18,13 @@ from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
-from ddrecon.scene_file.schema import FisheyeSection, OpencvSection, PerspectiveSection, ViewSection
 from ddrecon.scene_file.transforms import export_transforms
+from ddrecon.scene_file.view_schema import (
+    FisheyeSection,
+    OpencvSection,
+    PerspectiveSection,
+    ViewSection,
+)
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]

@@ -145,7 +145,9 @@ def share_by_loops(medium: Medium, directions: int) -> Tensor:
             t = step * abs(w[one]) / h
             shared[one] += (medium.grid.shape[one] > 1) * 1.5 * weight * t * (1 - t) * h**2 / step
     share = torch.ones_like(medium.extinction.value)
-    transport = medium.extinction.value - medium.mean_cosine * medium.remaining_scattering
+    # (1 - f) kappa_s times g' = (g - f) / (1 - f)
+    directed = (medium.g - medium.forward_fraction) * medium.scattering.value
+    transport = medium.extinction.value - directed
     for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
         half = 0.5 * extinction * length / max(weights, 1e-9)
         if half > 0:

@@ -8,9 +8,11 @@ from plain_rays import by_cells
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.light.moments import cut
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
-from ddrecon.transport.characteristics import Characteristic, radiance_along
-from ddrecon.transport.sweep import cell_gradient
+from ddrecon.transport.characteristics import Characteristic, Direction, Ends
+from ddrecon.transport.characteristics import radiance_along as follow
+from ddrecon.transport.sweep import cell_gradient, emitted_light
 
 DIRECTIONS = (
     (0.0, 0.0, 1.0),
@@ -38,6 +40,16 @@ def random_source(grid: Grid, colors: int = 1) -> Tensor:
 
 def outside(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64).view(-1, 1, 1, 1)
+
+
+def radiance_along(
+    medium: Medium, scatters: Tensor, rise: Tensor, inflow: Tensor | None, direction: Direction
+) -> tuple[Tensor, Ends]:
+    """I of what `scatters`, with light from outside, and what leaves the box besides that."""
+    emitted = emitted_light(medium, cut(scatters[None]), inflow)[0]
+    gradient = medium.remaining.value * rise
+    mean, gone = follow(medium.grid, medium.extinction.value, emitted, gradient, direction)
+    return mean if inflow is None else mean + inflow, gone
 
 
 @each_direction

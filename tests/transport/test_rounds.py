@@ -21,11 +21,11 @@ from ddrecon.grid import Grid, Triple
 from ddrecon.light.moments import cut
 from ddrecon.light.reduced import receive_light
 from ddrecon.lighting import solve_light
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.transport.rounds import run_rounds
-from ddrecon.transport.sweep import steep_gradient, sweep
+from ddrecon.transport.sweep import emitted_light, steep_gradient, sweep
 from ddrecon.validate.hard import ball as hard_ball
 from ddrecon.validate.hard import layer
 
@@ -51,13 +51,20 @@ def light_after(scene: Scene, rounds: int) -> Tensor:
     return solve_light(scene, SolveMemory()).diffuse[0]
 
 
+def swept_of(medium: Medium, scatters: Tensor, directions: int) -> Tensor:
+    """The moments of the radiance of what `scatters`."""
+    emitted = emitted_light(medium, cut(scatters))
+    rise = steep_gradient(medium, scatters[0], directions)
+    return sweep(medium.grid, medium.extinction.value, emitted, rise, directions)
+
+
 def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
     scene = make_scene(ball(), sigma_a=(0.0,), sigma_s=(3.0,), directional=(3.0,), tolerance=1e-10)
     medium = average_cells(scale_medium(scene.volume))
     source = receive_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
     light = last + source[0]
-    swept = sweep(medium, light[None], steep_gradient(medium, light, 44), None, 44)[0]
+    swept = swept_of(medium, light[None], 44)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
@@ -243,8 +250,7 @@ def test_memory_does_not_grow_with_directions():
         medium, source = scale_medium(scene.volume), torch.ones(1, 3, 10, 10, 10).double()
         found = []
         with saved_tensors_hooks(lambda one: found.append(one.detach()) or one, lambda one: one):
-            gradient = steep_gradient(medium, source[0], 26)
-            total = sweep(medium, source, gradient, None, directions).sum()
+            total = swept_of(medium, source, directions).sum()
         assert total.requires_grad
         return len({one.data_ptr() for one in found if one.numel() >= 1000})
 

@@ -16,10 +16,10 @@ from ddrecon.diffusion.cells import average_cells
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.solve import solve_by_multigrid
-from ddrecon.light.moments import fill
+from ddrecon.light.moments import cut, fill
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.transport.rounds import _mean_step, _transport_share, run_rounds
-from ddrecon.transport.sweep import steep_gradient, sweep
+from ddrecon.transport.sweep import emitted_light, steep_gradient, sweep
 
 has_flux_or_not = pytest.mark.parametrize("has_flux", [False, True])
 
@@ -50,7 +50,12 @@ def test_a_sweep_is_a_loop_over_directions_and_cells(has_flux: bool, varies: boo
     medium = gray_medium(shape, 0.4 * has_flux, varies)
     source = random_light(shape, degree)
     inflow = torch.full((1, 1, 1, 1), 0.3, dtype=torch.float64)
-    swept = sweep(medium, source, steep_gradient(medium, source[0], 26), inflow, 26)
+    emitted, rise = (
+        emitted_light(medium, cut(source), inflow),
+        steep_gradient(medium, source[0], 26),
+    )
+    swept = sweep(medium.grid, medium.extinction.value, emitted, rise, 26)
+    swept[0] += inflow
     expected = sweep_by_loops(medium, source, source[0, 0], 0.3, 26)
     torch.testing.assert_close(swept, expected, rtol=1e-11, atol=1e-13)
 

@@ -16,11 +16,6 @@ def rises_fused(q: Tensor) -> Tensor:
     return _find("Rises", (3, *q.shape), q)
 
 
-def means_fused(field: Tensor) -> Tensor:
-    """As `average`."""
-    return _find("Means", field.shape, field)
-
-
 def bends_fused(field: Tensor) -> Tensor:
     """As `bend`."""
     return _find("Bends", field.shape, field)

@@ -1,8 +1,8 @@
-"""Multigrid's passes as kernels (`passes.h`): listed in a table once, launched as often as wanted.
+"""Passes of multigrid and conjugate gradients as kernels (`passes.h`), in a table for all solves.
 
-On a GPU a pass is a launch, with a thread for each cell. On a processor an item is a row or a
-slice; passes over few cells, and all passes where threads are no more than colors, share a launch,
-in which a thread does the cells of a color.
+On a GPU a pass is a launch, with a thread for each cell or pair. On a processor an item is a row or
+a slice; passes over few cells, and all passes where threads are no more than colors, share a
+launch, in which a thread does the cells of a color.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import functools
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes
+from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes, pair_cells
 from ddrecon.diffusion.operator import Operator
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
@@ -25,13 +26,14 @@ from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
-    "SCALE WEIGH COARSEN MATRIX PRODUCT SMOOTH RESIDUAL RELAX RESTRICT SOLVE CORRECT",
+    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT SOLVE TURN PRODUCT ADVANCE",
     start=0,
 )
 """What a pass does, as `passes.h` has it."""
 PASS = """
-long kind, items, width, n[3], periodic, axes, face_colors, cell_colors, step, u, source, out;
-F *c[3], *loss, *inverse, *kept, *below[3], *above[3], *results[4]
+long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
+long u, source, out, factor, sums;
+F *c[3], *loss, *inverse, *coupling, *below, *above, *results[6]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
@@ -40,8 +42,9 @@ SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
 
 
-class Vector(NamedTuple):
-    """Numbers of all colors on a grid, from a `place` in the work of a cycle on.
+@dataclass(frozen=True)
+class Vector:
+    """Numbers of all colors on a grid, from a `place` in the work of a solve on.
 
     `twin`: the place of another vector of that grid, for what does not change in place.
     """
@@ -52,13 +55,13 @@ class Vector(NamedTuple):
 
 
 class KernelPasses(Passes):
-    """Lists the passes of a preparation, or of a cycle for vectors of so many `colors`.
+    """Lists the passes of a preparation, or of a solve for vectors of so many `colors`.
 
-    `is_by_cell`: whether an item does a cell, as on a GPU. `tensors`: what the table points to.
+    `tensors`: what the rows of the table point to.
     """
 
     def __init__(self, like: Tensor, colors: int = 1):
-        self.like, self.colors, self.is_by_cell = like, colors, like.is_cuda
+        self.like, self.colors = like, colors
         self.size, self.rows, self.tensors = 0, list[dict[str, int]](), list[Tensor]()
 
     def new_vector(self, shape: Sequence[int], *, has_twin: bool = False) -> Vector:
@@ -67,133 +70,103 @@ class KernelPasses(Passes):
         self.size += count * (1 + has_twin)
         return Vector(place, tuple(shape), place + count if has_twin else -1)
 
-    def scale(self, operator: Operator) -> tuple[Tensor, Tensor, Tensor]:
+    def scale(self, operator: Operator) -> tuple[Tensor, Tensor]:
         shape = operator.loss.shape
-        inverse, kept = (self.like.new_empty(shape) for _ in range(2))
-        ties = self.like.new_empty(3, math.prod(shape) // self._width(shape, 2))
-        self._add("SCALE", shape, operator, results=[inverse, kept, ties])
-        return inverse, kept, ties
+        inverse, coupling = (self.like.new_empty(shape) for _ in range(2))
+        self.add("SCALE", shape, operator, results=[inverse, coupling])
+        return inverse, coupling
 
     def coarsen(self, operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
-        grid = tuple(operator.loss.shape[1:])
-        shape = [(n + 1) // 2 if a == axis else n for a, n in enumerate(grid, 1)]
-        faces, cells = ((len(t), *shape) for t in (operator.conductances[0], operator.loss))
-        below, above, *results = (self.like.new_empty(faces) for _ in range(5))
-        results.append(self.like.new_empty(cells))
-        coarsening = Coarsening(axis, grid[axis - 1], below, above)
-        weights = [below, above, results[axis - 1]]
-        self._add_transfer("WEIGH", faces, grid, [coarsening], operator, results=weights)
-        self._add("COARSEN", cells, operator, [coarsening], grid=grid, rows=1, results=results)
-        z, y, x, loss = results
-        return coarsening, Operator((z, y, x), loss, operator.periodic)
-
-    def matrix(self, operator: Operator) -> Tensor:
-        count = operator.loss[0].numel()
-        matrix = self.like.new_empty(len(operator.loss), count, count, dtype=torch.float64)
-        self._add("MATRIX", operator.loss.shape, operator, rows=0, results=[matrix])
-        return matrix
+        cells, (_, *shape) = operator.loss.shape[axis], operator.loss.shape
+        shape[axis - 1] = (cells + 1) // 2
+        below, above, *faces = (
+            self.like.new_empty(len(operator.conductances[0]), *shape) for _ in range(5)
+        )
+        loss = self.like.new_empty(len(operator.loss), *shape)
+        coarsening = Coarsening(axis, cells, below, above)
+        # The axis first, then those across.
+        along, *across = (faces[(axis + k) % 3 - 1] for k in range(3))
+        fine = [operator.conductances[(axis + k) % 3 - 1] for k in range(3)]
+        results = [below, above, along, *across, loss]
+        self._add_pairs("WEIGH", coarsening, operator, len(loss), c=fine, results=results)
+        weights = {"axis": axis - 1, "cells": cells, "below": below, "above": above}
+        self.add("STIFFEN", below.shape, operator, shape[2], **weights, results=[along])
+        return coarsening, pair_cells(operator, axis, faces, loss)
 
     def run(self) -> None:
-        program = Program(self, "prepare")
-        launch(program.bind(self.like.new_empty(1)), program.cut(0, len(self.rows)))
-        self.rows.clear()
-
-    def product(self, operator: Operator, u: Vector, out: Vector) -> None:
-        """A u."""
-        self._add("PRODUCT", (self.colors, *u.shape), operator, u=u, out=out)
+        program, nothing = Program(self, "prepare"), self.like.new_empty(1)
+        program.run(program.bind(nothing, nothing), 0)
 
     def smooth(self, level: Level, source: Vector) -> Vector:
         out = self.new_vector(source.shape, has_twin=True)
-        return self._add_level("SMOOTH", level, out, source=source)
+        return self._relax("SMOOTH", level, out, source=source)
 
     def relax(self, level: Level, u: Vector, source: Vector, step: float) -> Vector:
         out = Vector(u.twin, u.shape, u.place)
-        return self._add_level("RELAX", level, out, u=u, source=source, step=STEPS.index(step))
+        return self._relax("RELAX", level, out, u=u, source=source, step=STEPS.index(step))
 
     def residual(self, level: Level, u: Vector, source: Vector) -> Vector:
-        out = Vector(u.twin, u.shape)
-        return self._add_level("RESIDUAL", level, out, u=u, source=source)
+        return self._relax("RESIDUAL", level, Vector(u.twin, u.shape), u=u, source=source)
+
+    def _relax(self, kind: str, level: Level, out: Vector, **values: Any) -> Vector:
+        values |= {"inverse": level.inverse, "coupling": level.coupling, "out": out}
+        self.add(kind, (self.colors, *out.shape), level.operator, **values)
+        return out
 
     def restrict(self, level: Level, residual: Vector) -> Vector:
-        for together in self._groups(level.coarsenings):
-            grid, out = residual.shape, self.new_vector(together[-1].below.shape[1:])
-            shape, vectors = (self.colors, *out.shape), {"source": residual, "out": out}
-            self._add_transfer("RESTRICT", shape, grid, together, level.operator, **vectors)
-            residual = out
+        for coarsening in level.coarsenings:
+            vectors = {"source": residual, "out": self.new_vector(coarsening.below.shape[1:])}
+            self._add_pairs("RESTRICT", coarsening, level.operator, self.colors, **vectors)
+            residual = vectors["out"]
         return residual
 
     def solve(self, inverse: Tensor, source: Vector) -> Vector:
         out = self.new_vector(source.shape, has_twin=True)
-        shape, colors = (self.colors, *out.shape), len(inverse)
-        self._add(
-            "SOLVE", shape, rows=0, inverse=inverse, cell_colors=colors, source=source, out=out
-        )
+        values: dict[str, Any] = {"inverse": inverse, "cell_colors": len(inverse)}
+        self.add("SOLVE", (self.colors, *out.shape), width=1, **values, source=source, out=out)
         return out
 
     def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
-        groups = self._groups(level.coarsenings)
-        for number, together in reversed([*enumerate(groups)]):
-            cells = {coarsening.axis: coarsening.cells for coarsening in together}
-            grid = [cells.get(axis, n) for axis, n in enumerate(coarse.shape, 1)]
-            # The last one, to the grid of u, adds to that what is kept.
-            kept, out = (None, self.new_vector(grid)) if number else (level.kept, u)
-            shape, values = (self.colors, *grid), {"source": coarse, "out": out, "kept": kept}
-            self._add_transfer("CORRECT", shape, grid, together, level.operator, **values)
+        for number, coarsening in reversed([*enumerate(level.coarsenings)]):
+            shape = [*coarse.shape]
+            shape[coarsening.axis - 1] = coarsening.cells
+            # The last one, to the grid of u, is added to that.
+            coupling, out = (level.coupling, u) if number == 0 else (None, self.new_vector(shape))
+            values = {"source": coarse, "out": out, "coupling": coupling}
+            self._add_pairs("CORRECT", coarsening, level.operator, self.colors, **values)
             coarse = out
         return u
 
-    def _groups(self, coarsenings: Sequence[Coarsening]) -> list[Sequence[Coarsening]]:
-        """Those of one pass: all on a GPU, where launches cost most; else one, as vector code."""
-        return [coarsenings] if self.is_by_cell else [[coarsening] for coarsening in coarsenings]
-
-    def _width(self, shape: Sequence[int], rows: int) -> int:
-        """How many cells an item does: one, a row, or a slice."""
-        return 1 if self.is_by_cell else math.prod(shape[len(shape) - rows :])
-
-    def _add_level(self, kind: str, level: Level, out: Vector, **values: Any) -> Vector:
-        values |= {"inverse": level.inverse, "kept": level.kept, "out": out}
-        self._add(kind, (self.colors, *out.shape), level.operator, **values)
-        return out
-
-    def _add_transfer(
-        self,
-        kind: str,
-        shape: Sequence[int],
-        grid: Sequence[int],
-        coarsenings: Sequence[Coarsening],
-        operator: Operator,
-        **values: Any,
+    def _add_pairs(
+        self, kind: str, coarsening: Coarsening, operator: Operator, colors: int, **values: Any
     ) -> None:
-        """Lists a pass along one axis, or more on a GPU. Across it rows need not be told apart."""
-        axes = {coarsening.axis for coarsening in coarsenings}
-        if not self.is_by_cell:
-            shape, grid = (_merge_axes(sizes, axes) for sizes in (shape, grid))
-        self._add(kind, shape, operator, coarsenings, grid=grid, rows=1, **values)
+        """Lists a pass over pairs of cells: an item has all of a line, or pairs side by side."""
+        shape, axis = coarsening.below.shape[1:], coarsening.axis
+        before, behind = math.prod(shape[: axis - 1]), math.prod(shape[axis:])
+        values = {"below": coarsening.below, "above": coarsening.above} | values
+        values["n"] = before, coarsening.cells, behind
+        width = behind if behind > 1 else shape[axis - 1]
+        self.add(kind, (colors, *shape), operator, width, **values)
 
-    def _add(
+    def add(
         self,
         kind: str,
         shape: Sequence[int],
         operator: Operator | None = None,
-        coarsenings: Sequence[Coarsening] = (),
-        rows: int = 2,
+        width: int | None = None,
         **values: Any,
     ) -> None:
-        """Lists a pass whose items fill `shape` [C, z, y, x]; the grid is that, or another one."""
-        width = self._width(shape, rows)
-        row: dict[str, Any] = {"kind": Kind[kind], "width": width}
-        row |= {"items": math.prod(shape) // width, "n": values.pop("grid", shape[1:]), **values}
+        """Lists a pass over all of `shape` [C, z, y, x]; `width`: of an item, None for a slice."""
+        width = 1 if self.like.is_cuda else width or shape[2] * shape[3]
+        row: dict[str, Any] = {"kind": Kind[kind], "items": math.prod(shape) // width}
+        row |= {"width": width, "n": shape[1:], "face_colors": 1}
         if operator:
             row |= {"c": operator.conductances, "loss": operator.loss}
             row |= {"face_colors": len(operator.conductances[0]), "cell_colors": len(operator.loss)}
             row["periodic"] = sum(1 << axis for axis in operator.periodic)
-        row["axes"] = sum(1 << coarsening.axis - 1 for coarsening in coarsenings)
-        for coarsening in coarsenings:
-            row[f"below_{coarsening.axis - 1}"] = coarsening.below
-            row[f"above_{coarsening.axis - 1}"] = coarsening.above
-        self.rows.append(dict(self._numbers_of(row)))
+        self.rows.append(dict(self._numbers_of(row | values)))
 
-    def _numbers_of(self, row: dict[str, Any]) -> Iterator[tuple[str, int]]:
+    def _numbers_of(self, row: Mapping[str, Any]) -> Iterator[tuple[str, int]]:
         """Each number of a `row` of the table, with its name."""
         for name, value in row.items():
             if isinstance(value, Tensor):
@@ -204,25 +177,13 @@ class KernelPasses(Passes):
             elif isinstance(value, int | None):
                 yield name, value or 0
             else:
-                for number, entry in enumerate(value):
-                    yield from self._numbers_of({f"{name}_{number}": entry})
+                yield from self._numbers_of({f"{name}_{k}": entry for k, entry in enumerate(value)})
 
 
 def entries_of(declared: str) -> Iterator[str]:
     """The names of the numbers and addresses that are `declared`, each entry of lists."""
     for _, _, name, count in declarations(declared):
         yield from [f"{name}_{entry}" for entry in range(count)] or [name]
-
-
-def _merge_axes(shape: Sequence[int], axes: set[int]) -> tuple[int, ...]:
-    """`shape` [(C,) z, y, x], in which axes that lie beside each other, and not in `axes`, are one.
-
-    So that rows, along x, are as long as can be: all of a slice for what happens across slices.
-    """
-    *colors, z, y, x = shape
-    if axes == {1}:
-        return *colors, z, 1, y * x
-    return (*colors, 1, z * y, x) if axes == {3} else (*colors, z, y, x)
 
 
 def _write_table(numbers: Sequence[int], like: Tensor) -> Tensor:
@@ -248,119 +209,144 @@ def table_kernel() -> TextKernel:
 
 
 class Program:
-    """A table of passes where kernels see it, and the launches that do them.
+    """A table of passes where kernels see it, and the launches of its steps.
 
-    `size`: how many numbers vectors take.
+    `steps`: the pass with which each begins. `size`: how many numbers vectors take.
     """
 
-    def __init__(self, passes: KernelPasses, name: str):
-        like, self.colors, self.size = passes.like, passes.colors, passes.size
-        self.kernel = passes_kernel(name, 8 * like.itemsize)
-        self.rows, self.tensors = [*passes.rows], [*passes.tensors]
+    def __init__(self, passes: KernelPasses, name: str, steps: Sequence[int] = (0,)):
+        like, self.size, rows = passes.like, passes.size, passes.rows
+        self.kernel, self.tensors = passes_kernel(name, 8 * like.itemsize), passes.tensors
         names = [*entries_of(PASS)]
-        numbers = [row.get(name, 0) for row in self.rows for name in names]
-        self.table = _write_table(numbers, like)
+        self.table = _write_table([row.get(name, 0) for row in rows for name in names], like)
         # So many cells of all colors are best done by one thread for each color.
-        self.most = -1 if like.is_cuda else SMALL
-        if not like.is_cuda and thread_count(like) <= self.colors:
-            self.most = sys.maxsize
+        most = -1 if like.is_cuda else SMALL
+        if not like.is_cuda and thread_count(like) <= passes.colors:
+            most = sys.maxsize
+        ends = zip(steps, [*steps[1:], len(rows)], strict=True)
+        self.launches = [_list_launches(rows, *end, passes.colors, most) for end in ends]
 
-    def bind(self, work: Tensor) -> Bound:
-        """The kernel, for vectors in `work`."""
-        return self.kernel.bind({"table": self.table}, {"work": work})
+    def bind(self, work: Tensor, solution: Tensor) -> Bound:
+        """The kernel, for vectors in `work` and a `solution`."""
+        return self.kernel.bind({"table": self.table}, {"work": work, "solution": solution})
 
-    def cut(self, first: int, last: int) -> list[dict[str, int]]:
-        """Launches of the passes from `first` to `last`: each all of one, or a color of several."""
-        launches = list[dict[str, int]]()
-        for number, row in enumerate(self.rows[first:last], first):
-            is_shared = row["items"] * row["width"] > self.most
-            if launches and launches[-1]["parts"] and not is_shared:
-                launches[-1]["end"] = number + 1
-                continue
-            count, parts = (row["items"], 0) if is_shared else (self.colors, self.colors)
-            launches.append({"count": count, "begin": number, "end": number + 1, "parts": parts})
-        return launches
+    def run(self, bound: Bound, step: int) -> None:
+        """Does the passes of a step."""
+        for arguments in self.launches[step]:
+            bound.launch(**arguments)
 
 
-def launch(bound: Bound, launches: Sequence[Mapping[str, int]]) -> None:
-    """Does the passes of a `bound` program, as it was `cut`."""
-    for arguments in launches:
-        bound.launch(**arguments)
+def _list_launches(
+    rows: Sequence[Mapping[str, int]], first: int, last: int, colors: int, most: int
+) -> list[dict[str, int]]:
+    """Launches of the passes from `first` to `last`.
+
+    A pass over more than `most` cells is one. Others share it, an item does a color of them all.
+    """
+    launches = list[dict[str, int]]()
+    for number, row in enumerate(rows[first:last], first):
+        is_large = row["items"] * row["width"] > most
+        if launches and launches[-1]["shares"] and not is_large:
+            launches[-1]["end"] = number + 1
+            continue
+        count, shares = (row["items"], 0) if is_large else (colors, colors)
+        launches.append({"count": count, "begin": number, "end": number + 1, "shares": shares})
+    return launches
 
 
 @functools.cache
 def passes_kernel(name: str, bits: int) -> TextKernel:
-    """The passes of a table from `begin` to `end`: an item of each, or one of so many `parts`.
+    """The passes of a table from `begin` to `end`: an item of each, or one of so many `shares`.
 
-    `name`: those that `prepare` a hierarchy, or those of a `cycle`.
+    `name`: those that `prepare` a hierarchy, or those that `iterate`.
     """
     steps = ", ".join(f"F({step!r})" for step in STEPS)
     text = f"""
     for (int k = begin; k < end; ++k) {{
         const Pass<F>& pass = ((const Pass<F>*)table)[k];
-        const Size from = parts ? pass.items * item / parts : item;
-        const Size to = parts ? pass.items * (item + 1) / parts : item + 1;
-        for (Size i = from; i < to; ++i) {name}(pass, work, {steps}, i);
+        const Size from = shares ? pass.items * item / shares : item;
+        const Size to = shares ? pass.items * (item + 1) / shares : item + 1;
+        for (Size i = from; i < to; ++i) {name}(pass, work, solution, {steps}, i);
     }}
     """
-    declared = "long *table; int begin, end, parts; F *work"
+    declared = "long *table; int begin, end, shares; F *work, *solution"
     header = "diffusion/fused/passes.h"
-    return TextKernel(f"multigrid_{name}", bits, text, declared, "work", header)
+    return TextKernel(f"multigrid_{name}", bits, text, declared, "work solution", header)
 
 
 def name_kernels(like: Tensor) -> None:
     """Has the kernels of a solve on tensors `like` this compiled meanwhile."""
-    for name in ("cycle", "prepare"):
+    for name in ("iterate", "prepare"):
         launch_later(passes_kernel(name, 8 * like.itemsize).kernel, like)
 
 
 class KernelGrids:
-    """The grids of an operator, and the program of products and cycles for each count of colors."""
+    """The grids of an operator, and the program of a solve for each count of colors."""
 
     def __init__(self, operator: Operator):
         faces = max(map(len, operator.conductances))
         z, y, x = (c.expand(faces, -1, -1, -1).contiguous() for c in operator.conductances)
         loss = operator.loss.expand(max(faces, len(operator.loss)), -1, -1, -1).contiguous()
-        self.operator = Operator((z, y, x), loss, operator.periodic)
+        self.operator = replace(operator, conductances=(z, y, x), loss=loss, prepared={})
         # Colors that share nothing are prepared one after another.
         colors = faces if faces == len(loss) else 1
         self.hierarchy = Hierarchy.of(self.operator, KernelPasses(loss, colors))
         self.programs: dict[int, tuple[Program, list[Vector]]] = {}
 
     def program(self, colors: int) -> tuple[Program, list[Vector]]:
-        """The program, a cycle before a product; direction and residual, product and solution."""
+        """The three steps of an iteration, and the vectors of `KernelSteps`, in their order."""
         if colors not in self.programs:
-            loss = self.operator.loss
-            passes = KernelPasses(loss, colors)
-            direction, residual = (passes.new_vector(loss.shape[1:]) for _ in range(2))
-            solution = self.hierarchy.cycle(passes, residual)
-            product = Vector(solution.twin, solution.shape)
-            passes.product(self.operator, direction, product)
-            vectors = [direction, residual, product, solution]
-            self.programs[colors] = Program(passes, "cycle"), vectors
+            operator, passes = self.operator, KernelPasses(self.operator.loss, colors)
+            grid = operator.loss.shape[1:]
+            direction, residual = (passes.new_vector(grid) for _ in range(2))
+            factor = passes.new_vector((1, 1, 1))
+            sums = passes.new_vector(grid if operator.loss.is_cuda else grid[:1])
+            preconditioned = self.hierarchy.cycle(passes, residual)
+            product = Vector(preconditioned.twin, grid)
+            turn = len(passes.rows)
+            passes.rows[-1]["sums"] = sums.place
+            values: dict[str, Any] = {"u": direction, "factor": factor, "sums": sums}
+            values["inverse"], shape = self.hierarchy.inverse_diagonal, (colors, *grid)
+            passes.add("TURN", shape, operator, **values, source=preconditioned)
+            passes.add("PRODUCT", shape, operator, **values, out=product)
+            passes.add("ADVANCE", shape, operator, **values, source=product, out=residual)
+            vectors = [direction, residual, preconditioned, product, factor, sums]
+            self.programs[colors] = Program(passes, "iterate", (0, turn, turn + 2)), vectors
         return self.programs[colors]
 
 
-class KernelCycle:
-    """Products and V-cycles of an operator, of vectors like `source`, by kernels."""
+class KernelSteps:
+    """As `TensorSteps`, by kernels."""
 
     def __init__(self, operator: Operator, source: Tensor):
-        grids = operator.once(KernelGrids)
-        program, vectors = grids.program(len(source))
-        work = source.new_empty(program.size)
-        self.hierarchy, self._bound = grids.hierarchy, program.bind(work)
-        last = len(program.rows) - 1
-        self._cycle, self._product = program.cut(0, last), program.cut(last, last + 1)
-        self.direction, self.residual, self.room, self._solution = (
-            work[vector.place :][: source.numel()].view_as(source) for vector in vectors
+        grids, colors = operator.once(KernelGrids), len(source)
+        self._program, vectors = grids.program(colors)
+        self.inverse = grids.hierarchy.inverse_diagonal
+        self.solution, work = source.new_zeros(source.shape), source.new_empty(self._program.size)
+        self._bound = self._program.bind(work, self.solution)
+        (
+            self.direction,
+            self.residual,
+            self.preconditioned,
+            self.product,
+            self._factor,
+            self._sums,
+        ) = (
+            work[vector.place :][: colors * math.prod(vector.shape)].view(colors, *vector.shape)
+            for vector in vectors
         )
 
-    def product(self) -> Tensor:
-        """A times the direction."""
-        launch(self._bound, self._product)
-        return self.room
+    def precondition(self) -> Tensor:
+        return self._run(0)
 
-    def cycle(self) -> Tensor:
-        """Roughly A^-1 times the residual."""
-        launch(self._bound, self._cycle)
-        return self._solution
+    def turn(self, factor: Tensor) -> Tensor:
+        self._factor.copy_(factor)
+        return self._run(1)
+
+    def advance(self, factor: Tensor) -> Tensor:
+        self._factor.copy_(factor)
+        return self._run(2)
+
+    def _run(self, step: int) -> Tensor:
+        self._program.run(self._bound, step)
+        return self._sums.flatten(1).sum(1).view(-1, 1, 1, 1)

@@ -10,7 +10,7 @@ struct Sharp {
 
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {
         // to the fourth power, which must not overflow
-        const N given = number[0] * in[2], depth = given / (1 + given / 1000000);
+        const N full = number[0] * in[2], depth = full / (1 + full / 1000000);
         const N square = depth * depth;
         const N light = in[0] - in[1] / (8 * (1 + square * square));
         out[0] = pick(value_of(light) < 0, 0 * light, light);

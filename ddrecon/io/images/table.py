@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.extras import is_there
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
@@ -149,7 +149,7 @@ def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
     picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
     with replace_file(array) as temporary:
         np.save(temporary, as_float32(pixels), allow_pickle=False)
-    if not is_there(PACKAGE):
+    if find_spec(PACKAGE) is None:
         return [array]
     write_exr(picture, pixels)
     return [picture, array]

@@ -12,8 +12,8 @@ INLINE constexpr double find_root(double x) {
 }
 // What makes the mean square of a harmonic 1; and (2 M - 1)!!.
 template <int L, int M> constexpr double NORM =
-    find_root((M ? 2 : 1) * (2 * L + 1) * FACTORIAL<L - M> / FACTORIAL<L + M>);
-template <int M> constexpr double ODD = FACTORIAL<2 * M> / (FACTORIAL<M> * (1 << M));
+    find_root((M ? 2 : 1) * (2 * L + 1) * factorial(L - M) / factorial(L + M));
+template <int M> constexpr double ODD = factorial(2 * M) / (factorial(M) * (1 << M));
 
 // y_k of a vector v, z first, from those of order M and degree L on (`numerics/harmonics.py`):
 // `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `below` that of L - 1.
@@ -63,11 +63,12 @@ template <class F> struct View {
     }
 };
 
-// Light of DEGREE > 0 in angle, its moments of degree l times a factor. Given are fields: all
-// moments phi, and radiance besides (HAS_MORE). And numbers: where the camera is, which VARIES, and
-// the factors.
+// Light of DEGREE > 0 in angle, its moments of degree l times a factor. Fields are all moments phi,
+// and radiance besides (HAS_MORE); numbers are where the camera is, which VARIES, and the factors.
 template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
     static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1), INS = COUNT + HAS_MORE;
+    static constexpr int LAST = DEGREE;
+    static constexpr bool MOVES = VARIES;
     enum { EYE = 0, FACTOR = 3, NUMBERS = 4 + DEGREE };
 
     // Harmonics towards the camera, at a cell; what moments of each degree add; and what all but
@@ -98,77 +99,68 @@ template <int DEGREE, bool HAS_MORE, bool VARIES> struct Outgoing {
             seen.along += factor[l] * seen.sum[l];
         }
     }
-
-    template <class F, class N, class In> static INLINE void scatter(
-        const Row& row, const View<F>& view, const In* in, const N* number, F* radiance) {
-        F first[3];
-        view.center_of(row, first);
-        F* out = radiance + row.at;
-        INDEPENDENT
-        for (int i = 0; i < row.width; ++i) {
-            const N even = number[FACTOR] * in[0][i];
-            Directed<N> seen;
-            direct(view, first, i, number + EYE, number + FACTOR, in, seen);
-            out[i] = change_of(floored(even, seen.along, view.margin, view.least));
-        }
-    }
-
-    template <class F> static INLINE void scatter_back(
-        const Row& row, const View<F>& view, const F* const* in, const F* number, const F* bar,
-        F* const* out, F* sums) {
-        REORDERED
-        typedef typename If<VARIES, Dual<F, 3>, F>::type N;
-        const F* const factor = number + FACTOR;
-        F first[3], sum[NUMBERS];
-        N eye[3] = {N(number[0]), N(number[1]), N(number[2])};
-        view.center_of(row, first);
-        if constexpr (VARIES)
-            for (int a = 0; a < 3; ++a) eye[a].by[a] = F(1);
-        UNROLLED
-        for (int k = 0; k < NUMBERS; ++k) sum[k] = F(0);
-        INDEPENDENT
-        for (int i = 0; i < row.width; ++i) {
-            Directed<N> seen;
-            direct(view, first, i, eye, factor, in, seen);
-            Dual<F, 2> even(factor[0] * in[0][i]), along(value_of(seen.along));
-            even.by[0] = along.by[1] = F(1);
-            const Dual<F, 2> radiance = floored(even, along, view.margin, view.least);
-            const F even_bar = bar[i] * radiance.by[0], along_bar = bar[i] * radiance.by[1];
-            sum[FACTOR] += in[0][i] * even_bar;
-            out[0][i] = factor[0] * even_bar;
-            UNROLLED
-            for (int l = 1; l <= DEGREE; ++l) {
-                sum[FACTOR + l] += value_of(seen.sum[l]) * along_bar;
-                UNROLLED
-                for (int k = l * l; k < (l + 1) * (l + 1); ++k)
-                    out[k][i] = factor[l] * along_bar * value_of(seen.y[k]);
-            }
-            if constexpr (HAS_MORE) out[COUNT][i] = along_bar;
-            if constexpr (VARIES)
-                for (int a = 0; a < 3; ++a) sum[EYE + a] += along_bar * seen.along.by[a];
-        }
-        UNROLLED
-        for (int k = 0; k < NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
-    }
 };
 
+// The radiance in a row; where N are dual numbers, its change.
 template <class Cell, class N, class F> INLINE void find_values(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
     const F* const* d_fields, const F* numbers, const F* d_numbers, F* const* outputs) {
     const Inputs<N, Cell::INS, Cell::NUMBERS, F> inputs(
         row, channels, fields, d_fields, numbers, d_numbers);
-    Cell::scatter(row, view, inputs.in, inputs.number, outputs[0]);
+    const N* number = inputs.number;
+    F first[3], *radiance = outputs[0] + row.at;
+    view.center_of(row, first);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        const N even = number[Cell::FACTOR] * inputs.in[0][i];
+        typename Cell::template Directed<N> seen;
+        Cell::direct(view, first, i, number + Cell::EYE, number + Cell::FACTOR, inputs.in, seen);
+        radiance[i] = change_of(floored(even, seen.along, view.margin, view.least));
+    }
 }
 
+// Cotangents of fields, and of numbers `sums` over a row, from that of the radiance.
 template <class Cell, class F> INLINE void find_cotangents(
     const Row& row, const View<F>& view, const int* channels, const F* const* fields,
     const F* numbers, const F* const* bars, F* const* outputs, F* sums) {
-    const F* in[Cell::INS];
-    F number[Cell::NUMBERS], *out[Cell::INS];
+    REORDERED
+    typedef typename If<Cell::MOVES, Dual<F, 3>, F>::type N;
+    constexpr int EYE = Cell::EYE, FACTOR = Cell::FACTOR, COUNT = Cell::COUNT;
+    const F *in[Cell::INS], *bar = bars[0] + row.at;
+    F number[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS], first[3];
     row.in_all<Cell::INS>(fields, channels, in);
     row.of_color<Cell::NUMBERS>(numbers, number);
     row.in_all<Cell::INS>(outputs, out);
-    Cell::scatter_back(row, view, in, number, bars[0] + row.at, out, sums);
+    view.center_of(row, first);
+    const F* const factor = number + FACTOR;
+    N eye[3] = {N(number[0]), N(number[1]), N(number[2])};
+    if constexpr (Cell::MOVES)
+        for (int a = 0; a < 3; ++a) eye[a].by[a] = F(1);
+    UNROLLED
+    for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] = F(0);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        typename Cell::template Directed<N> seen;
+        Cell::direct(view, first, i, eye, factor, in, seen);
+        Dual<F, 2> even(factor[0] * in[0][i]), along(value_of(seen.along));
+        even.by[0] = along.by[1] = F(1);
+        const Dual<F, 2> radiance = floored(even, along, view.margin, view.least);
+        const F even_bar = bar[i] * radiance.by[0], along_bar = bar[i] * radiance.by[1];
+        sum[FACTOR] += in[0][i] * even_bar;
+        out[0][i] = factor[0] * even_bar;
+        UNROLLED
+        for (int l = 1; l <= Cell::LAST; ++l) {
+            sum[FACTOR + l] += value_of(seen.sum[l]) * along_bar;
+            UNROLLED
+            for (int k = l * l; k < (l + 1) * (l + 1); ++k)
+                out[k][i] = factor[l] * along_bar * value_of(seen.y[k]);
+        }
+        if constexpr (Cell::INS > COUNT) out[COUNT][i] = along_bar;
+        if constexpr (Cell::MOVES)
+            for (int a = 0; a < 3; ++a) sum[EYE + a] += along_bar * seen.along.by[a];
+    }
+    UNROLLED
+    for (int k = 0; k < Cell::NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
 }
 
 } // namespace ddrecon

@@ -4,94 +4,87 @@
 
 namespace ddrecon {
 
-template <class F> INLINE F blend(F a, F low, F high) { return low + a * (high - low); }
-
 template <class F, int BLOCK> struct Ways {
     int ways, samples, channels, depth, height, width;
-    const F *fields, *firsts, *lasts, *lengths, *fraction;
+    const F *field, *first, *last, *length, *fraction;
 
-    // Where sample i of way t lies along an axis, z, y or x.
-    INLINE F place(int i, int t, int axis) const {
-        const F last = lasts[axis * ways + t];
-        return last - fraction[i] * (last - firsts[axis * ways + t]);
-    }
     INLINE int count_from(int begin) const { return begin + BLOCK < ways ? BLOCK : ways - begin; }
     INLINE long long cells() const { return (long long)depth * height * width; }
-    // From a cell to its next neighbors.
-    INLINE int up_z() const { return depth > 1 ? height * width : 0; }
-    INLINE int up_y() const { return height > 1 ? width : 0; }
-    INLINE int up_x() const { return width > 1 ? 1 : 0; }
 
-    // The cell before a place on a line, and the part of the way to the next one; not beyond the
-    // outermost centers.
+    // The cell before a place on a line of `cells`, and the part of the way to the next one; not
+    // beyond the outermost centers.
     struct Between {
         int n;
         F a;
-        INLINE Between(F at, F most) {
-            const F inside = at < F(0) ? F(0) : at > most ? most : at;
-            const int whole = (int)inside, last = most < F(1) ? 0 : (int)most - 1;
-            n = whole < last ? whole : last;
+        INLINE Between(F at, int cells) {
+            const F most = F(cells - 1), inside = at < F(0) ? F(0) : at > most ? most : at;
+            const int whole = (int)inside, before = cells > 1 ? cells - 2 : 0;
+            n = whole < before ? whole : before;
             a = inside - F(n);
         }
     };
-    // The cells around sample i of way t.
+    // Where sample i of way t lies along an axis, z, y or x.
+    INLINE Between place(int i, int t, int axis, int cells) const {
+        const F end = last[axis * ways + t];
+        return Between(end - fraction[i] * (end - first[axis * ways + t]), cells);
+    }
+    // The first of the eight cells around a sample, and the parts of the way to the next ones.
     struct Corners {
-        Between z, y, x;
         int at;
-        INLINE Corners(const Ways& all, int i, int t)
-            : z(all.place(i, t, 0), F(all.depth - 1)),
-              y(all.place(i, t, 1), F(all.height - 1)),
-              x(all.place(i, t, 2), F(all.width - 1)) {
-            at = (z.n * all.height + y.n) * all.width + x.n;
-        }
-        // The field there.
-        INLINE F look(const Ways& all, const F* field) const {
-            auto row = [&](int from) HERE {
-                return blend(x.a, field[at + from], field[at + from + all.up_x()]);
-            };
-            auto layer = [&](int from) HERE {
-                return blend(y.a, row(from), row(from + all.up_y()));
-            };
-            return blend(z.a, layer(0), layer(all.up_z()));
-        }
+        F z, y, x;
     };
+    INLINE Corners corners(int i, int t) const {
+        const Between z = place(i, t, 0, depth), y = place(i, t, 1, height);
+        const Between x = place(i, t, 2, width);
+        return {(z.n * height + y.n) * width + x.n, z.a, y.a, x.a};
+    }
+    // One of these cells, and what it counts for.
+    INLINE int cell(const Corners& around, int k) const {
+        return around.at + (k / 4 && depth > 1 ? height * width : 0) +
+               (k / 2 % 2 && height > 1 ? width : 0) + (k % 2 && width > 1);
+    }
+    static INLINE F weight(const Corners& around, int k) {
+        return (k / 4 ? around.z : F(1) - around.z) * (k / 2 % 2 ? around.y : F(1) - around.y) *
+               (k % 2 ? around.x : F(1) - around.x);
+    }
 
-    INLINE void integrate(int item, F* totals) const {
+    INLINE void integrate(int item, F* total) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
-            const F* __restrict field = fields + channel * cells();
+            const F* __restrict values = field + channel * cells();
             F sum[BLOCK];
             for (int t = 0; t < count; ++t) sum[t] = F(0);
             for (int i = 0; i < samples; ++i)
-                for (int t = 0; t < count; ++t)
-                    sum[t] += Corners(*this, i, begin + t).look(*this, field);
-            F* __restrict total = totals + (long long)channel * ways + begin;
-            for (int t = 0; t < count; ++t) total[t] = sum[t] * lengths[begin + t] / F(samples);
+                for (int t = 0; t < count; ++t) {
+                    const Corners around = corners(i, begin + t);
+                    UNROLLED
+                    for (int k = 0; k < 8; ++k)
+                        sum[t] += weight(around, k) * values[cell(around, k)];
+                }
+            F* __restrict out = total + (long long)channel * ways + begin;
+            for (int t = 0; t < count; ++t) out[t] = sum[t] * length[begin + t] / F(samples);
         }
     }
 
-    // The field's cotangent, from those of `totals`.
-    INLINE void integrate_back(int item, const F* totals, F* fields_bar) const {
+    // Adds to the field's cotangent, from that of `total`.
+    INLINE void integrate_back(int item, const F* total, F* field_bar) const {
         const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
-            const F* __restrict bar = totals + (long long)channel * ways + begin;
-            F part[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
-            int corner[BLOCK];
-            for (int t = 0; t < count; ++t) part[t] = bar[t] * lengths[begin + t] / F(samples);
+            const F* __restrict bar = total + (long long)channel * ways + begin;
+            F* const bars = field_bar + channel * cells();
+            F sample_bar[BLOCK], z[BLOCK], y[BLOCK], x[BLOCK];
+            int at[BLOCK];
+            for (int t = 0; t < count; ++t) sample_bar[t] = bar[t] * length[begin + t] / F(samples);
             for (int i = 0; i < samples; ++i) {
                 for (int t = 0; t < count; ++t) {
-                    const Corners own(*this, i, begin + t);
-                    corner[t] = own.at, az[t] = own.z.a, ay[t] = own.y.a, ax[t] = own.x.a;
+                    const Corners around = corners(i, begin + t);
+                    at[t] = around.at, z[t] = around.z, y[t] = around.y, x[t] = around.x;
                 }
                 for (int t = 0; t < count; ++t) {
-                    auto add_row = [&](int from, F value) HERE {
-                        F* const to = fields_bar + channel * cells() + corner[t] + from;
-                        add_to(to, value - value * ax[t]), add_to(to + up_x(), value * ax[t]);
-                    };
-                    auto add_layer = [&](int from, F value) HERE {
-                        add_row(from, value - value * ay[t]), add_row(from + up_y(), value * ay[t]);
-                    };
-                    add_layer(0, part[t] - part[t] * az[t]), add_layer(up_z(), part[t] * az[t]);
+                    const Corners around = {at[t], z[t], y[t], x[t]};
+                    UNROLLED
+                    for (int k = 0; k < 8; ++k)
+                        add_to(bars + cell(around, k), weight(around, k) * sample_bar[t]);
                 }
             }
         }

@@ -56,15 +56,15 @@ class _Integral(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor | None, ...]:
-        ways = field, *_, length, _ = ctx.saved_tensors
+        field, *ways = ctx.saved_tensors
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
         threads = count_shares(thread_count(field), field.nbytes)
-        shares = [field.new_zeros(field.shape) for _ in range(threads)]
-        own = [{"fields_bar": share} for share in shares]
-        items, _ = cut(len(length), BLOCK, length)
-        kernel = way_kernel(True, field.element_size() * 8)
-        kernel.launch(items, _ways(*ways) | {"totals": total_bar}, own[0], shares=own)
-        return functools.reduce(Tensor.add_, shares), None, None, None, None
+        bars = [{"field_bar": field.new_zeros(field.shape)} for _ in range(threads)]
+        items, _ = cut(len(ways[2]), BLOCK, field)
+        arguments = _ways(field, *ways) | {"total": total_bar}
+        way_kernel(True, 8 * field.itemsize).launch(items, arguments, bars[0], shares=bars)
+        field_bar = functools.reduce(Tensor.add_, (bar["field_bar"] for bar in bars))
+        return field_bar, None, None, None, None
 
     @staticmethod
     def jvp(ctx: Any, d_field: Tensor | None, *_: None) -> Tensor:
@@ -78,34 +78,28 @@ def _integrate(field: Tensor, *ways: Tensor) -> Tensor:
     """The integral of `field` along `ways`."""
     total = field.new_empty(len(field), len(ways[2]))
     items, _ = cut(len(ways[2]), BLOCK, field)
-    kernel = way_kernel(False, field.element_size() * 8)
-    kernel.launch(items, _ways(field, *ways), {"totals": total})
+    way_kernel(False, 8 * field.itemsize).launch(items, _ways(field, *ways), {"total": total})
     return total
 
 
-def _ways(
-    field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
-) -> dict[str, Any]:
-    """What both kernels are given."""
-    channels, depth, height, width = field.shape
-    sizes = {"channels": channels, "depth": depth, "height": height, "width": width}
-    sizes |= {"ways": len(length), "samples": len(fraction)}
-    arrays = {"fields": field, "firsts": first, "lasts": last, "lengths": length}
-    return sizes | arrays | {"fraction": fraction}
+_SIZES = "ways, samples, channels, depth, height, width"
+_ARRAYS = "field, first, last, length, fraction"
 
 
-_WAYS = "ways, samples, channels, depth, height, width, fields, firsts, lasts, lengths, fraction"
-_GIVEN = """
-int ways, samples, channels, depth, height, width;
-F *fields, *firsts, *lasts, *lengths, *fraction, *totals, *fields_bar
-"""
+def _ways(field: Tensor, *ways: Tensor) -> dict[str, Any]:
+    """What both kernels read."""
+    sizes = len(ways[2]), len(ways[3]), *field.shape
+    names = f"{_SIZES}, {_ARRAYS}".split(", ")
+    return dict(zip(names, (*sizes, field, *ways), strict=True))
 
 
 @functools.cache
 def way_kernel(is_adjoint: bool, bits: int) -> TextKernel:
-    """The kernel of integrals along ways, `totals`; or its adjoint, from cotangents `totals`."""
-    made = "fields_bar" if is_adjoint else "totals"
-    call = "integrate_back(item, totals, fields_bar)" if is_adjoint else "integrate(item, totals)"
-    text = f"Ways<F, IS_GPU ? 1 : {BLOCK}>{{{_WAYS}}}.{call};"
-    name = f"ways{'_adjoint' * is_adjoint}"
-    return TextKernel(name, bits, text, _GIVEN, made, "light/fused/point_light.h")
+    """The kernel of integrals along ways; or its adjoint, from cotangents in `total`."""
+    call = "integrate_back(item, total, field_bar)" if is_adjoint else "integrate(item, total)"
+    text = f"Ways<F, IS_GPU ? 1 : {BLOCK}>{{{_SIZES}, {_ARRAYS}}}.{call};"
+    declared = f"int {_SIZES}; F *{', *'.join(_ARRAYS.split(', '))}, *total"
+    header, name = "light/fused/point_light.h", f"ways{'_adjoint' * is_adjoint}"
+    if is_adjoint:
+        return TextKernel(name, bits, text, f"{declared}, *field_bar", "field_bar", header)
+    return TextKernel(name, bits, text, declared, "total", header)

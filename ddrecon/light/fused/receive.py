@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,12 +10,11 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import launch_later
 from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.light.beam import MOST_BEAMS
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 CHUNK = 256
 """Cells that one item does on a processor; on a GPU it is one."""
-MOST_BEAMS = 48
-"""So many beams at most are received at once."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 
@@ -26,21 +24,25 @@ def receive(
 ) -> Tensor:
     """Moments [moments, C, z, y, x] of L beams together: `weights` times tau, averaged over cells.
 
-    `field` [K, z, y, x] and `scale` [C] of the extinction; `entered` [L, K, z, y, x]: the mass up
-    to where beams enter cells; `steps` [L] [u]: their paths in these; `weights` [L, moments, C].
+    `field` [K, z, y, x] and `scale` [C or 1, 1, 1, 1] of the extinction; `entered` [L, K, z, y, x]:
+    the mass up to where beams enter cells; `steps` [L] [u]: their paths in these; `weights`
+    [L, moments, C or 1].
     """
-    moments: Tensor = _Received.apply(field, scale, entered, steps, weights)
-    return moments
+    colors = max(weights.shape[2], len(scale))
+    weights, scales = weights.expand(-1, -1, colors), scale.view(-1).expand(len(steps), 1, colors)
+    numbers = torch.cat([scales, scales * steps[:, None, None], weights], 1)
+    phi: Tensor = _Received.apply(field, entered, numbers)
+    return phi
 
 
 class _Received(torch.autograd.Function):
-    """What `receive` returns."""
+    """The moments, by `numbers` [L, 2 + moments, C]: scale, scale times step, and weights."""
 
     @staticmethod
-    def forward(*tensors: Tensor) -> Tensor:
-        if any(tensor.requires_grad for tensor in tensors):
-            launch_later(receive_kernel("receive_back", 8 * tensors[0].itemsize).kernel, tensors[0])
-        return _receive("receive", _arguments(tensors))
+    def forward(field: Tensor, entered: Tensor, numbers: Tensor) -> Tensor:
+        if field.requires_grad or entered.requires_grad or numbers.requires_grad:
+            launch_later(receive_kernel("receive_back", 8 * field.itemsize).kernel, field)
+        return _receive("receive", field, entered, numbers)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -49,80 +51,78 @@ class _Received(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
-        # Once: each access may compute them again.
-        field, _, entered, _, weights = tensors = ctx.saved_tensors
-        _, needs_scale, _, needs_steps, needs_weights = ctx.needs_input_grad
-        varies = needs_scale or needs_steps or needs_weights
-        lights, moments, colors = weights.shape
-        arguments = _arguments(tensors) | {"varies": varies, "bars": bar}
+        field, entered, numbers = ctx.saved_tensors
+        vary = ctx.needs_input_grad[2]
+        arguments = _arguments(field, entered, numbers) | {"vary": vary, "bars": bar}
         field_bar, entered_bar = field.new_zeros(field.shape), field.new_empty(entered.shape)
-        bars = {"field_bar": field_bar, "entered_bar": entered_bar}
+        numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
+
+        # Sums of as many items at a time as memory has room for.
         items, _ = cut(field[0].numel(), CHUNK, field)
-        width = 1 + (1 + moments) * colors
-        total = field.new_zeros(lights, width, dtype=torch.float64)
-        most = max(1, MOST_SUMS // total.numel()) if varies else items
-        kernel = receive_kernel("receive_back", 8 * field.element_size())
+        most = max(1, MOST_SUMS // numbers.numel()) if vary else items
+        kernel = receive_kernel("receive_back", 8 * field.itemsize)
         for first in range(0, items, most):
             count = min(most, items - first)
-            sums = total.new_zeros(count * varies, lights, width)
-            kernel.launch(count, arguments | {"first_item": first}, bars | {"sums": sums})
-            total += sums.sum(0)
-        if not varies:
-            return field_bar, None, entered_bar, None, None
-        steps_bar, scale_bar, weights_bar = total.to(field).split([1, colors, moments * colors], 1)
-        weights_bar = weights_bar.reshape(weights.shape)
-        return field_bar, scale_bar.sum(0), entered_bar, steps_bar[:, 0], weights_bar
+            sums = numbers_bar.new_zeros(count * vary, *numbers.shape)
+            bars = {"field_bar": field_bar, "entered_bar": entered_bar, "sums": sums}
+            kernel.launch(count, arguments | {"first_item": first}, bars)
+            numbers_bar += sums.sum(0)
+        return field_bar, entered_bar, numbers_bar.to(numbers)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            values, d_values = tensors[:5], tensors[5:]
-            arguments = _arguments(values)
-            for name, value, d_value in zip(_ARRAYS, values, d_values, strict=True):
-                arguments[f"d_{name}"] = torch.zeros_like(value) if d_value is None else d_value
-            return _receive("tangent", arguments)
+            d_field, d_entered, d_numbers = (
+                torch.zeros_like(value) if d_value is None else d_value
+                for value, d_value in zip(tensors[:3], tensors[3:], strict=True)
+            )
+            d_values = {"d_field": d_field, "d_entered": d_entered, "d_numbers": d_numbers}
+            return _receive("tangent", *tensors[:3], **d_values)
 
-        d_moments: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
-        return d_moments
+        d_phi: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_phi
 
 
-_ARRAYS = "field", "scale", "entered", "steps", "weights"
 _SIZES = "cells, channels, colors, moments, lights"
 
 
-def _arguments(tensors: Sequence[Tensor]) -> dict[str, Any]:
-    """What all kernels are given: arrays and their sizes, by name."""
-    field, weights = tensors[0], tensors[-1]
-    lights, moments, colors = weights.shape
-    sizes = field[0].numel(), len(field), colors, moments, lights
-    names = *_ARRAYS, *_SIZES.split(", ")
-    return dict(zip(names, (*tensors, *sizes), strict=True))
+def _arguments(field: Tensor, entered: Tensor, numbers: Tensor) -> dict[str, Any]:
+    """What all kernels read: arrays and their sizes, by name."""
+    lights, rows, colors = numbers.shape
+    sizes = field[0].numel(), len(field), colors, rows - 2, lights
+    arrays = {"field": field, "entered": entered, "numbers": numbers}
+    return arrays | dict(zip(_SIZES.split(", "), sizes, strict=True))
 
 
-def _receive(kind: str, arguments: dict[str, Any]) -> Tensor:
+def _receive(
+    kind: str, field: Tensor, entered: Tensor, numbers: Tensor, **changes: Tensor
+) -> Tensor:
     """Moments, or of kind "tangent" their changes."""
-    field: Tensor = arguments["field"]
+    arguments = _arguments(field, entered, numbers) | changes
     phi = field.new_empty(arguments["moments"], arguments["colors"], *field.shape[1:])
     items, _ = cut(field[0].numel(), CHUNK, field)
-    receive_kernel(kind, 8 * field.element_size()).launch(items, arguments, {"phi": phi})
+    receive_kernel(kind, 8 * field.itemsize).launch(items, arguments, {"phi": phi})
     return phi
 
 
 @functools.cache
 def receive_kernel(kind: str, bits: int) -> TextKernel:
     """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
-    arrays, more, written = ", ".join(_ARRAYS), "F *phi", "phi"
-    call = f"receive<F, {MOST_BEAMS}>(item, {arrays}, phi)"
-    if kind == "tangent":
-        pairs = ", ".join(f"Changing<F>{{{name}, d_{name}}}" for name in _ARRAYS)
-        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, {pairs}, phi)"
-        more = ", ".join([more, *(f"*d_{name}" for name in _ARRAYS)])
-    elif kind == "receive_back":
-        bars = "bars, field_bar, entered_bar, sums"
-        call = f"receive_back(item, first_item, varies, {arrays}, {bars})"
-        more = "F *bars, *field_bar, *entered_bar; double *sums"
-        written = "field_bar entered_bar sums"
+    call, arrays = {
+        "receive": (f"receive<F, {MOST_BEAMS}>(item, field, entered, numbers, phi)", "F *phi"),
+        "tangent": (
+            f"receive<Dual<F>, {MOST_BEAMS}>(item, Changing<F>{{field, d_field}}, "
+            "Changing<F>{entered, d_entered}, Changing<F>{numbers, d_numbers}, phi)",
+            "F *phi, *d_field, *d_entered, *d_numbers",
+        ),
+        "receive_back": (
+            "receive_back(item, first_item, vary, field, entered, numbers, bars, field_bar, "
+            "entered_bar, sums)",
+            "F *bars, *field_bar, *entered_bar; double *sums; int first_item; bool vary",
+        ),
+    }[kind]
     text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SIZES}}};\nreceiver.{call};"
-    declared = "long cells; int first_item, channels, colors, moments, lights, varies;"
-    declared += f" F *{', *'.join(_ARRAYS)}; {more}"
-    return TextKernel(f"beams_{kind}", bits, text, declared, written, "light/fused/receive.h")
+    declared = "long cells; int channels, colors, moments, lights; F *field, *entered, *numbers; "
+    written = "field_bar entered_bar sums" if kind == "receive_back" else "phi"
+    header = "light/fused/receive.h"
+    return TextKernel(f"beams_{kind}", bits, text, declared + arrays, written, header)

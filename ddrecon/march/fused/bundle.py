@@ -1,4 +1,4 @@
-"""What kernels are given of rays and of beams, found once where neither is varied."""
+"""Arguments of kernels that describe rays and beams, computed once where neither is varied."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.march.fused.kernels import Layout
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.phase import PhaseFunction, remember_of_phase
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
 
 class Packed(NamedTuple):
-    """Rays: `bundle` [R, 8] as of `Given` in `rays.h`; `origin` and `direction` [R, 3] in u."""
+    """Rays: `bundle` [R, 8] as of `Arguments` in `rays.h`; `origin` and `direction` [R, 3] in u."""
 
     bundle: Tensor
     origin: Tensor
@@ -55,17 +54,16 @@ def pack_rays(
 
 
 def see_beams(outgoing: OutgoingLight, packed: Packed) -> Tensor:
-    """The `angles` [2 beams, R] at which rays see beams, as of `Given` in `rays.h`."""
-    seen = [
+    """The `angles` [2 beams, R] at which rays see beams, as of `Arguments` in `rays.h`."""
+    angles = [
         _see_beam(packed.direction, beam.direction)
         if isinstance(beam, Beam)
         else torch.stack(beam.passing(packed.origin, packed.direction))
         for beam in outgoing.beams
     ]
-    if len(seen) == 1:
-        return seen[0]
-    rows = [angles[[k]] for k in (0, 1) for angles in seen]
-    return torch.cat([packed.direction.new_empty(0, len(packed.direction)), *rows])
+    if not angles:
+        return packed.direction.new_empty(0, len(packed.direction))
+    return torch.stack(angles, 1).flatten(0, 1)
 
 
 @remember
@@ -82,29 +80,11 @@ def table_of(outgoing: OutgoingLight, layout: Layout) -> Tensor:
     return outgoing.seen.table(layout.peak >= 0).to(outgoing.diffuse).flatten(0, 2)
 
 
-def factors_of(outgoing: OutgoingLight, layout: Layout, angles: Tensor) -> list[Tensor | None]:
-    """p of each beam [1 or C, R] where it is the same all along a ray, else None (E2.2)."""
-    count = len(outgoing.beams)
-    if layout.peak >= 0 or layout.numbers:
-        return [None] * count
-    return [
-        None if is_point else _find_factor(outgoing.seen.phase, cosine)
-        for is_point, cosine in zip(layout.beams, angles[count:], strict=True)
-    ]
-
-
-@remember_of_phase
-def _find_factor(phase: PhaseFunction, cosine: Tensor) -> Tensor:
-    return phase.value(cosine)
-
-
 def numbers_of(outgoing: OutgoingLight) -> Tensor:
     """The scale and the peak of each color, and the bound of third-order corrections."""
     scale = outgoing.extinction.scale.view(-1).expand(outgoing.colors)
     peak = outgoing.peak
     if peak is None or "peak" in outgoing.fields:
         peak = torch.zeros_like(scale)
-    bound = outgoing.extinction.mass_bound if outgoing.beams else 0.0
-    return torch.cat(
-        [scale, peak.view(-1).expand_as(scale), torch.as_tensor(bound).to(scale).view(1)]
-    )
+    bound = torch.as_tensor(outgoing.extinction.mass_bound if outgoing.beams else 0.0)
+    return torch.cat([scale, peak.view(-1).expand_as(scale), bound.to(scale).view(1)])

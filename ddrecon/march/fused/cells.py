@@ -12,6 +12,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,34 +41,36 @@ class Cells:
     axis: int = 0
     order: Tensor | None = None
     support: Tensor | None = None
-    _found: list[Tensor] = field(default_factory=list)
+    _walked: list[Tensor] = field(default_factory=list)
 
     @property
     def is_sliced(self) -> bool:
         """Whether nodes lie in slices."""
         return self.order is not None
 
-    def strides(self, shape: Sequence[int]) -> dict[str, int]:
-        """How many cells on the next one is, and how many there are; of fields of `shape`."""
+    def arguments(self, rays: Tensor, shape: Sequence[int]) -> dict[str, Any]:
+        """What kernels need to know of nodes of `rays` among cells of fields of `shape`."""
         # Slices across z are found by long offsets; other places are numbers of 32 bits.
         if (self.axis or not self.is_sliced) and (cells := math.prod(shape[-3:])) >= MOST:
             raise too_many("cells seen along x or y, or from inside", cells)
-        along = (shape[-2] * shape[-1], shape[-1], 1)
+        if self.support is not None and not self._walked:
+            self._walked.append(find_walked(self.support, self.planes, rays))
+        walked = self._walked[0] if self._walked else None
+        strides = (shape[-2] * shape[-1], shape[-1], 1)
         row, column = across(self.axis)
         return {
+            "planes": self.planes,
+            "slices": self.order,
+            "walked": walked,
+            "words": 0 if walked is None else walked.shape[1],
+            "node_count": len(self.planes),
             "depth": shape[self.axis - 3],
-            "plane_stride": along[self.axis],
-            "row_stride": along[row],
-            "column_stride": along[column],
             "rows": shape[row - 3],
             "columns": shape[column - 3],
+            "plane_stride": strides[self.axis],
+            "row_stride": strides[row],
+            "column_stride": strides[column],
         }
-
-    def walked(self, rays: Tensor) -> Tensor | None:
-        """The segments that packets of its `rays` are to walk; None: all. They are found once."""
-        if self.support is not None and not self._found:
-            self._found.append(find_walked(self.support, self.planes, rays))
-        return self._found[0] if self._found else None
 
 
 def cells_of(sampler: Sampler) -> tuple[Cells, list[Tensor]]:
@@ -91,8 +94,8 @@ def mark_kernel(bits: int) -> TextKernel:
     """The kernel that finds which segments of a packet of rays touch cells of a support."""
     names = "ray_count, node_count, rows, columns, words"
     text = f"mark(item, planes, rays, touched, walked, {names});"
-    given = f"F *planes, *rays; bool *touched; int *walked, {names}"
-    return TextKernel("mark", bits, text, given, "walked", "march/fused/cells.h")
+    arguments = f"F *planes, *rays; bool *touched; int *walked, {names}"
+    return TextKernel("mark", bits, text, arguments, "walked", "march/fused/cells.h")
 
 
 @remember
@@ -101,15 +104,12 @@ def find_walked(support: Tensor, planes: Tensor, rays: Tensor) -> Tensor:
 
     `support` [N, rows, columns] is that of the slices in which nodes lie, as `planes` [N] do.
     """
-    touched, nodes = _touched(support), len(planes)
-    packets, _ = cut(len(rays), LANES, rays)
+    (nodes, rows, columns), (packets, _) = support.shape, cut(len(rays), LANES, rays)
     words = -(-nodes // BITS)
-    walked = rays.new_empty(packets, words, dtype=torch.int32)
-    given = {"planes": planes, "rays": rays, "touched": touched, "ray_count": len(rays)}
-    given |= {"node_count": nodes, "rows": support.shape[1], "columns": support.shape[2]}
-    mark_kernel(torch.finfo(rays.dtype).bits).launch(
-        packets, given | {"words": words}, {"walked": walked}
-    )
+    walked = rays.new_zeros(packets, words, dtype=torch.int32)
+    arguments = {"planes": planes, "rays": rays, "touched": _touched(support), "words": words}
+    arguments |= {"ray_count": len(rays), "node_count": nodes, "rows": rows, "columns": columns}
+    mark_kernel(torch.finfo(rays.dtype).bits).launch(packets, arguments, {"walked": walked})
     return walked
 
 

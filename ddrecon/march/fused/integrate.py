@@ -17,7 +17,7 @@ from ddrecon.cameras import Rays
 from ddrecon.kernels.launch import count_shares, launch_later, thread_count
 from ddrecon.kernels.text import LANES, cut
 from ddrecon.march.box import Crossing
-from ddrecon.march.fused.bundle import factors_of, numbers_of, pack_rays, see_beams, table_of
+from ddrecon.march.fused.bundle import numbers_of, pack_rays, see_beams, table_of
 from ddrecon.march.fused.cells import Cells, cells_of
 from ddrecon.march.fused.kernels import (
     Case,
@@ -35,7 +35,7 @@ NEIGHBORS, TURNS = 128, 8
 often each thread has its turn, at most.
 """
 NAMES = "rays", "angles", "numbers", "table", "fronts"
-"""What a walk is given besides fields and what stays, in the order of its arguments."""
+"""The tensors of a walk before its fields, in the order of its arguments."""
 
 
 def march_rays(
@@ -57,28 +57,29 @@ def march_rays(
         *fields,
     )
     # The walk's masses begin with what is in front.
-    own = masses if front is None else masses - front
-    return _compose(outgoing, out, factors_of(outgoing, layout, angles)), own
+    masses = masses if front is None else masses - front
+    return _compose(outgoing, layout, out, angles), masses
 
 
-def _compose(outgoing: OutgoingLight, out: Tensor, factors: Sequence[Tensor | None]) -> Tensor:
+def _compose(outgoing: OutgoingLight, layout: Layout, out: Tensor, angles: Tensor) -> Tensor:
     """Scattered radiance [C, R] from the integrals `out` [C (1 + beams), R].
 
     What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
-    light that of what remains; beams' irradiances, and p where it is one of the `factors`
-    [1 or C, R] (E2.2).
+    light that of what remains; beams' irradiances, and p where beams are seen at one of `angles`
+    (E2.2).
     """
     diffuse, *arriving = out.split(outgoing.colors)
     scattered = diffuse * outgoing.diffuse_scale.view(-1, 1)
-    for beam, light, factor in zip(outgoing.beams, arriving, factors, strict=True):
-        weighted = light if factor is None else light * factor
+    for index, (beam, light) in enumerate(zip(outgoing.beams, arriving, strict=True)):
+        if not layout.has_curve(index):
+            light = light * outgoing.seen.phase.value(angles[len(arriving) + index])
         strength = outgoing.scattering.scale * beam.irradiance / (4 * math.pi)
-        scattered = scattered + weighted * strength.view(-1, 1)
+        scattered = scattered + light * strength.view(-1, 1)
     return scattered
 
 
 class Integrate(torch.autograd.Function):
-    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `Given` of `rays.h`.
+    """Outputs [outputs, R] and masses [K, R] of whole rays, from `Arguments` of `rays.h`.
 
     The masses come once more in double precision, for the walk back. Differentiable in both modes
     with respect to all tensors.
@@ -87,15 +88,13 @@ class Integrate(torch.autograd.Function):
     @staticmethod
     def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rays = tensors[0]
-        out = rays.new_empty(layout.outputs, len(rays))
-        masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
-        packets, given = _packets(cells, tensors, thread_count(rays))
-        if any(needs := [one.requires_grad for one in tensors]):
-            launch_later(
-                adjoint_kernel(layout, _case(layout, cells, needs[: len(NAMES)])).kernel, rays
-            )
-        kernel = integral_kernel(layout, cells.is_sliced)
-        kernel.launch(packets, given, {"out": out, "masses": masses})
+        outputs = _empty_outputs(layout, rays)
+        outputs["masses"] = outputs["masses"].double()
+        packets, arguments = _arguments(cells, tensors, thread_count(rays))
+        if any(needs := [tensor.requires_grad for tensor in tensors]):
+            launch_later(adjoint_kernel(layout, _case(layout, cells, needs)).kernel, rays)
+        integral_kernel(layout, cells.is_sliced).launch(packets, arguments, outputs)
+        out, masses = outputs.values()
         return out, masses.to(rays.dtype, copy=True), masses
 
     @staticmethod
@@ -107,51 +106,50 @@ class Integrate(torch.autograd.Function):
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars_of_made: Tensor | None) -> tuple[Any, ...]:
-        """Cotangents of the tensors that need them; of numbers and fronts always."""
-        masses, *tensors = ctx.saved_tensors
-        needs, ends = ctx.needs_input_grad[2:], {"masses": masses}
-        rooms = _empty(ctx.layout, tensors[0])
-        for name, bar, room in zip(("out_bar", "masses_bar"), bars_of_made, rooms, strict=False):
-            ends[name] = room.zero_() if bar is None else bar
-        rays, _, numbers, table, fronts, *fields = tensors
+    def backward(ctx: Any, *output_bars: Tensor | None) -> tuple[Any, ...]:
+        """Cotangents of the tensors that need them; of numbers always."""
+        (masses, *tensors), needs = ctx.saved_tensors, ctx.needs_input_grad[2:]
+        rays, numbers, fields = tensors[0], tensors[2], tensors[len(NAMES) :]
+        bars = [
+            tensor.new_zeros(tensor.shape) if is_needed and tensor.numel() else None
+            for tensor, is_needed in zip(tensors, needs, strict=True)
+        ]
+        rays_bar, angles_bar, _, table_bar, fronts_bar, *field_bars = bars
+
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        sums = [table if needs[NAMES.index("table")] else None]
-        sums += [
-            one if is_so else None for one, is_so in zip(fields, needs[len(NAMES) :], strict=True)
-        ]
-        size = rays.element_size() * sum(one.numel() for one in sums if one is not None)
+        sums = [table_bar, *field_bars]
+        size = sum(total.nbytes for total in sums if total is not None)
         threads = count_shares(thread_count(rays), size)
-        shares = [
-            [None if one is None else one.new_zeros(one.shape) for one in sums]
-            for _ in range(threads)
+        shares = [sums] + [
+            [None if total is None else torch.zeros_like(total) for total in sums]
+            for _ in range(threads - 1)
         ]
-        own = [
-            {"table_bar": one, "bars": _channels(of_fields, fields)} for one, *of_fields in shares
-        ]
-        packets, given = _packets(ctx.cells, tensors, threads)
+        packets, arguments = _arguments(ctx.cells, tensors, threads)
+        arguments |= {"masses": masses, "packets": packets}
+        outputs = _empty_outputs(ctx.layout, rays).items()
+        for (name, empty), bar in zip(outputs, output_bars, strict=False):
+            arguments[f"{name}_bar"] = empty.zero_() if bar is None else bar
         numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
-        bars = {
-            f"{name}_bar": one.new_empty(one.shape) if is_so else None
-            for name, one, is_so in zip(NAMES[:2], tensors, needs, strict=False)
-        }
-        bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
-        kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs[: len(NAMES)]))
-        made = bars | {"numbers_bar": numbers_bar}
-        kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
+        results = {"rays_bar": rays_bar, "angles_bar": angles_bar, "fronts_bar": fronts_bar}
+        adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs)).launch(
+            packets,
+            arguments,
+            results | {"numbers_bar": numbers_bar},
+            shares=[
+                {"table_bar": of_table, "bars": _channels(of_fields, fields)}
+                for of_table, *of_fields in shares
+            ],
+        )
         for share in shares[1:]:
-            for total, part in zip(shares[0], share, strict=True):
-                if total is not None and part is not None:
-                    total += part
-        table_bar, *field_bars = shares[0]
-        rays_bar, angles_bar, fronts_bar = bars.values()
-        numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
-        others = numbers_bar, table_bar, fronts_bar, *field_bars
-        return None, None, rays_bar, angles_bar, *others
+            for total, addend in zip(sums, share, strict=True):
+                if total is not None and addend is not None:
+                    total += addend
+        bars[2] = numbers_bar.sum(1).to(numbers.dtype)
+        return None, None, *bars
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
-        def change(*tensors: Any) -> tuple[Tensor, Tensor]:
+    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
             half = len(tensors) // 2
             return _change(ctx.layout, ctx.cells, tensors[:half], tensors[half:])
 
@@ -159,54 +157,51 @@ class Integrate(torch.autograd.Function):
 
 
 def _case(layout: Layout, cells: Cells, varied: Sequence[bool]) -> Case:
-    """What kernels are compiled for where those of `NAMES` are `varied`."""
+    """What kernels are compiled for where tensors, in the order of `NAMES`, are `varied`."""
     rays, angles, _, table, *_ = varied
-    return Case(cells.is_sliced, rays, layout.has_curves and (rays or angles), table)
+    return Case(cells.is_sliced, rays or (layout.has_curves and angles), table)
 
 
 def _change(
     layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, ...]:
     """The changes of outputs and masses with those of all tensors."""
     count, fields = len(NAMES), values[len(NAMES) :]
-    d_out, d_masses = _empty(layout, values[0])
-    packets, given = _packets(cells, values, thread_count(values[0]))
-    nothing = torch.zeros_like(fields[0][0])
-    channels = _channels(d_values[count:], fields)
-    given["fields"] += [nothing if one is None else one for one in channels]
-    given |= {f"d_{name}": one for name, one in zip(NAMES, d_values[:count], strict=True)}
-    if given["d_numbers"] is None:
-        given["d_numbers"] = torch.zeros_like(given["numbers"])
-    case = _case(layout, cells, [one is not None for one in d_values[:count]])
-    made = {"d_out": d_out, "d_masses": d_masses}
-    tangent_kernel(layout, case).launch(packets, given, made)
-    return d_out, d_masses
+    packets, arguments = _arguments(cells, values, thread_count(values[0]))
+    unchanged = torch.zeros_like(fields[0][0])
+    d_fields = _channels(d_values[count:], fields)
+    arguments["fields"] += [unchanged if change is None else change for change in d_fields]
+    arguments |= {f"d_{name}": change for name, change in zip(NAMES, d_values, strict=False)}
+    if arguments["d_numbers"] is None:
+        arguments["d_numbers"] = torch.zeros_like(arguments["numbers"])
+    d_outputs = _empty_outputs(layout, values[0])
+    tangent_kernel(
+        layout, _case(layout, cells, [change is not None for change in d_values])
+    ).launch(packets, arguments, {f"d_{name}": change for name, change in d_outputs.items()})
+    return tuple(d_outputs.values())
 
 
-def _empty(layout: Layout, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Room for outputs and masses, or their changes."""
-    count = len(rays)
-    return rays.new_empty(layout.outputs, count), rays.new_empty(layout.extinction, count)
+def _empty_outputs(layout: Layout, rays: Tensor) -> dict[str, Tensor]:
+    """Memory for outputs and masses, or their changes."""
+    counts = {"out": layout.outputs, "masses": layout.extinction}
+    return {name: rays.new_empty(count, len(rays)) for name, count in counts.items()}
 
 
-def _packets(cells: Cells, tensors: Sequence[Tensor], threads: int) -> tuple[int, dict[str, Any]]:
-    """How many packets there are, and what kernels in so many `threads` are given, by name."""
+def _arguments(cells: Cells, tensors: Sequence[Tensor], threads: int) -> tuple[int, dict[str, Any]]:
+    """How many packets there are, and the arguments of kernels in so many `threads`, by name."""
     rays, fields = tensors[0], tensors[len(NAMES) :]
     packets, _ = cut(len(rays), LANES, rays)
-    walked = cells.walked(rays)
-    given = {
-        "planes": cells.planes,
-        "slices": cells.order,
-        **{name: one if one.numel() else None for name, one in zip(NAMES, tensors, strict=False)},
-        **cells.strides(fields[0].shape),
+    arguments = {
+        **{
+            name: value if value.numel() else None
+            for name, value in zip(NAMES, tensors, strict=False)
+        },
+        **cells.arguments(rays, fields[0].shape),
         "ray_count": len(rays),
-        "node_count": len(cells.planes),
-        "walked": walked,
-        "words": 0 if walked is None else walked.shape[1],
         "dealt": deal(packets, threads),
         "fields": _channels(fields, fields),
     }
-    return packets, given
+    return packets, arguments
 
 
 @functools.lru_cache(maxsize=8)

@@ -12,9 +12,9 @@ import torch
 from ddrecon.kernels.text import TextKernel, names_of
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.phase_cells import count_powers, is_scaled
+from ddrecon.medium.phase_peak import count_powers, is_scaled
 
-_GIVEN = """
+_ARGUMENTS = """
 F *planes, *rays, *angles, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
 """
@@ -71,17 +71,20 @@ class Layout(NamedTuple):
             torch.finfo(outgoing.diffuse.dtype).bits,
         )
 
+    def has_curve(self, beam: int) -> bool:
+        """Whether p of a beam changes along a ray."""
+        return self.peak >= 0 or self.numbers > 0 or self.beams[beam]
+
     @property
     def has_curves(self) -> bool:
-        """Whether p of any beam changes along a ray."""
-        return bool(self.beams) and (self.peak >= 0 or self.numbers > 0 or any(self.beams))
+        """Whether p of any beam does."""
+        return any(map(self.has_curve, range(len(self.beams))))
 
     @property
     def channels(self) -> int:
         """All channels of a node."""
-        masses = len(self.beams) * self.extinction
-        others = max(self.peak, 0) + self.numbers + self.remaining
-        return self.extinction + self.diffuse + masses + self.scattering + self.emitted + others
+        optics = (1 + len(self.beams)) * self.extinction + self.diffuse + self.scattering
+        return optics + self.emitted + max(self.peak, 0) + self.numbers + self.remaining
 
     @property
     def outputs(self) -> int:
@@ -92,19 +95,20 @@ class Layout(NamedTuple):
 class Case(NamedTuple):
     """What else kernels are compiled for: whether nodes lie in slices, and what is varied.
 
-    Rays; the angles at which they see beams, which turn with them; and tables of phase functions.
+    Rays, or the angles at which they see beams; and tables of phase functions.
     """
 
     is_sliced: bool
-    varies_rays: bool = False
-    varies_angles: bool = False
+    moves: bool = False
     varies_tables: bool = False
 
 
 @functools.cache
 def integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
     """The kernel of E2.1 to E2.3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
-    text = f"walk<F, {_written(layout, Case(is_sliced))}, VALUES>(item, of_all, {{}}, out, masses);"
+    text = (
+        f"walk<F, {_types(layout, Case(is_sliced))}, VALUES>(item, arguments, {{}}, out, masses);"
+    )
     return _kernel("integrate", layout, 1, text, "F *out; double *masses", "out masses", "rays")
 
 
@@ -112,48 +116,48 @@ def integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
 def tangent_kernel(layout: Layout, case: Case) -> TextKernel:
     """The kernel of the changes `d_out` [outputs, R] and `d_masses` [K, R] of packets of rays.
 
-    Behind the fields it is given their changes; those of others may be left out, but for
+    Behind the fields come their changes; those of other arguments may be left out, but for
     `d_numbers`.
     """
     text = f"""
     const Changes<F> changes = {{{names_of(_CHANGES)}}};
-    walk<F, {_written(layout, case)}, TANGENT>(item, of_all, changes, d_out, d_masses);
+    walk<F, {_types(layout, case)}, TANGENT>(item, arguments, changes, d_out, d_masses);
     """
-    given, made = f"{_CHANGES}, *d_out, *d_masses", "d_out d_masses"
-    return _kernel("integrate_tangent", layout, 2, text, given, made, "rays")
+    declared, outputs = f"{_CHANGES}, *d_out, *d_masses", "d_out d_masses"
+    return _kernel("integrate_tangent", layout, 2, text, declared, outputs, "rays")
 
 
 @functools.cache
 def adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
-    These are left out where none are asked for, as are those of others. Each packet has its own
-    `numbers_bar` [2 C + 1, packets].
+    Those that are not asked for are left out, as are those of other arguments. Each packet has its
+    own `numbers_bar` [2 C + 1, packets].
     """
-    given = f"""
+    declared = f"""
     F *out_bar, *masses_bar; double *masses, *numbers_bar;
     F *rays_bar, *angles_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
     int packets
     """
     text = f"""
-    const Bars<F> of_bars = {{{names_of(given)}}};
-    Back<F, {_written(layout, case)}>(item, of_all, of_bars).run();
+    const Cotangents<F> cotangents = {{{names_of(declared)}}};
+    Back<F, {_types(layout, case)}>(item, arguments, cotangents).run();
     """
-    made = "numbers_bar rays_bar angles_bar table_bar fronts_bar bars"
-    return _kernel("transpose", layout, 1, text, given, made, "back")
+    outputs = "numbers_bar rays_bar angles_bar table_bar fronts_bar bars"
+    return _kernel("transpose", layout, 1, text, declared, outputs, "back")
 
 
 def _kernel(
-    name: str, layout: Layout, lists: int, text: str, given: str, made: str, header: str
+    name: str, layout: Layout, lists: int, text: str, declared: str, outputs: str, header: str
 ) -> TextKernel:
-    """The kernel of `text`, which has `of_all`; with so many `lists` of fields."""
-    all_given = f"{_GIVEN} F *fields[{lists * layout.channels}];"
-    record = f"const Given<F> of_all = {{{names_of(all_given)}}};"
+    """The kernel of `text`, which has `arguments`; with so many `lists` of fields."""
+    shared = f"{_ARGUMENTS} F *fields[{lists * layout.channels}];"
+    record = f"const Arguments<F> arguments = {{{names_of(shared)}}};"
     path = f"march/fused/{header}.h"
-    return TextKernel(name, layout.bits, record + text, all_given + given, made, path)
+    return TextKernel(name, layout.bits, record + text, shared + declared, outputs, path)
 
 
-def _written(layout: Layout, case: Case) -> str:
+def _types(layout: Layout, case: Case) -> str:
     """The types `Layout` and `Case` of C++, which find where each channel stands."""
-    of_layout = ", ".join(str(int(count)) for count in (*layout[:-2], *layout.beams))
-    return f"Layout<{of_layout}>, Case<{', '.join(str(int(is_so)) for is_so in case)}>"
+    counts = ", ".join(str(int(count)) for count in (*layout[:-2], *layout.beams))
+    return f"Layout<{counts}>, Case<{', '.join(str(int(flag)) for flag in case)}>"

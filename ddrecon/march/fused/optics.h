@@ -3,7 +3,7 @@
 #include "ddrecon/kernels/packets.h"
 // The formulas of the view-ray integral for packets: those of `numerics/decay.py`,
 // `numerics/chebyshev.py`, `numerics/angle_table.py`, `light/point_light.py` and
-// `medium/phase_cells.py`, whose constants these are.
+// `medium/phase_peak.py`, whose constants these are.
 
 namespace ddrecon {
 
@@ -13,14 +13,21 @@ template <class F> struct Numbers : Packets<F> {
     typedef typename P::V V;
     typedef typename P::M M;
     template <int K> using D = Dual<V, K>;
-    using P::least, P::log, P::most, P::narrow, P::pick, P::root, P::wide;
+    using P::gather, P::least, P::log, P::most, P::narrow, P::pick, P::read, P::root, P::wide;
 
-    template <int K> static INLINE D<K> pick(M is, const D<K>& one, const D<K>& other) {
+    template <int K> static INLINE D<K> pick(M is, const D<K>& yes, const D<K>& no) {
         D<K> r;
-        r.value = pick(is, one.value, other.value);
+        r.value = pick(is, yes.value, no.value);
         UNROLLED
-        for (int k = 0; k < K; ++k) r.by[k] = pick(is, one.by[k], other.by[k]);
+        for (int k = 0; k < K; ++k) r.by[k] = pick(is, yes.by[k], no.by[k]);
         return r;
+    }
+    // Of arrays and their changes.
+    static INLINE D<1> gather(const Changing<F>& field, typename P::I at) {
+        return {gather(field.value, at), gather(field.change, at)};
+    }
+    static INLINE D<1> read(const Changing<F>& field) {
+        return {read(field.value), read(field.change)};
     }
     template <int K> static INLINE D<K> least(const D<K>& a, const D<K>& b) {
         return pick(a.value < b.value, a, b);
@@ -29,8 +36,8 @@ template <class F> struct Numbers : Packets<F> {
         return pick(a.value > b.value, a, b);
     }
     template <int K> static INLINE D<K> root(const D<K>& x) {
-        const V found = root(x.value);
-        return x.chain(found, F(0.5) / found);
+        const V value = root(x.value);
+        return x.chain(value, F(0.5) / value);
     }
     template <int K> static INLINE D<K> log(const D<K>& x) {
         return x.chain(log(x.value), F(1) / x.value);
@@ -50,13 +57,14 @@ template <class F> struct Numbers : Packets<F> {
         return y.chain(atan2(y.value, x.value), x.value * inverse, x, -y.value * inverse);
     }
     // Lane l, of many in memory: where l is no constant.
-    static INLINE F own(const V& x, int l) { return ((const F*)&x)[l]; }
-    // A dual number's value, or its change.
-    template <int PART, class X> static INLINE X& part(X& x) { return x; }
-    template <int PART, class X> static INLINE X& part(Dual<X>& x) {
-        return PART ? x.by[0] : x.value;
-    }
+    static INLINE F lane_in_memory(const V& x, int l) { return ((const F*)&x)[l]; }
 };
+
+template <class X> INLINE void swap(X& a, X& b) {
+    const X former = a;
+    a = b;
+    b = former;
+}
 
 // Angles of tables are so many steps from 0 to pi; S has so many coefficients over the depth.
 constexpr int ANGLE_STEPS = 1024, COEFFICIENTS = 12;
@@ -134,25 +142,28 @@ template <class F, bool IS_G, class N> INLINE N number_place(const N& number) {
     return F(1 / STEEPEST_RISE) * P::log((F(1) + g) / (F(1) - g)) - F(1);
 }
 
-// A place between two of even places, where cubics have their values and slopes (Hermite).
+// A place between two of even angles, where cubics have their values and slopes (Hermite).
 template <class F, class N> struct Cubic {
     typedef Numbers<F> P;
     typename P::I first;
-    N part;
+    N fraction;
     INLINE Cubic() {}
-    INLINE Cubic(typename P::I first, const N& part) : first(first), part(part) {}
-    INLINE Cubic(const N& place, int steps) {
-        first = P::whole(P::least(P::most(value_of(place), P::all(F(0))), P::all(F(steps - 1))));
-        part = place - P::real(first);
+    INLINE Cubic(typename P::I first, const N& fraction) : first(first), fraction(fraction) {}
+    // Of an angle in steps.
+    INLINE explicit Cubic(const N& angle) {
+        const auto least = P::all(F(0)), most = P::all(F(ANGLE_STEPS - 1));
+        first = P::whole(P::least(P::most(value_of(angle), least), most));
+        fraction = angle - P::real(first);
     }
-    INLINE Cubic<F, typename P::V> value() const { return {first, value_of(part)}; }
-    // What value and slope at both places count, which are a `step` apart.
-    INLINE void weigh(F step, N* w) const {
-        const N u = part, rest = F(1) - u;
-        w[0] = (F(1) + u + u) * rest * rest;
-        w[1] = step * u * rest * rest;
-        w[2] = (F(1) + rest + rest) * u * u;
-        w[3] = -(step * rest) * u * u;
+    INLINE Cubic<F, typename P::V> value() const { return {first, value_of(fraction)}; }
+    // What value and slope at both angles count.
+    INLINE void weigh(N* w) const {
+        constexpr F step = F(PI / ANGLE_STEPS);
+        const N u = fraction, v = F(1) - u;
+        w[0] = (F(1) + u + u) * v * v;
+        w[1] = step * u * v * v;
+        w[2] = (F(1) + v + v) * u * u;
+        w[3] = -(step * v) * u * u;
     }
 };
 
@@ -163,7 +174,7 @@ template <class F> struct Point {
     template <class N> static INLINE Cubic<F, N> see(N foot, N across, N t, N& cosine) {
         const N apart = P::root(across), away = -(foot + t);
         cosine = away / P::root(across + away * away);
-        return Cubic<F, N>(P::atan2(apart, away) * F(ANGLE_STEPS / PI), ANGLE_STEPS);
+        return Cubic<F, N>(P::atan2(apart, away) * F(ANGLE_STEPS / PI));
     }
     // The integral of 1 / r^2: the angle that the way subtends over the distance.
     template <class N> static INLINE N subtended(N foot, N across, N t0, N t1) {
@@ -176,17 +187,12 @@ template <class F> struct Point {
 template <class F, int COUNT> struct Table {
     typedef Numbers<F> P;
     typedef typename P::V V;
-    static constexpr F STEP = F(PI / ANGLE_STEPS);
     static constexpr int SIZE = 2 * (ANGLE_STEPS + 1) * COUNT;
-    // Where an angle is, counted in steps.
-    template <class N> static INLINE Cubic<F, N> place(const N& angle) {
-        return Cubic<F, N>(angle, ANGLE_STEPS);
-    }
     // The first `count` of those from `table` on.
     template <class N>
     static INLINE void read(const Cubic<F, N>& angle, const F* table, int count, N* out) {
         N weights[4];
-        angle.weigh(STEP, weights);
+        angle.weigh(weights);
         const typename P::I at = 2 * COUNT * angle.first;
         for (int k = 0; k < count; ++k) {
             out[k] = weights[0] * P::gather(table + k, at);
@@ -196,7 +202,7 @@ template <class F, int COUNT> struct Table {
     // What bars of these are for the table.
     static INLINE void spread(const Cubic<F, V>& angle, F* table_bar, const V* bar) {
         V weights[4];
-        angle.weigh(STEP, weights);
+        angle.weigh(weights);
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < 4; ++j)
                 for (int k = 0; k < COUNT; ++k)

@@ -57,19 +57,21 @@ struct Layout {
         constexpr bool points[] = {POINTS..., false};
         return (POINTS || ... || false) && points[b];
     }
-    // Whether p of beam b changes along a ray.
+    // Whether p changes along a ray, of any beam; and of beam b.
+    static constexpr bool HAS_CURVES = BEAMS && (HAS_PEAK || HAS_NUMBERS || (POINTS || ...));
     static constexpr INLINE bool has_curve(int b) { return HAS_PEAK || HAS_NUMBERS || is_point(b); }
 };
 
-// What a kernel is given. Nodes lie in `slices` [N] of `fields`, channels of cells, at `planes` [N]
-// across them [u]; or, where there are none, anywhere: at such parts of the way from near to far.
-// `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
-// [2 beams, R]: of each beam the angle in steps of a table, of a point light the foot; then of each
-// the cosine, of a point light the square distance. `numbers`: scale and peak by color, bound of
-// third-order corrections. `table` [tables * (steps + 1) * 2, CURVE]: coefficients of p by angle.
-// `fronts` [K, R]: the mass before the rays, if any. `walked` [packets, words]: bits of the
-// segments to be walked, if not all are. Item i is packet i, or `dealt` [packets] says which.
-template <class F> struct Given {
+// What a kernel is called with. Nodes lie in `slices` [N] of `fields`, channels of cells, at
+// `planes` [N] across them [u]; or, where there are none, anywhere: at such parts of the way from
+// near to far. `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u].
+// `angles` [2 beams, R]: of each beam the angle in steps of a table, of a point light the foot;
+// then of each the cosine, of a point light the square distance. `numbers`: scale and peak by
+// color, bound of third-order corrections. `table` [tables * (steps + 1) * 2, CURVE]: coefficients
+// of p by angle. `fronts` [K, R]: the mass before the rays, if any. `walked` [packets, words]: bits
+// of the segments to be walked, if not all are. Item i is packet i, or `dealt` [packets] says
+// which.
+template <class F> struct Arguments {
     const F *planes, *rays, *angles, *numbers, *table, *fronts;
     const int *slices, *walked, *dealt;
     int ray_count, node_count, depth, rows, columns, words;
@@ -83,11 +85,10 @@ template <class F> struct Changes {
     const F *rays, *angles, *numbers, *table, *fronts;
 };
 
-// Whether nodes lie in slices; and whether derivatives are asked for by rays, by the angles at
-// which they see beams, which turn with them, and by the tables.
-template <bool SLICED, bool RAYS, bool ANGLES, bool TABLES> struct Case {
-    static constexpr bool IS_SLICED = SLICED, VARIES_RAYS = RAYS;
-    static constexpr bool VARIES_ANGLES = ANGLES, VARIES_TABLES = TABLES;
+// Whether nodes lie in slices; and whether derivatives are asked for by rays or by the angles at
+// which they see beams, and by the tables.
+template <bool SLICED, bool MOVED, bool TABLES> struct Case {
+    static constexpr bool IS_SLICED = SLICED, MOVES = MOVED, VARIES_TABLES = TABLES;
 };
 
 // A walk finds values; or values and changes, where numbers N are dual; or what an adjoint needs:
@@ -98,89 +99,84 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     typedef Numbers<F> P;
     typedef typename P::V V;
     typedef typename P::W W;
-    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_RAYS, Which::VARIES_TABLES;
+    using Which::IS_SLICED, Which::MOVES, Which::VARIES_TABLES;
     typedef ddrecon::Table<F, L::CURVE> Table;
 
     // In an adjoint p has derivatives by the depth of the peak, by the number of the cell, by the
     // place in tables, and where p is scaled by the cosine.
     static constexpr bool IS_TANGENT = MODE == TANGENT, IS_ADJOINT = MODE == ADJOINT;
+    static constexpr bool TURNS = MOVES && L::HAS_CURVES;
     static constexpr int DEPTH = 0, NUMBER = L::HAS_PEAK, PLACE = NUMBER + L::HAS_NUMBERS;
-    static constexpr int COSINE = PLACE + VARIES_ANGLES;
-    static constexpr int DIRECTIONS = COSINE + (VARIES_ANGLES && L::IS_SCALED);
-    typedef Dual<V> D;
-    // Of values; of p; of distances and angles along rays; of coefficients of p.
-    typedef typename If<IS_TANGENT, D, V>::type N;
+    static constexpr int COSINE = PLACE + TURNS, DIRECTIONS = COSINE + (TURNS && L::IS_SCALED);
+    // Of values; of p; of distances and angles along rays; of coefficients of p; of masses.
+    typedef typename If<IS_TANGENT, Dual<V>, V>::type N;
     typedef typename If<IS_ADJOINT, Dual<V, DIRECTIONS ? DIRECTIONS : 1>, N>::type E;
-    typedef typename If<VARIES_RAYS || VARIES_ANGLES, N, V>::type Way;
-    typedef typename If<VARIES_RAYS || VARIES_ANGLES || (IS_TANGENT && VARIES_TABLES), E, V>::type
-        Curve;
+    typedef typename If<MOVES, N, V>::type Length;
+    typedef typename If<MOVES || (IS_TANGENT && VARIES_TABLES), E, V>::type Coefficient;
     typedef typename If<IS_TANGENT, Dual<W>, W>::type Mass;
-    typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
 
-    // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
-    // at and `t` clamped to the box; values; emission, depth, exp(-depth), and p.
-    struct Node : Spot<F, IS_SLICED, V> {
+    // Node n: whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s`
+    // sampled at and `t` clamped to the box; values; emission, depth, exp(-depth), and p.
+    struct Node : Spot<F, IS_SLICED, Length> {
         Runs<F> runs;
+        int n;
         bool is_empty, is_lit;
-        Way s, t;
+        Length s, t;
         N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
         V limit[L::MASSES + 1], decay[L::OUT];
         E p[L::OUT];
     };
 
-    const Given<F>& given;
+    const Arguments<F>& arguments;
     const Changes<F> changes;
     int item, last, begin, first_node = 0, last_node;
     // Origin, direction, near and far.
-    Way ray[8];
+    Length ray[8];
     // Both `angles` of each beam, and p's coefficients of those that are no point lights.
-    Way foot[L::BEAMS + 1], across[L::BEAMS + 1];
-    Curve curves[L::BEAMS * L::HELD + 1];
+    Length foot[L::BEAMS + 1], across[L::BEAMS + 1];
+    Coefficient curves[L::BEAMS * L::HELD + 1];
     // Along y the packet's rays are closer together than along x; it `is_turned` where y are
     // columns.
     bool is_turned = false;
     Lines lines;
 
-    Rays(int number, const Given<F>& given, const Changes<F>& changes)
-        : given(given),
+    Rays(int number, const Arguments<F>& arguments, const Changes<F>& changes)
+        : arguments(arguments),
           changes(changes),
-          item(given.dealt ? given.dealt[number] : number),
-          last(given.ray_count - 1),
+          item(arguments.dealt ? arguments.dealt[number] : number),
+          last(arguments.ray_count - 1),
           begin(item * LANES),
-          last_node(given.node_count - 1),
-          lines{given.rows, given.columns, given.row_stride, given.column_stride} {
-        for (int k = 0; k < 8; ++k) ray[k] = load<Way>(given.rays, changes.rays, k, 8);
+          last_node(arguments.node_count - 1),
+          lines{arguments.rows, arguments.columns, arguments.row_stride, arguments.column_stride} {
+        for (int k = 0; k < 8; ++k) ray[k] = load<Length>(arguments.rays, changes.rays, k, 8);
         for (int b = 0; b < L::BEAMS; ++b) {
-            foot[b] = load<Way>(given.angles, changes.angles, row_of(b));
-            across[b] = load<Way>(given.angles, changes.angles, row_of(L::BEAMS + b));
+            foot[b] = load<Length>(arguments.angles, changes.angles, row_of(b));
+            across[b] = load<Length>(arguments.angles, changes.angles, row_of(L::BEAMS + b));
             if (L::has_curve(b) && !L::is_point(b))
-                read_tables(Table::place(foot[b]), curves + b * L::HELD);
+                read_tables(Cubic<F, Length>(foot[b]), curves + b * L::HELD);
         }
         // Nodes before the box and behind it are clamped to its faces: between them nothing is
         // added.
         const V near = value_of(ray[6]), far = value_of(ray[7]);
-        while (first_node < last_node && P::every(value_of(distance(ray, first_node + 1)) <= near))
+        while (first_node < last_node && P::every(value_of(distance(first_node + 1)) <= near))
             ++first_node;
-        while (last_node > first_node && P::every(value_of(distance(ray, last_node - 1)) >= far))
+        while (last_node > first_node && P::every(value_of(distance(last_node - 1)) >= far))
             --last_node;
         if (P::every(near >= far)) last_node = first_node;
         if (LANES > 1 && IS_SLICED) turn();
     }
     void turn() {
-        const Way s = distance(ray, (first_node + last_node) / 2);
-        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
+        const Length s = distance((first_node + last_node) / 2);
+        const V y = value_of(place(s, 1)), x = value_of(place(s, 2));
         const int end = begin + LANES <= last ? LANES - 1 : last - begin;
         const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
         if (high * high <= wide * wide) return;
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
-        for (int k = 1; k <= 4; k += 3) {
-            const Way y = ray[k];
-            ray[k] = ray[k + 1];
-            ray[k + 1] = y;
-        }
+        swap(ray[1], ray[2]);
+        swap(ray[4], ray[5]);
     }
-    long long row_of(int k) const { return given.row_of(k); }
+    long long row_of(int k) const { return arguments.row_of(k); }
     // What the rays have at `at` of an array, and its change.
     template <class X> X load(const F* array, const F* change, long long at, int step = 1) const {
         const V value = P::load(array + at, begin, step, last);
@@ -191,22 +187,22 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
     // And a number that all rays share: a color's scale, its peak, or the bound.
     N number(int k) const {
-        const V value = P::all(given.numbers[k]);
+        const V value = P::all(arguments.numbers[k]);
         if constexpr (IS_TANGENT)
             return {value, P::all(changes.numbers[k])};
         else
             return value;
     }
     Mass front(int k) const {
-        if (!given.fronts) return P::wide(N(P::all(F(0))));
-        return P::wide(load<N>(given.fronts, changes.fronts, row_of(k)));
+        if (!arguments.fronts) return P::wide(N(P::all(F(0))));
+        return P::wide(load<N>(arguments.fronts, changes.fronts, row_of(k)));
     }
 
     // Whether segment n, behind node n - 1, is to be walked; the next stretch of such segments
     // behind node `to`, and the one before node `from`: nodes `from` to `to`; whether there is one.
     bool walks(int n) const {
-        return !given.walked ||
-               (given.walked[(long long)item * given.words + n / 32] >> (n % 32) & 1);
+        const long long word = (long long)item * arguments.words + n / 32;
+        return !arguments.walked || (arguments.walked[word] >> (n % 32) & 1);
     }
     bool next_stretch(int& from, int& to) const {
         for (from = to; from < last_node && !walks(from + 1);) ++from;
@@ -219,103 +215,64 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return from < to;
     }
 
-    // Of any kind of numbers that a ray has: the distance of node n; the same clamped to the box;
-    // and where it is then across slices, along y, and along x.
-    template <class X> X distance(const X* ray, int n) const {
-        if (IS_SLICED) return (given.planes[n] - ray[0]) / ray[3];
-        return ray[6] + given.planes[n] * (ray[7] - ray[6]);
+    // The distance of node n; the same clamped to the box; and where it is then across slices,
+    // along y, and along x.
+    Length distance(int n) const {
+        if (IS_SLICED) return (arguments.planes[n] - ray[0]) / ray[3];
+        return ray[6] + arguments.planes[n] * (ray[7] - ray[6]);
     }
-    template <class X> static X clamp(const X* ray, const X& s) {
-        return P::least(P::most(s, ray[6]), ray[7]);
-    }
-    template <class X> static X place(const X* ray, const X& s, int axis) {
-        return ray[axis] + s * ray[3 + axis];
-    }
+    Length clamp(const Length& s) const { return P::least(P::most(s, ray[6]), ray[7]); }
+    Length place(const Length& s, int axis) const { return ray[axis] + s * ray[3 + axis]; }
     long long slice(int n) const {
-        return IS_SLICED ? (long long)given.slices[n] * given.plane_stride : 0;
+        return IS_SLICED ? (long long)arguments.slices[n] * arguments.plane_stride : 0;
+    }
+    // Field c, in a slice of node n, and of numbers N its change.
+    auto field(int c, int n) const {
+        const F* const change = IS_TANGENT ? arguments.fields[L::CHANNELS + c] : nullptr;
+        return readable<N>(arguments.fields[c], change) + slice(n);
     }
     // Where node n lies, and the matter there.
     void locate(int n, Node& node) const {
-        node.s = distance(ray, n);
-        node.t = clamp(ray, node.s);
-        auto at = [&](int axis, int size) {
-            return Place<F, V>::at(value_of(place(ray, node.s, axis)), size);
-        };
-        node.y = at(1, lines.rows);
-        node.x = at(2, lines.columns);
-        if (!IS_SLICED) node.z = at(0, given.depth);
+        node.n = n;
+        node.s = distance(n);
+        node.t = clamp(node.s);
+        node.y = Place<F, Length>(place(node.s, 1), lines.rows);
+        node.x = Place<F, Length>(place(node.s, 2), lines.columns);
+        if (!IS_SLICED) node.z = Place<F, Length>(place(node.s, 0), arguments.depth);
         if (IS_SLICED) node.runs.find(node.y, node.x, lines);
-        sample(node, n, 0, L::EXTINCTION);
-        if (L::SCATTERING || L::EMITTED) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
+        sample(node, 0, L::EXTINCTION);
+        if (L::SCATTERING || L::EMITTED) sample(node, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;
         for (int c = 0; c < L::FIRST_PEAK; ++c)
             if (c < L::EXTINCTION || c >= L::AFTER_MASSES)
                 node.is_empty = node.is_empty && is_nothing(node.v[c]);
     }
     static bool is_nothing(const V& x) { return P::every(x == P::all(F(0))); }
-    static bool is_nothing(const D& x) { return is_nothing(x.value) && is_nothing(x.by[0]); }
-    // Values of channels `from` to before `to`, and their changes.
-    void sample(Node& node, int n, int from, int to) const {
-        sample_part<0>(node, n, from, to);
-        if constexpr (IS_TANGENT) sample_part<1>(node, n, from, to);
-        if constexpr (IS_TANGENT && VARIES_RAYS) move(node, n, from, to);
-    }
-    template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
-        const F* const* fields = given.fields + PART * L::CHANNELS;
-        const long long offset = slice(n);
+    static bool is_nothing(const Dual<V>& x) { return is_nothing(x.value) && is_nothing(x.by[0]); }
+    // Values of channels `from` to before `to`.
+    void sample(Node& node, int from, int to) const {
 #if !IS_GPU
         if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
             if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
                 for (int r = 0; r < node.runs.count; ++r) {
-                    const Window<F> w(node.runs.run[r], node.y, node.x, lines);
+                    const Window<F, Length> w(node.runs.run[r], node.y, node.x, lines);
                     for (int c = from; c < to; ++c) {
-                        V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = w.value(fields[c] + offset, L::is_cubic(c), bend);
-                        known = P::pick(w.is_in, v, known);
+                        N bend(P::all(F(0)));
+                        const N v = w.value(field(c, node.n), L::is_cubic(c), bend);
+                        node.v[c] = P::pick(w.is_in, v, node.v[c]);
                         if (!L::is_cubic(c)) continue;
-                        V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
-                        known_bend = P::pick(w.is_in, bend, known_bend);
+                        N& known = node.bend[c - L::FIRST_MASS];
+                        known = P::pick(w.is_in, bend, known);
                     }
                 }
                 return;
             }
 #endif
         for (int c = from; c < to; ++c) {
-            V bend = P::all(F(0));
-            P::template part<PART>(node.v[c]) =
-                node.value(fields[c] + offset, lines, L::is_cubic(c), bend);
-            if (L::is_cubic(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
+            N bend(P::all(F(0)));
+            node.v[c] = node.value(field(c, node.n), lines, L::is_cubic(c), bend);
+            if (L::is_cubic(c)) node.bend[c - L::FIRST_MASS] = bend;
         }
-    }
-    // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
-    // bend of that each is handed to `take`.
-    template <class Take> void take_slopes(int n, const Way& s, int from, int to, Take take) const {
-        auto at = [&](int axis, int size, int direction) {
-            return Place<F, Slope>::moving(value_of(place(ray, s, axis)), size, direction);
-        };
-        Spot<F, IS_SLICED, Slope> spot;
-        spot.y = at(1, lines.rows, 0);
-        spot.x = at(2, lines.columns, 1);
-        if constexpr (!IS_SLICED) spot.z = at(0, given.depth, 2);
-        for (int c = from; c < to; ++c) {
-            Slope bend(P::all(F(0)));
-            const Slope v = spot.value(given.fields[c] + slice(n), lines, L::is_cubic(c), bend);
-            take(c, v, bend);
-        }
-    }
-    // What values change by, as node n moves.
-    void move(Node& node, int n, int from, int to) const {
-        const int axes[] = {1, 2, 0};
-        auto along = [&](const Slope& slope) -> V {
-            V change = P::all(F(0));
-            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k)
-                change += slope.by[k] * place(ray, node.s, axes[k]).by[0];
-            return change;
-        };
-        take_slopes(n, node.s, from, to, [&](int c, const Slope& v, const Slope& bend) {
-            node.v[c].by[0] += along(v);
-            if (L::is_cubic(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
-        });
     }
 
     N peak_of(const Node& node, int c) const {
@@ -330,10 +287,11 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
     // The first `count` coefficients of p from `first` on in table h, cubic in the angle.
     void read_table(
-        const Cubic<F, Way>& place, int h, int first, int count, Curve* coefficients) const {
-        const Cubic<F, Curve> angle(place.first, seed<PLACE, Curve>(place.part));
+        const Cubic<F, Length>& place, int h, int first, int count,
+        Coefficient* coefficients) const {
+        const Cubic<F, Coefficient> angle(place.first, seed<PLACE, Coefficient>(place.fraction));
         const int at = h * Table::SIZE + first;
-        Table::read(angle, given.table + at, count, coefficients);
+        Table::read(angle, arguments.table + at, count, coefficients);
         if constexpr (IS_TANGENT && VARIES_TABLES) {
             V change[L::HELD / L::TABLES];
             if (changes.table) Table::read(place.value(), changes.table + at, count, change);
@@ -341,7 +299,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         }
     }
     // All coefficients of p, from all tables, if they are HELD.
-    void read_tables(const Cubic<F, Way>& place, Curve* held) const {
+    void read_tables(const Cubic<F, Length>& place, Coefficient* held) const {
         for (int h = 0; h < L::TABLES && L::HOLDS; ++h)
             read_table(place, h, 0, L::CURVE, held + h * L::CURVE);
     }
@@ -350,12 +308,12 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     static Cubic<F, X> see(int b, const X& foot, const X& across, const X& distance, X& cosine) {
         if (L::is_point(b)) return Point<F>::see(foot, across, distance, cosine);
         cosine = across;
-        return Table::place(foot);
+        return Cubic<F, X>(foot);
     }
-    // All else at node n: all outputs' emission, depth and p behind the mass `m`.
-    void emit(int n, Node& node, const Mass* m) const {
-        sample(node, n, L::EXTINCTION, L::AFTER_MASSES);
-        if (L::FIRST_PEAK < L::CHANNELS) sample(node, n, L::FIRST_PEAK, L::CHANNELS);
+    // All else at a node: all outputs' emission, depth and p behind the mass `m`.
+    void emit(Node& node, const Mass* m) const {
+        sample(node, L::EXTINCTION, L::AFTER_MASSES);
+        if (L::FIRST_PEAK < L::CHANNELS) sample(node, L::FIRST_PEAK, L::CHANNELS);
         for (int k = 0; k < L::MASSES; ++k) {
             const N off = number(2 * L::C) * node.bend[k], limit = F(1) / P::root(F(1) + off * off);
             // On faces that are lit it is 0 but for rounding, whose exponential may overflow.
@@ -375,24 +333,24 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
             places[k] = number_place<F, L::IS_SCALED>(numbers[k]);
         }
         for (int b = 0; b < L::BEAMS; ++b) {
-            Curve at_node[L::HELD];
+            Coefficient at_node[L::HELD];
             const bool is_held = L::HOLDS && !L::is_point(b);
-            const Curve* const held = is_held ? curves + b * L::HELD : at_node;
-            Way cosine;
-            const Cubic<F, Way> place = see(b, foot[b], across[b], node.t, cosine);
+            const Coefficient* const held = is_held ? curves + b * L::HELD : at_node;
+            Length cosine;
+            const Cubic<F, Length> place = see(b, foot[b], across[b], node.t, cosine);
             if (L::is_point(b)) read_tables(place, at_node);
             for (int c = 0; c < L::C; ++c) {
                 const int i = L::C + b * L::C + c, k = L::number(c);
                 const N scattering = node.v[L::scattering(c)];
-                const N way = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
+                const N passed = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
                 E p(P::all(F(1)));
                 if (L::has_curve(b)) {
-                    auto row = [&](int m) -> const Curve* {
+                    auto row = [&](int m) -> const Coefficient* {
                         if (L::HOLDS) return held + L::table(c) * L::CURVE + m * L::TERMS;
                         read_table(place, L::table(c), m * L::TERMS, L::TERMS, at_node);
                         return at_node;
                     };
-                    const E depth = seed<DEPTH, E>(peak_of(node, c) * way);
+                    const E depth = seed<DEPTH, E>(peak_of(node, c) * passed);
                     p = Polynomials<F, L::TERMS, L::POWERS>::template at<E>(row, depth, places[k]);
                 }
                 if (L::HAS_PEAK) p = P::most(p, E(P::all(F(0))));
@@ -403,7 +361,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                     node.w[i] = scattering * p.value;
                 else
                     node.w[i] = scattering * p;
-                node.u[i] = number(c) * way;
+                node.u[i] = number(c) * passed;
             }
         }
         for (int i = 0; i < L::OUT; ++i) node.decay[i] = P::decay(value_of(node.u[i]));
@@ -412,7 +370,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
     }
     // What output i is integrated by: length, or for a point light the integral of 1 / r^2.
-    Way measure(const Node& a, const Node& b, int i) const {
+    Length measure(const Node& a, const Node& b, int i) const {
         const int beam = i / L::C - 1;
         if (i < L::C || !L::is_point(beam)) return b.t - a.t;
         return Point<F>::subtended(foot[beam], across[beam], a.t, b.t);
@@ -421,13 +379,12 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
 
 // The integral along a packet of rays, from the camera into the volume (E2.1 to E2.3): `out`
 // [outputs, R] and `masses` [K, R]; or in a TANGENT the changes of both.
-template <class F, class L, class Which, Mode MODE, class Masses>
-void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Masses* masses) {
+template <class F, class L, class Which, Mode MODE, class Masses> void walk(
+    int item, const Arguments<F>& arguments, const Changes<F>& changes, F* out, Masses* masses) {
     typedef ddrecon::Rays<F, L, Which, MODE> Rays;
     typedef typename Rays::P P;
     typedef typename Rays::N N;
-    constexpr int PART = MODE == TANGENT;
-    const Rays rays(item, given, changes);
+    const Rays rays(item, arguments, changes);
     N total[L::OUT];
     typename Rays::Mass m[L::EXTINCTION];
     for (int i = 0; i < L::OUT; ++i) total[i] = N(P::all(F(0)));
@@ -441,26 +398,24 @@ void walk(int item, const Given<F>& given, const Changes<F>& changes, F* out, Ma
             b->is_lit = !(a->is_empty && b->is_empty);
             // Between empty nodes nothing is added: what light there is does not matter.
             if (b->is_lit) {
-                if (!a->is_lit) rays.emit(n - 1, *a, m);
+                if (!a->is_lit) rays.emit(*a, m);
                 // The mass passed on the way to the next node, and what it emits behind that.
                 for (int k = 0; k < L::EXTINCTION; ++k) m[k] += rays.mass_between(*a, *b, k);
-                rays.emit(n, *b, m);
+                rays.emit(*b, m);
                 // E2.2, E2.3: what arrives from the segment between both.
                 for (int i = 0; i < L::OUT; ++i) {
                     const N decay = Decay<F>::of(a->u[i], b->u[i], a->decay[i], b->decay[i]);
                     total[i] += F(0.5) * (a->w[i] + b->w[i]) * rays.measure(*a, *b, i) * decay;
                 }
             }
-            typename Rays::Node* const passed = a;
-            a = b;
-            b = passed;
+            swap(a, b);
         }
     }
     for (int l = 0; l < LANES && rays.begin + l <= rays.last; ++l) {
         for (int i = 0; i < L::OUT; ++i)
-            out[rays.row_of(i) + rays.begin + l] = P::lane(P::template part<PART>(total[i]), l);
+            out[rays.row_of(i) + rays.begin + l] = P::lane(change_of(total[i]), l);
         for (int k = 0; k < L::EXTINCTION; ++k)
-            masses[rays.row_of(k) + rays.begin + l] = P::lane_of(P::template part<PART>(m[k]), l);
+            masses[rays.row_of(k) + rays.begin + l] = P::lane_of(change_of(m[k]), l);
     }
 }
 

@@ -2,5 +2,5 @@
 
 `step.h` is the formula of a step, in numbers or dual ones. `ordinates.h` follows light along
 ordinates of a quadrature set, forward and back. `ordinates.py` has the tables that it is given,
-`launches.py` launches it, and `sweep.py` makes of it one differentiable function of tensors.
+`sweep.py` launches it as one differentiable function of tensors.
 """

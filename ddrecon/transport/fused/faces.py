@@ -1,7 +1,7 @@
 """Sweeps in which light enters by faces, or goes around, by fused kernels (E2.9, E2.13, E2.15).
 
-What enters cells from outside, and light where it leaves them, lie in rings (`ordinates.h`): planes
-with a rim, counted from where the light of an ordinate enters along z.
+What enters cells from outside, and light where it leaves them, lie in rings (`ordinates.h`), which
+have a cell beyond each face.
 """
 
 from __future__ import annotations
@@ -10,55 +10,57 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import recompute
-from ddrecon.transport.characteristics import Characteristic, Ends, enter_again
+from ddrecon.transport.characteristics import Characteristic, Ends, drift, enter_again
 from ddrecon.transport.fused.ordinates import ordinate_tables
-from ddrecon.transport.fused.sweep import sweep_chunk
+from ddrecon.transport.fused.sweep import Fields, sweep_ordinates
+from ddrecon.transport.mirror import Mirror
 from ddrecon.transport.sweep import sweep_rule
 
 
-def sweep_faces(
-    medium: Medium,
-    source: Tensor,
+def sweep_fused(
+    grid: Grid,
+    extinction: Tensor,
+    emitted: Tensor,
     gradient: Tensor,
-    inflow: Tensor | None,
     directions: int,
-    ends: Sequence[Ends] | None,
-) -> tuple[Tensor, list[Ends]]:
-    """As `sweep` of `transport/sweep.py`, and what leaves the box along each direction.
-
-    `ends`: what enters along each besides `inflow`, None for nothing.
-    """
-    tables = ordinate_tables(medium.grid, directions, source, len(source))
+    mirror: Mirror | None,
+) -> Tensor:
+    """As `_sweep_emitted` of `transport/sweep.py`."""
+    fields = extinction, emitted, gradient
+    if not (emitted.is_cuda or grid.periodic or mirror):
+        return sweep_ordinates((grid, directions, None), fields)[0]
+    tables = ordinate_tables(grid, directions, emitted, len(emitted))
     points, *_ = sweep_rule(directions, 1)
-    moments, gone = torch.zeros_like(source), dict[int, Ends]()
+    moments, gone = torch.zeros_like(emitted), dict[int, Ends]()
     for number, chunk in enumerate(tables.chunks):
         numbers = tables.numbers[chunk.ordinates]
-        courses = [Characteristic.of(medium.grid, points[n]) for n in numbers]
-        entering = None if ends is None else [ends[n] for n in numbers]
-        light, place = (source, gradient, inflow), (directions, number)
-        part, left = recompute(_sweep_chunk, medium, light, place, courses, entering)
-        moments = moments + part
-        gone |= zip(numbers, left, strict=True)
-    return moments, [gone[n] for n in range(directions)]
+        courses = [Characteristic.of(grid, points[n]) for n in numbers]
+        ends = None if mirror is None else [mirror.entering(n) for n in numbers]
+        chunk_moments, leaving = recompute(
+            _sweep_chunk, (grid, directions, number), fields, courses, ends
+        )
+        moments = moments + chunk_moments
+        gone |= zip(numbers, leaving, strict=bool(leaving))
+    if mirror is not None:
+        mirror.left.extend(gone[n] for n in range(directions))
+    return moments
 
 
 def _sweep_chunk(
-    medium: Medium,
-    emitted: tuple[Tensor, Tensor, Tensor | None],
-    place: tuple[int, int],
+    of: tuple[Grid, int, int],
+    fields: Fields,
     courses: list[Characteristic],
     ends: list[Ends] | None,
 ) -> tuple[Tensor, list[Ends]]:
-    """The moments of the ordinates of a chunk, and what leaves along each.
-
-    `emitted`: source, gradient and inflow; `place`: how many directions there are, and the chunk.
-    """
-    source, gradient, _ = emitted
-    nothing = [_nothing(course, source) for course in courses]
+    """The moments of the ordinates of a chunk, and what leaves along each if any enters."""
+    if ends is None and not any(course.wraps[0] for course in courses):
+        return sweep_ordinates(of, fields)[0], []
+    extinction, emitted, gradient = fields
+    nothing = [_nothing(course, emitted) for course in courses]
     ends = nothing if ends is None else ends
 
     def follow(across: Sequence[Tensor], is_dark: bool = False) -> tuple[Tensor, list[Ends]]:
@@ -67,12 +69,11 @@ def _sweep_chunk(
             (first, *end[1:])
             for first, end in zip(across, nothing if is_dark else ends, strict=True)
         ]
-        rings = [_place(medium.grid, *one) for one in zip(courses, entering, strict=True)]
-        dark = torch.zeros_like(source), torch.zeros_like(gradient), None
-        light = dark if is_dark else emitted
-        moments, ring = sweep_chunk(medium, *light, *place, torch.stack(rings))
+        rings = [_ring_of_ends(*pair) for pair in zip(courses, entering, strict=True)]
+        dark = extinction, torch.zeros_like(emitted), torch.zeros_like(gradient)
+        moments, light = sweep_ordinates(of, dark if is_dark else fields, torch.stack(rings))
         return moments, [
-            _leave(medium.grid, *one) for one in zip(courses, ring, entering, strict=True)
+            _ends_of_ring(*triple) for triple in zip(courses, light, entering, strict=True)
         ]
 
     def leave(across: Sequence[Tensor], is_dark: bool = False) -> list[Tensor]:
@@ -97,82 +98,28 @@ def _nothing(course: Characteristic, like: Tensor) -> Ends:
     )
 
 
-def _behind(values: Tensor, dim: int, drift: float, is_around: bool) -> Tensor:
-    """Of each place along `dim` the value upwind; 0 outside unless the grid `is_around`."""
-    moved = values.roll(1 if drift > 0 else -1, dim)
-    if is_around:
-        return moved
-    size = values.shape[dim]
-    kept = torch.arange(size, device=values.device) != (0 if drift > 0 else size - 1)
-    return moved * kept.view([-1 if d == dim else 1 for d in range(values.ndim)]).to(values)
-
-
-def _place(grid: Grid, course: Characteristic, ends: Ends) -> Tensor:
-    """The ring [C, planes, y + 2, x + 2] of what enters cells."""
-    across, row_side, column_side = ends
-    (row, column), (_, rows_wrap, columns_wrap) = course.drift, course.wraps
-    slices, (colors, rows, columns) = len(row_side), across.shape
-    # What comes from the sides of a slice to the next: rows move before columns.
-    more = across.new_zeros(slices, colors, rows, columns)
-    if row and not rows_wrap:
-        side = torch.lerp(row_side, _behind(row_side, 2, column, columns_wrap), abs(column))
-        more[:, :, 0 if row > 0 else -1] += abs(row) * side
-    if column and not columns_wrap:
-        more[..., 0 if column > 0 else -1] += abs(column) * column_side
-    more = more if course.forward > 0 else more.flip(0)
-    more = torch.cat([across[None], more])
-    cells, beyond = more[:-1], more[-1]
-    cells = course.lift(cells if course.forward > 0 else cells.flip(0))
-    return _ring_of(grid, course, cells, beyond)
-
-
-def _leave(grid: Grid, course: Characteristic, ring: Tensor, ends: Ends) -> Ends:
-    """What leaves the box, of the `ring` of light where it leaves cells and what has entered."""
-    (row, column), (_, rows_wrap, _) = course.drift, course.wraps
-    cells, beyond = _cells_of(grid, course, ring)
-    laid = course.lay(cells)
-    rows = laid[:, :, -1 if row > 0 else 0] if row else torch.zeros_like(ends[1])
-    if not column:
-        return beyond, rows, torch.zeros_like(ends[2])
-    last = -1 if column > 0 else 0
-    columns = laid[..., last]
-    if row:
-        behind = _behind(columns, 2, row, rows_wrap)
-        if not rows_wrap:
-            edge = torch.arange(columns.shape[2], device=columns.device)
-            is_edge = edge == (0 if row > 0 else len(edge) - 1)
-            behind = behind + is_edge.to(columns) * ends[1][..., last, None]
-        columns = torch.lerp(columns, behind, abs(row))
-    return beyond, rows, columns
-
-
-def _from_entry(course: Characteristic, values: Tensor, dim: int) -> Tensor:
-    """`values` with planes counted along `dim` from where light enters them, or the inverse."""
-    return values.flip(dim) if course.moved[0] < 0 else values
-
-
-def _beyond(grid: Grid, course: Characteristic) -> tuple[int | slice, ...]:
-    """Where in a ring [C, planes, y, x] the cells lie that are beyond the last slice."""
-    depth, height, width = grid.shape
-    places: list[int | slice] = [slice(depth), slice(1, -1), slice(1, -1)]
-    axis = course.order[0] - 1
-    after = (depth, height + 1, width + 1)[axis]
-    places[axis] = after if course.forward > 0 or axis == 0 else 0
-    return slice(None), *places
-
-
-def _ring_of(grid: Grid, course: Characteristic, cells: Tensor, beyond: Tensor) -> Tensor:
-    """The ring with numbers of `cells` [C, z, y, x] and of those `beyond` [C, rows, columns]."""
-    depth, height, width = grid.shape
-    ring = cells.new_zeros(len(cells), depth + 2, height + 2, width + 2)
-    ring[:, :depth, 1:-1, 1:-1] = _from_entry(course, cells, 1)
-    is_across = course.order[0] == 1
-    ring[_beyond(grid, course)] = beyond if is_across else _from_entry(course, beyond, 1)
+def _ring_of_ends(course: Characteristic, ends: Ends) -> Tensor:
+    """The ring [C, z + 2, y + 2, x + 2] of what enters cells, and those behind the last slice."""
+    across, *sides = ends
+    dark = across.new_zeros(len(sides[0]), *across.shape)
+    # What enters by the sides of a slice comes to the next.
+    drifted, *_ = drift(dark, sides, course)
+    drifted = drifted if course.forward > 0 else drifted.flip(0)
+    arriving = torch.cat([across[None], drifted])
+    cells, behind = arriving[:-1], arriving[-1]
+    ring = pad(course.lift(cells if course.forward > 0 else cells.flip(0)), (1,) * 6)
+    _behind(course, ring).copy_(behind)
     return ring
 
 
-def _cells_of(grid: Grid, course: Characteristic, ring: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `_ring_of`."""
-    beyond, is_across = ring[_beyond(grid, course)], course.order[0] == 1
-    cells = _from_entry(course, ring[:, : grid.shape[0], 1:-1, 1:-1], 1)
-    return cells, beyond if is_across else _from_entry(course, beyond, 1)
+def _ends_of_ring(course: Characteristic, ring: Tensor, ends: Ends) -> Ends:
+    """What leaves the box, of the `ring` of light where it leaves cells and what has entered."""
+    cells = course.lay(ring[:, 1:-1, 1:-1, 1:-1])
+    _, rows, columns = drift(cells, ends[1:], course)
+    return _behind(course, ring), rows, columns
+
+
+def _behind(course: Characteristic, ring: Tensor) -> Tensor:
+    """The cells [C, rows, columns] of a ring that lie behind the last slice."""
+    beyond = ring.select(course.order[0], -1 if course.forward > 0 else 0)
+    return beyond[:, 1:-1, 1:-1]

@@ -38,6 +38,6 @@ def gain_fused(
         (cells, (len(change), *cells), *[(3, *cells)] * has_flux),
         y * x,
     )
-    each = torch.stack([one.reshape(-1).expand(colors) for one in numbers])
-    source, gain, *more = function.apply(each, *fields)
+    rows = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
+    source, gain, *more = function.apply(rows, *fields)
     return gain, source, more[0] if more else None

@@ -16,7 +16,7 @@ from ddrecon.transport.characteristics import Characteristic, Direction
 from ddrecon.transport.sweep import sweep_rule
 
 POINTS = 4
-"""Cells upwind that light comes from at most."""
+"""Cells upwind that light comes from, unless it comes from one."""
 MOST = 24
 """Ordinates in a team at most: more read moments less often, fewer leave more of a cache."""
 
@@ -47,8 +47,8 @@ class Tables:
 
     `chunks` are swept one after another. `arrays`: `teams` [T, 4] and `ordinates` [N, 13] have the
     structs `Team` and `Ordinate` of `ordinates.h`, `paths` [N, 8] the struct `Path`; `values` and
-    `weighted` [N, K] are harmonics, and harmonics times quadrature weights;
-    `moved` [N, 3] is a part of `paths`; `ones` [N, 1].
+    `weighted` [N, K] are harmonics times the path through a cell, and times quadrature weights;
+    `moved` [N, 3] is a part of `paths`.
     """
 
     numbers: list[int]
@@ -62,8 +62,9 @@ class Ordinate:
     """How the ordinate `number` of a quadrature set crosses the grid.
 
     `axis`: that across which its slices lie; `step` [u]: its path through a cell; `moved`: cells
-    that it passes along z, y and x meanwhile, with signs. Light comes from `points`, so many cells
-    away, against its senses, with `weights`. Across x the first lies in the same row.
+    that it passes along z, y and x meanwhile, with signs. Light comes from four `points`, so many
+    cells away, against its senses, with `weights`: the largest first, but across x the point in the
+    same row.
     """
 
     number: int
@@ -78,15 +79,14 @@ class Ordinate:
         """The ordinate of a `direction` through `grid` (E2.9)."""
         course = Characteristic.of(grid, direction)
         axis, moved = course.order[0] - 1, course.moved
-        points, weights = list[tuple[int, ...]](), list[float]()
-        for point in product(*((1,) if other == axis else (0, 1) for other in range(3))):
-            weight = math.prod(
-                abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True)
-            )
-            # Scalar recurrences in rows want their own point, whatever its weight.
-            if weight > 0 or (axis == 2 and not points):
-                points.append(point)
-                weights.append(weight)
+
+        def weight(point: tuple[int, ...]) -> float:
+            return math.prod(abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
+
+        points = list(product(*((1,) if a == axis else (0, 1) for a in range(3))))
+        if axis < 2:
+            points.sort(key=weight, reverse=True)
+        weights = [weight(point) for point in points]
         # Equal paths share decay terms: mirror images have equal ones but for rounding.
         step = float(f"{course.step:.14g}")
         return Ordinate(number, axis, step, tuple(moved), points, weights)
@@ -104,34 +104,38 @@ class Ordinate:
     def integers(self, width: int) -> list[int]:
         """The struct `Ordinate` for rows of so many cells."""
         _, up, along = self.senses
-        shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
-        lacking = [0] * (POINTS - len(self.points))
-        is_single = len(self.points) == 1 and self.axis < 2
+        count = 1 if self.axis < 2 and self.weights[1] == 0 else POINTS
         backs = [back for back, _, _ in self.points]
-        count = 1 if is_single else POINTS
-        return [self.axis, *self.senses, count, *backs, *lacking, *shifts, *lacking]
+        shifts = [up * y * (width + 2) + along * x for _, y, x in self.points]
+        return [self.axis, *self.senses, count, *backs, *shifts]
 
     def numbers(self) -> list[float]:
         """The struct `Path`."""
-        lacking = [0.0] * (POINTS - len(self.weights))
-        return [self.step, *self.moved, *self.weights, *lacking]
+        return [self.step, *(self.step * m for m in self.moved), *self.weights]
 
 
-def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[list[list[list[Ordinate]]]]:
-    """Chunks of teams for kernels by rows: of each team those that go up in y, and down.
+@dataclass(frozen=True)
+class Team:
+    """Ordinates that go through planes together, along z or against it: up in y, and down."""
 
-    Teams come in pairs, along z and against it, of which a chunk has so many `pieces`.
-    """
+    sense: int
+    up: list[Ordinate]
+    down: list[Ordinate]
+
+
+def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[Team]:
+    """Teams for kernels by rows, in pairs along z and against it, and so many `pieces` of these."""
     ways = [[o for o in ordinates if (o.moved > (0, 0, 0)) == is_up] for is_up in (True, False)]
     count = math.ceil(len(ways[0]) / MOST / pieces) * pieces
-    teams = list[list[list[Ordinate]]]()
+    teams = list[Team]()
     for n in range(count):
-        for way in ways:
+        for sense, way in zip((1, -1), ways, strict=True):
             turns = {turn: [o for o in way[n::count] if o.turn == turn] for turn in (1, -1, 0)}
             # Those that can do either turn with the others, so that rows are read once.
             turns[1 if len(turns[1]) >= len(turns[-1]) else -1] += turns[0]
-            teams.append([sorted(turns[turn], key=lambda o: o.step) for turn in (1, -1)])
-    return [teams[k : k + 2 * pieces] for k in range(0, len(teams), 2 * pieces)]
+            up, down = (sorted(turns[turn], key=lambda o: o.step) for turn in (1, -1))
+            teams.append(Team(sense, up, down))
+    return teams
 
 
 def ordinate_tables(
@@ -142,12 +146,12 @@ def ordinate_tables(
     They are for kernels by rows, whose teams are `pieces` of the directions, or by cells (None);
     of the type and on the device of `like` [..., C, z, y, x].
     """
-    most = 0
+    together = 2 * (pieces or 0)
     if pieces is None:
         _, second, largest = sorted(grid.shape)
         items = FILL_GPU if like.is_cuda else FILL_CACHE
-        most = math.ceil(items / (like.shape[-4] * second * largest))
-    return _make_tables(grid, directions, moments, pieces, most, like.dtype, like.device)
+        together = math.ceil(items / (like.shape[-4] * second * largest))
+    return _make_tables(grid, directions, moments, pieces, together, like.dtype, like.device)
 
 
 @functools.cache
@@ -157,40 +161,38 @@ def _make_tables(
     directions: int,
     moments: int,
     pieces: int | None,
-    most: int,
+    together: int,
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tables:
-    """The same; chunks by cells have so many ordinates at `most`."""
+    """The same, of chunks of so many teams `together`."""
     points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
-    if pieces is not None:
-        chunks_of_teams = _team_rows(ordinates, pieces)
+    if pieces is None:
+        teams = [Team(o.senses[0], [o], []) for o in ordinates]
     else:
-        single = [[[o], []] for o in ordinates]
-        chunks_of_teams = [single[k : k + most] for k in range(0, len(single), most)]
-    order, teams, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
-    for chunk in chunks_of_teams:
-        first, team = len(order), len(teams)
-        for number, (ups, downs) in enumerate(chunk):
-            sense = ups[0].senses[0] if pieces is None else 1 - 2 * (number % 2)
-            begin, middle = len(order), len(order) + len(ups)
-            order += ups + downs
-            teams.append([begin, middle, len(order), sense])
-        chunks.append(Chunk(first, len(order) - first, team, len(teams) - team))
+        teams = _team_rows(ordinates, pieces)
+    order, rows, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
+    for number in range(0, len(teams), together):
+        first, several = len(order), teams[number : number + together]
+        for team in several:
+            begin, middle = len(order), len(order) + len(team.up)
+            order += team.up + team.down
+            rows.append([begin, middle, len(order), team.sense])
+        chunks.append(Chunk(first, len(order) - first, number, len(several)))
     numbers = [o.number for o in order]
-    values = harmonics[numbers]
-    of_numbers = {
-        "paths": torch.tensor([o.numbers() for o in order], dtype=torch.float64),
-        "moved": torch.tensor([o.moved for o in order], dtype=torch.float64),
-        "values": values,
-        "weighted": values * values.new_tensor(weights)[numbers, None],
-        "ones": values.new_ones(len(order), 1),
+    paths = torch.tensor([o.numbers() for o in order], dtype=torch.float64)
+    values, set_weights = harmonics[numbers], harmonics.new_tensor(weights)[numbers, None]
+    integers = {"teams": rows, "ordinates": [o.integers(grid.shape[2]) for o in order]}
+    tables = {
+        "paths": paths,
+        "moved": paths[:, 1:4],
+        "values": paths[:, :1] * values,
+        "weighted": set_weights * values,
     }
-    integers = {"teams": teams, "ordinates": [o.integers(grid.shape[2]) for o in order]}
     arrays = {
-        name: torch.tensor(rows, dtype=torch.int32, device=device)
-        for name, rows in integers.items()
-    } | {name: numbers.to(device, dtype) for name, numbers in of_numbers.items()}
-    team_size = max(end - begin for begin, _, end, _ in teams)
+        name: torch.tensor(table, dtype=torch.int32, device=device)
+        for name, table in integers.items()
+    } | {name: table.to(device, dtype) for name, table in tables.items()}
+    team_size = max(end - begin for begin, _, end, _ in rows)
     return Tables(numbers, chunks, arrays, team_size)

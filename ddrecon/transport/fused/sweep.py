@@ -1,146 +1,303 @@
-"""A sweep as one differentiable function of tensors, by fused kernels (E2.9, E2.8)."""
+"""A sweep as one differentiable function of tensors, by fused kernels (`ordinates.h`; E2.9, E2.8).
+
+By rows, on a processor, a launch does some planes of a chunk of ordinates, with each team once
+along z and once against it. They meet in the middle, where each goes on in the next launch: so no
+two write to the same cells at once. By cells, on a GPU and where light enters by faces, a launch
+does one slice of all ordinates of a chunk, and products of matrices sum over these.
+"""
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import Medium
+from ddrecon.grid import Grid
+from ddrecon.kernels.launch import count_shares, launch_later
+from ddrecon.kernels.text import TextKernel, names_of
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-from ddrecon.numerics.remember import remember
-from ddrecon.transport.fused.launches import Ordinates, Sweep, Swept
+from ddrecon.transport.fused.ordinates import Chunk, ordinate_tables
+
+GIVEN = (
+    "int *teams, *ordinates; F *paths, *values, *weighted, *extinction, *gradient, *source,"
+    "*d_extinction, *d_gradient, *d_source, *bars, *entering, *light, *returning, *scratch,"
+    "*outputs, *sums, *gradient_bar, *extinction_bar; int depth, height, width, periodic, count,"
+    "colors, planes, back_planes, pitch, room, first, launched, team, color, together, lanes,"
+    "begin, end"
+)
+"""What the struct `Sweep` of `ordinates.h` holds."""
+MADE = "light returning scratch outputs sums gradient_bar extinction_bar"
+"""What of that kernels write."""
+TABLES = "teams", "ordinates", "paths", "values", "weighted"
+VECTOR = 16
+"""Rows of numbers begin at multiples of so many."""
+ROWS = 7
+"""Rows of scratch for a team besides those of moments and ordinates."""
+SLAB = 4
+"""Planes of which I is kept for the adjoint at most; before each slab it is saved."""
+Ordinates = tuple[Grid, int, int | None]
+"""A grid, how many directions cross it, and which chunk of them, by cells; None: all, by rows."""
+Fields = tuple[Tensor, Tensor, Tensor]
+"""What a sweep depends on: extinction [C, z, y, x], the moments [K, C, z, y, x] of what cells emit,
+and its gradient [3, C, z, y, x] from cell to cell.
+"""
+FIELDS = "extinction", "source", "gradient"
+"""Their names in kernels."""
 
 
-def sweep_fused(
-    medium: Medium, source: Tensor, gradient: Tensor, inflow: Tensor | None, directions: int
-) -> Tensor:
-    """As `sweep` in `transport/sweep.py`, where light enters by no face but as `inflow`."""
-    return _apply(medium, source, gradient, inflow, (medium.grid, directions, None), None)[0]
+class _Launches:
+    """Kernels that sweep what stands in `fields`, or its change by `d_fields`."""
+
+    def __init__(self, of: Ordinates, fields: Fields, d_fields: Fields | None = None):
+        self.grid, directions, self.chunk = of
+        self.fields, self.d_fields, self.like = fields, d_fields, fields[1]
+        self.by_rows = self.chunk is None
+        self.count, self.colors = self.like.shape[:2]
+        self.together, self.lanes, self.pieces = self.colors, 1, 1
+        if self.by_rows:
+            threads = torch.get_num_threads()
+            self.together = max(1, min(threads // 2, self.colors))
+            copied = self.like.element_size() * self.like[0].numel() * (self.count + 4)
+            self.pieces = count_shares(max(1, threads // (2 * self.colors)), copied, 1)
+        else:
+            _, second, largest = sorted(self.grid.shape)
+            self.lanes = second * largest
+        pieces = self.pieces if self.by_rows else None
+        self.tables = ordinate_tables(self.grid, directions, self.like, self.count, pieces)
+        # Rows and columns of a plane with its rim.
+        self.plane = self.grid.shape[1] + 2, self.grid.shape[2] + 2
+
+    def ring(self, chunk: Chunk, colors: slice, planes: int) -> Tensor:
+        """Planes of numbers, [ordinates, colors, planes, plane]; of changes, with these behind."""
+        kinds = () if self.d_fields is None else (2,)
+        together = colors.stop - colors.start
+        return self.like.new_zeros(chunk.count, together, planes, *kinds, *self.plane)
+
+    def kernel(self, run: str) -> TextKernel:
+        """The kernel of a `run` of `Ordinates`."""
+        return _kernel(run, self.d_fields is not None, self.by_rows, 8 * self.like.itemsize)
+
+    def bind(
+        self, run: str, chunk: Chunk, colors: slice, **arrays: Tensor | None
+    ) -> Callable[[range], None]:
+        """The kernel of a `run`, given these `arrays`, as a function of planes, or of a slice."""
+        kernel, tables, together = self.kernel(run), self.tables, colors.stop - colors.start
+        depth, height, width = self.grid.shape
+        pitch, room = math.ceil(width / VECTOR) * VECTOR, ROWS + self.count + 2 * tables.most
+        items = chunk.teams * together * self.lanes
+        if self.by_rows:
+            arrays["scratch"] = self.like.new_empty(items * room * pitch)
+        planes, back_planes = (
+            1 if ring is None else ring.shape[2] for ring in map(arrays.get, ("light", "returning"))
+        )
+        changes = self.d_fields or (None,) * len(FIELDS)
+        inputs = dict.fromkeys(kernel.arrays) | dict(zip(FIELDS, self.fields, strict=True))
+        inputs |= {f"d_{name}": change for name, change in zip(FIELDS, changes, strict=True)}
+        inputs |= {name: tables.arrays[name] for name in TABLES} | arrays
+        outputs = {name: inputs.pop(name) for name in kernel.written}
+        numbers = {
+            "depth": depth, "height": height, "width": width, "planes": planes,
+            "back_planes": back_planes, "periodic": sum(2**axis for axis in self.grid.periodic),
+            "count": self.count, "colors": self.colors, "pitch": pitch, "room": room,
+            "first": chunk.first, "launched": chunk.count * together, "team": chunk.team,
+            "color": colors.start, "together": together, "lanes": self.lanes, "begin": 0, "end": 0,
+        }  # fmt: skip
+        bound = kernel.bind(inputs | numbers, outputs)
+
+        def launch(stage: range) -> None:
+            threads = None
+            if self.by_rows:
+                # Teams that meet in the middle of an odd number of planes do it one after another.
+                is_middle = 2 * stage.start + 1 == depth
+                threads = 1 if is_middle else min(items, torch.get_num_threads())
+            bound.launch(items, threads, begin=stage.start, end=stage.stop)
+
+        return launch
 
 
-def sweep_chunk(
-    medium: Medium,
-    source: Tensor,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    directions: int,
-    chunk: int,
-    entering: Tensor,
+class _ByRows(_Launches):
+    """All ordinates, of which light enters by no face."""
+
+    def follow(self, _: None, saves: bool = False) -> tuple[Tensor, Tensor | None]:
+        """Moments of radiance [K, C, z, y, x], or their change; and what `go_back` is to get.
+
+        If it `saves`, that is light before each stage, [stages, ordinates, C, plane].
+        """
+        stages, moments, saved = self._stages(), self._sums(self.count), None
+        if saves:
+            shape = len(stages), len(self.tables.numbers), self.colors, *self.plane
+            saved = self.like.new_empty(shape)
+            for run in ("LIGHT", "BACK"):
+                launch_later(self.kernel(run).kernel, self.like)
+        for chunk, colors in self._shares():
+            light = self.ring(chunk, colors, 2)
+            follow = self.bind("MOMENTS", chunk, colors, light=light, sums=moments)
+            for number, stage in enumerate(stages):
+                if saved is not None:
+                    saved[number, chunk.ordinates, colors] = light[:, :, (stage.start - 1) % 2]
+                follow(stage)
+        return _total(moments), saved
+
+    def go_back(self, bars: Tensor, saved: Tensor, *_: None) -> tuple[Tensor | None, ...]:
+        """Cotangents of `fields`, of those of moments, `bars`, and what `follow` has saved."""
+        counts = 1, self.count, 3
+        totals = extinction, source, gradient = (*map(self._sums, counts),)
+        planes, stages = SLAB + 1, list(enumerate(self._stages()))
+        for chunk, colors in self._shares():
+            light = self.ring(chunk, colors, planes)
+            arrays = {
+                "light": light, "returning": self.ring(chunk, colors, 2), "bars": bars,
+                "extinction_bar": extinction, "gradient_bar": gradient, "sums": source,
+            }  # fmt: skip
+            follow, go_back = (self.bind(run, chunk, colors, **arrays) for run in ("LIGHT", "BACK"))
+            for number, stage in reversed(stages):
+                light[:, :, (stage.start - 1) % planes] = saved[number, chunk.ordinates, colors]
+                follow(stage)
+                go_back(stage)
+        extinction_bar, *fields_bar = map(_total, totals)
+        return extinction_bar[0], *fields_bar, None
+
+    def _shares(self) -> Iterator[tuple[Chunk, slice]]:
+        """Ordinates and colors swept side by side."""
+        for chunk in self.tables.chunks:
+            for color in range(0, self.colors, self.together):
+                yield chunk, slice(color, min(color + self.together, self.colors))
+
+    def _stages(self) -> list[range]:
+        """Planes of each launch, counted from where light enters."""
+        depth = self.grid.shape[0]
+        half = depth // 2
+        # The plane in the middle, if there is one, is a stage of its own.
+        bounds = [
+            *range(0, half, SLAB), *range(half, depth - half), *range(depth - half, depth, SLAB)
+        ]  # fmt: skip
+        return [range(*pair) for pair in zip(bounds, [*bounds[1:], depth], strict=True)]
+
+    def _sums(self, count: int) -> Tensor:
+        return self.like.new_zeros(self.pieces, count, *self.like.shape[1:])
+
+
+def _total(sums: Tensor) -> Tensor:
+    """The sum over pieces."""
+    return sums[0] if len(sums) == 1 else sums.sum(0)
+
+
+class _ByCells(_Launches):
+    """A chunk of ordinates, of which light may enter cells from outside: a ring like light."""
+
+    def follow(self, entering: Tensor | None, _: bool = False) -> tuple[Tensor, Tensor]:
+        """Moments of radiance [K, C, z, y, x], or their change; and light where it leaves cells."""
+        chunk, colors = self._all()
+        # Planes behind the grid and, at the end of the ring, before it.
+        light, means = self.ring(chunk, colors, self.grid.shape[0] + 2), self._outputs(1)
+        follow = self.bind("MOMENTS", chunk, colors, light=light, outputs=means, entering=entering)
+        for stage in self._slices(entering):
+            follow(stage)
+        return self._sum("weighted", means[0]), light
+
+    def go_back(
+        self, bars: Tensor, light: Tensor, entering: Tensor | None, light_bar: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        """Cotangents of `fields` and of what is `entering`, of those of moments and `light`."""
+        chunk, colors = self._all()
+        # The cotangent of what enters takes the place of that of light.
+        returning = torch.zeros_like(light) if light_bar is None else light_bar.clone()
+        outputs, rings = self._outputs(3), {"light": light, "returning": returning}
+        go_back = self.bind(
+            "BACK", chunk, colors, **rings, outputs=outputs, bars=bars, entering=entering
+        )
+        for stage in reversed(self._slices(entering)):
+            go_back(stage)
+        source, rise, extinction = outputs
+        sums = self._sum("values", source), self._sum("moved", rise)
+        return extinction.sum(0), *sums, None if entering is None else returning
+
+    def _all(self) -> tuple[Chunk, slice]:
+        assert self.chunk is not None
+        return self.tables.chunks[self.chunk], slice(0, self.colors)
+
+    def _slices(self, entering: Tensor | None) -> list[range]:
+        """The slice of each launch, and with faces what lies behind the last."""
+        count = max(self.grid.shape) + (entering is not None)
+        return [range(s, s + 1) for s in range(count)]
+
+    def _outputs(self, count: int) -> Tensor:
+        """What ordinates give in each cell."""
+        return self.like.new_empty(count, self._all()[0].count, *self.like.shape[1:])
+
+    def _sum(self, table: str, output: Tensor) -> Tensor:
+        """The sum over ordinates of their `output`, times the `table` of that name."""
+        return torch.tensordot(self.tables.arrays[table][self._all()[0].ordinates].T, output, 1)
+
+
+@functools.cache
+def _kernel(run: str, is_dual: bool, by_rows: bool, bits: int) -> TextKernel:
+    """The kernel of a `run` of `Ordinates`."""
+    kind = f"Ordinates<{'Dual<F>' if is_dual else 'F'}, F, {str(not by_rows).lower()}>"
+    text = f"F cell[{kind}::CELL]; const Sweep<F> of = {{{names_of(GIVEN)}}};"
+    text += f"{kind}(item, of, cell).run<{kind}::{run}>();"
+    name = f"ordinates_{run.lower()}"
+    return TextKernel(name, bits, text, GIVEN, MADE, "transport/fused/ordinates.h")
+
+
+def sweep_ordinates(
+    of: Ordinates, fields: Fields, entering: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The moments of a `chunk` of ordinates, and light where it leaves cells, less `inflow`.
+    """The moments [K, C, z, y, x] of radiance along ordinates `of` a quadrature set.
 
-    That, and what is `entering` cells from outside, are rings (`ordinates.h`)
-    [ordinates, C, planes, y + 2, x + 2].
+    Of a chunk the second result is light where it leaves cells, a ring
+    [ordinates, C, z + 2, y + 2, x + 2] (`ordinates.h`), and so is what is `entering` them.
     """
-    return _apply(medium, source, gradient, inflow, (medium.grid, directions, chunk), entering)
-
-
-def _apply(
-    medium: Medium,
-    source: Tensor,
-    gradient: Tensor,
-    inflow: Tensor | None,
-    of: Ordinates,
-    entering: Tensor | None,
-) -> Any:
-    extinction, remaining = medium.extinction, medium.remaining
-    scales = _stack_scales(extinction.scale, remaining.scale, inflow, source.shape[1])
-    scattering = None if remaining.field is extinction.field else remaining.field
-    gradient = gradient.expand(3, *source.shape[1:])
-    tensors = scales, extinction.field, scattering, gradient, source, entering
-    return _Sweep.apply(torch.is_grad_enabled(), of, *tensors)
-
-
-@remember
-def _stack_scales(
-    extinction: Tensor, scattering: Tensor, inflow: Tensor | None, colors: int
-) -> Tensor:
-    """Factors of extinction and of scattering that remains, and inflow, [3, C]."""
-    entering = torch.zeros_like(extinction) if inflow is None else inflow
-    scales = extinction, scattering, entering
-    return torch.stack([scale.reshape(-1).expand(colors) for scale in scales])
-
-
-def _swept(tensors: Any) -> Swept:
-    """From tensors as autograd must be given them: one by one, None for a field that is shared."""
-    scales, extinction, scattering, gradient, source = tensors
-    scattering = extinction if scattering is None else scattering
-    fields = scales, extinction, scattering, gradient, source
-    return Swept(*(field.contiguous() for field in fields))
-
-
-def _of_field(bar: Tensor, scale: Tensor, field: Tensor) -> Tensor:
-    """The cotangent of a `field`, of that of `scale` times the field, [C, z, y, x]."""
-    if len(field) == 1:
-        return torch.tensordot(scale, bar, 1)[None]
-    return scale.view(-1, 1, 1, 1) * bar
+    tensors = *(field.contiguous() for field in fields), entering
+    swept: tuple[Tensor, Tensor] = _Sweep.apply(of, torch.is_grad_enabled(), *tensors)
+    return swept
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of radiance, with derivatives by all tensors of `Swept` and what is entering.
-
-    The second result is light as of `sweep_chunk`, or of no use but to the backward pass.
-    """
+    """Moments, and by rows what the backward pass needs, by cells light where it leaves cells."""
 
     @staticmethod
-    def forward(may_save: bool, of: Ordinates, *tensors: Any) -> tuple[Tensor, Tensor | None]:
+    def forward(of: Ordinates, may_save: bool, *tensors: Any) -> tuple[Tensor, Tensor | None]:
         *fields, entering = tensors
-        saves = may_save and any(one is not None and one.requires_grad for one in tensors)
-        return Sweep(of, _swept(fields)).follow(saves, entering)
+        saves = may_save and any(field.requires_grad for field in fields)
+        return _launches(of, fields).follow(entering, saves)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
-        _, ctx.of, *tensors = inputs
-        ctx.saved = output[1] if tensors[-1] is None else None
-        ctx.mark_non_differentiable(*([] if ctx.saved is None else [ctx.saved]))
+        ctx.of, _, *tensors = inputs
+        if ctx.of[2] is None and output[1] is not None:
+            ctx.mark_non_differentiable(output[1])
         ctx.set_materialize_grads(False)
-        keep(ctx, *tensors)
+        keep(ctx, *tensors, output[1])
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, bars: Tensor | None, light_bar: Tensor | None) -> tuple[Any, ...]:
-        *fields, entering = ctx.saved_tensors
-        swept = _swept(fields)
-        bars = torch.zeros_like(swept.source) if bars is None else bars.contiguous()
-        returning = None
-        if entering is not None:
-            # The cotangent of what enters takes the place of that of light.
-            returning = torch.zeros_like(entering) if light_bar is None else light_bar.clone()
-        inflow, mass, scattered, gradient, source = Sweep(ctx.of, swept).go_back(
-            bars, ctx.saved, entering, returning
-        )
-        scales_bar = None
-        if ctx.needs_input_grad[2]:
-            pairs = (mass, swept.extinction), (scattered, swept.scattering)
-            sums = [(bar * field).sum((1, 2, 3), dtype=torch.float64) for bar, field in pairs]
-            scales_bar = torch.stack([*(one.to(inflow) for one in sums), inflow])
-        of_extinction, of_scattering = (
-            _of_field(bar, scale, field)
-            for bar, scale, field in zip(
-                (mass, scattered), swept.scales, (swept.extinction, swept.scattering), strict=False
-            )
-        )
-        of_fields: tuple[Tensor, Tensor | None] = of_extinction, of_scattering
-        if fields[2] is None:
-            of_fields = of_extinction + of_scattering, None
-        return None, None, scales_bar, *of_fields, gradient, source, returning
+        *fields, entering, light = ctx.saved_tensors
+        bars = torch.zeros_like(fields[1]) if bars is None else bars.contiguous()
+        return None, None, *_launches(ctx.of, fields).go_back(bars, light, entering, light_bar)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor, Tensor | None]:
         def change(*tensors: Any) -> Any:
-            half = len(tensors) // 2
-            values, entering = tensors[: half - 1], tensors[half - 1]
+            values, d_values = tensors[:4], tensors[4:]
             *d_fields, d_entering = (
                 value if value is None else torch.zeros_like(value) if d is None else d
-                for value, d in zip(tensors[:half], tensors[half:], strict=True)
+                for value, d in zip(values, d_values, strict=True)
             )
-            if d_entering is not None:
+            *fields, entering = values
+            if entering is not None and d_entering is not None:
                 entering = torch.stack([entering, d_entering], 3)
-            sweep = Sweep(ctx.of, _swept(values), _swept(d_fields))
-            moments, light = sweep.follow(entering=entering)
+            moments, light = _launches(ctx.of, fields, d_fields).follow(entering)
             return moments if light is None else (moments, light[:, :, :, 1].contiguous())
 
-        d_results = run_plainly(change, *ctx.saved_tensors, *changes[2:])
+        d_results = run_plainly(change, *ctx.saved_tensors[:4], *changes[2:])
         return d_results if isinstance(d_results, tuple) else (d_results, None)
+
+
+def _launches(of: Ordinates, *fields: Any) -> Any:
+    return (_ByRows if of[2] is None else _ByCells)(of, *fields)
