@@ -177,7 +177,7 @@ def launches_counted(counts: Counts) -> Iterator[None]:
 
 def load(views: int, rounds: int, device: str) -> Scene:
     """The plume at full resolution, from half its density."""
-    overrides = [f"diffusion.transport_rounds={rounds}", "optimize.refine_at=[]"]
+    overrides = [f"diffusion.transport_rounds={rounds}"]
     scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=overrides, device=device)
     density = torch.tensor(read_field(ROOT / "data" / "plume" / "density.npz", "density").values)
     start = 0.5 * density.to(scene.volume.density)

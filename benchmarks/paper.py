@@ -145,7 +145,7 @@ def at_paper_size(
     all of them are at full resolution.
     """
     fewer = (
-        () if iterations is None else (f"optimize.iterations={iterations}", "optimize.refine_at=[]")
+        () if iterations is None else (f"optimize.iterations={iterations}")
     )
     size = [*experiment.paper_size, *fewer]
     if experiment.known:

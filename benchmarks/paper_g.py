@@ -56,7 +56,7 @@ EXPERIMENTS = 2
 
 def finish(overrides: list[str], iterations: int) -> Reconstruction:
     """A run of Fig. 10 with `overrides`, at its end."""
-    more = [f"optimize.iterations={iterations}", "optimize.refine_at=[]"]
+    more = [f"optimize.iterations={iterations}"]
     scene = load_scene(CONFIGS / "fig10.yaml", overrides=[*more, *overrides])
     run = Reconstruction(scene_at_level(scene, COARSER))
     while not run.is_done:

@@ -197,7 +197,8 @@ class OptimizeSettings:
     """What `ddrecon optimize` finds, and how.
 
     parameters: What to find: names, as in the last table, with their settings.
-    iterations: The most. With `auto` a run ends by itself: [when to stop](settings.md#when-to-stop).
+    iterations: The most that are made. With `auto`, and before, a run ends by itself:
+        [when to stop](settings.md#when-to-stop).
     loss: What is made small, as a mean over pixels. Unless given, `display` where pictures are sRGB
         files, `l2` where they are linear. [Settings](settings.md) says more.
     noise: How pictures err, for `loss: photon` and `ddrecon uncertainty`; estimated unless given.

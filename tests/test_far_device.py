@@ -96,7 +96,7 @@ def test_indices_and_masks_go_to_the_device_and_not_back() -> None:
 
 def run(device: torch.device) -> Result:
     """Two iterations; rounds are among the derivatives below."""
-    overrides = ["optimize.refine_at=[]", "diffusion.tolerance=0.01", CAPTURE]
+    overrides = ["diffusion.tolerance=0.01", CAPTURE]
     overrides += ["diffusion.transport_rounds=0", EVERY_RAY]
     path = CONFIGS / "capture.yaml"
     scene = load_scene(path, overrides=overrides, dtype=torch.float64, device=device)

@@ -307,7 +307,7 @@ def test_its_albedo_is_found_beside_the_density() -> None:
     small = [GROUND, VIEWS, *SMALL]
     known = load_scene(BALL, overrides=[*small, "optimize=null", "ground.albedo=0.6"])
     views = [replace(view, image=render(known, view.name)[0]) for view in known.views]
-    sought = "iterations: 25, refine_at: [], parameters: {density: {}, ground.albedo: {}}"
+    sought = "iterations: 25, parameters: {density: {}, ground.albedo: {}}"
     scene = load_scene(BALL, overrides=[*small, f"optimize={{{sought}}}"])
     found = optimize(replace(scene, views=views)).scene.ground
     assert found is not None and float(found.albedo) == pytest.approx(0.6, abs=0.01)

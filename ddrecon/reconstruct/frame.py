@@ -27,6 +27,9 @@ from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
 
+OF_CANDIDATE = ("loss", "data_loss", "penalty", "psnr", "ssim")
+"""What a row says of a candidate, which may be refused."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -114,9 +117,17 @@ class Frame:
         return Point(self.level.train, values, weights, self.memory.last)
 
     def add_row(
-        self, evaluation: Evaluation, weight: float, seconds: float, is_test_due: bool
+        self,
+        evaluation: Evaluation,
+        weight: float,
+        seconds: float,
+        is_accepted: bool,
+        is_test_due: bool,
     ) -> Row:
-        """The log's row of an iteration, which took `seconds`; the prior counts by `weight`."""
+        """The log's row of an iteration, which took `seconds`; the prior counts by `weight`.
+
+        The running totals keep the losses of the last candidate that the search accepted.
+        """
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim, ssim = None, None, None
         if is_test_due:
@@ -141,7 +152,12 @@ class Frame:
             test_ssim=test_ssim,
         )
         # Sum: the solvers' iterations, and quality as last known.
-        unchanged = {n: getattr(self.total, n) for n, value in vars(row).items() if value is None}
+        stale = () if is_accepted else OF_CANDIDATE
+        unchanged = {
+            name: getattr(self.total, name)
+            for name, value in vars(row).items()
+            if value is None or name in stale
+        }
         counts = "forward_iterations", "adjoint_iterations"
         sums = {name: getattr(self.total, name) + getattr(row, name) for name in counts}
         self.total = replace(row, **unchanged, **sums)

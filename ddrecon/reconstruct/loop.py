@@ -100,7 +100,7 @@ class Together:
         if not self.search.values:
             self._find_metric(evaluations)
         weight = self.search.weight
-        self.search.judge(candidate, objective)
+        is_accepted = self.search.judge(candidate, objective)
         self._put(self.search.values)
         stage = self.schedule.stage
         self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
@@ -114,7 +114,7 @@ class Together:
         is_test_due = is_over or (self.iteration + 1) % tuning.TEST_EVERY == 0
         seconds = perf_counter() - start
         rows = [
-            frame.add_row(evaluation, weight, seconds, is_test_due)
+            frame.add_row(evaluation, weight, seconds, is_accepted, is_test_due)
             for frame, evaluation in zip(self.frames, evaluations, strict=True)
         ]
         if self.schedule.stage != stage:
@@ -128,9 +128,10 @@ class Together:
 
     def deviations(self) -> dict[str, Tensor]:
         """The disagreement of the frames on each single number, entry by entry, by name."""
-        return self.numbers.deviations(
-            [frame.evaluate().objective.gradients for frame in self.frames]
-        )
+        evaluations = [frame.evaluate() for frame in self.frames]
+        pairs = zip(self.frames, evaluations, strict=True)
+        self.numbers.prepare([frame.point(evaluation.compared) for frame, evaluation in pairs])
+        return self.numbers.deviations([each.objective.gradients for each in evaluations])
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
@@ -271,6 +272,17 @@ class Reconstruction(Together):
     def step(self) -> Row:
         """The log's row of one more iteration; raises DivergenceError as `advance` does."""
         return self.advance()[0]
+
+    def ending(self) -> dict[str, Any]:
+        """Why the run ended, and the root mean squares of what it leaves and of the noise.
+
+        Both are parts of that of the pictures, as the loss compares them.
+        """
+        unit = self.problem.power or 1.0
+        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
+        ending: dict[str, Any] = self.schedule.ending(self.iteration)
+        ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
+        return ending | {"residual": residual, "noise": noise}
 
     def current_scene(self) -> Scene:
         """The scene at full resolution, with everything as reconstructed so far."""

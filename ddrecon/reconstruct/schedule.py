@@ -81,7 +81,7 @@ class Schedule:
         progress, is_last = self.progress, self.progress.stage == len(self.stages) - 1
         share = (self.most - progress.began) // 2
         is_short = not is_last and iteration - progress.began >= max(share, 1)
-        if not (search.is_stuck or search.gain < tuning.REST or is_short):
+        if not (search.gain < tuning.REST or is_short):
             return
         if not is_last:
             self.progress = Progress(progress.stage + 1, iteration)

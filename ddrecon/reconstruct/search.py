@@ -82,8 +82,11 @@ class Search:
     def gain(self) -> float:
         """What the loss can still fall by, as the metric has it, as part of the loss.
 
-        It is the most of the last few values; nothing is known of it before.
+        It is the most of the last few values; nothing is known of it before. It is 0 where no step
+        helps.
         """
+        if self.is_stuck:
+            return 0.0
         return max(self.gains) if len(self.gains) == tuning.GAINS else math.inf
 
     def candidate(self) -> Values:

@@ -55,7 +55,7 @@ def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The first rank's `gradients` by name.
 
     Those of others are the same, unless a GPU or another kind of processor adds in another order:
-    then they differ by rounding, of which Adam makes whole steps where a derivative is nearly 0.
+    then they differ by rounding, by which a search may decide otherwise.
     """
     ours = [gradient if is_first() else 0 * gradient for gradient in gradients.values()]
     return dict(zip(gradients, sum_over_ranks(ours), strict=True))

@@ -1,4 +1,4 @@
-"""What seems to be wrong with a run, by its pictures and its log.
+"""What seems to be wrong with a run, by its pictures and its search.
 
 Each function returns a sentence, with what to do, or None where there is nothing to say.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from statistics import mean, median
 from typing import Any
 
@@ -16,7 +15,6 @@ from torch import Tensor
 
 from ddrecon.hull import bounds_text
 from ddrecon.medium.coefficients import Volume
-from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.support import Support, find_cut
 from ddrecon.scene import Scene, View
@@ -34,23 +32,23 @@ MOVED = 0.2
 GHOSTS = 0.01
 """Views held out are worse for density where no picture shows smoke, from this part of it on."""
 WORTHWHILE = 0.1
-"""A run is unfinished where as many iterations again would take this part off its loss."""
-SURE = 3.0
-"""Standard errors that a fall must exceed, as the loss differs from view to view."""
+"""A run is unfinished where its loss can fall by this part of it."""
 
 
 def diagnose(
     scene: Scene,
     images: Mapping[str, Tensor],
     quality: Mapping[str, Mapping[str, float]],
-    rows: Sequence[Row],
+    iteration: int,
+    gain: float,
     support: Support | None = None,
     described: Mapping[str, Any] | None = None,
 ) -> list[dict[str, str]]:
     """What seems to be wrong with a run that has found `scene` and rendered `images` of its views.
 
-    `quality` has the PSNR of each, `rows` are its log, `support` is where density was sought, which
-    is `described`. Each is a word that names its `kind`, and a sentence, its `text`.
+    `quality` has the PSNR of each; after so many iterations the loss can fall by its part `gain`;
+    `support` is where density was sought, which is `described`. Each is a word that names its
+    `kind`, and a sentence, its `text`.
     """
     seen = [view for view in scene.views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
@@ -60,20 +58,18 @@ def diagnose(
     if support is not None:
         doubt = f"volume.bounds? {doubt}" if doubt else find_cut(support, scene.volume.grid)
     gains = [_gain(view, images[view.name], 1.0)[0] for view in trained]
-    usual, share = median(gains) if len(gains) > 2 else 1.0, _promised_share(rows, sure=0)
-    # What is not yet explained is no picture's fault as long as going on may explain it: that is
-    # what the loss loses in as many iterations again, be it by chance. It is all where a run is too
-    # short to tell, and where renders as a whole lack the usual gain.
-    least = 1.0
-    if share is not None and abs(math.log(usual)) <= math.log(GAIN):
-        least = max(EXPLAINED, share)
+    usual = median(gains) if len(gains) > 2 else 1.0
+    # What is not yet explained is no picture's fault as long as going on may explain it. It is all
+    # where a run is too short to tell, and where renders as a whole lack the usual gain.
+    to_come = min(gain, 1.0) if abs(math.log(usual)) <= math.log(GAIN) else 1.0
+    least = max(EXPLAINED, to_come)
     texts = {
         "overfit": overfit,
         "support": doubt,
         "exposure": find_exposure(trained, images, usual, least),
-        "cameras": find_shift(trained, images, max(MOVED, share or 0) if least < 1 else 1.0),
+        "cameras": find_shift(trained, images, max(MOVED, to_come)),
         # What is overfit would only become more so.
-        "unfinished": None if overfit else find_falling(rows),
+        "unfinished": None if overfit else find_unfinished(gain, iteration),
     }
     return [{"kind": kind, "text": text} for kind, text in texts.items() if text is not None]
 
@@ -148,49 +144,18 @@ def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float
     )
 
 
-def find_falling(rows: Sequence[Row]) -> str | None:
-    """Whether going on would lower the loss, by how it falls over the last half of the run.
+def find_unfinished(gain: float, iteration: int) -> str | None:
+    """Whether going on after so many iterations would lower the loss, by its part `gain`.
 
-    Only what is of the last resolution tells: what falls after a refinement soon comes to rest.
+    It is infinite in a run that is too short to tell.
     """
-    gain = _promised_share(rows, SURE)
-    if gain is None or gain < WORTHWHILE:
+    if not WORTHWHILE <= gain < math.inf:
         return None
     much = f"some {100 * gain:.0f} %" if gain < 0.5 else "more than half"
     return (
-        f"unfinished: as it falls, the loss would be lower by {much} after as many iterations "
-        f"again; go on with --resume --iterations {2 * rows[-1].iteration}"
+        f"unfinished: the loss can still fall, by {much} as the search has it; "
+        f"go on with --resume --iterations {2 * iteration}"
     )
-
-
-def _promised_share(rows: Sequence[Row], sure: float) -> float | None:
-    """`promised` for as many iterations again, as part of the loss; None in too short a run."""
-    last = [row.loss for row in rows if row.cells == rows[-1].cells]
-    count = min(len(rows) // 6, len(last) // 3)
-    if count < 3 or not min(last) > 0:
-        return None
-    return promised(last[-3 * count :], len(rows), sure) / mean(last[-count:])
-
-
-def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
-    """The fall of the loss in `more` iterations, extrapolated from `losses`.
-
-    The model is c + a q^t. The means m1, m2, m3 of thirds of w iterations give
-    q^w = Q = (m2 - m3) / (m1 - m2) (Aitken 1926), and at the end
-    a q^t = (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). The result is 0 where the second fall may be
-    chance: no more than `sure` standard errors, by how much neighbors differ.
-    """
-    count = len(losses) // 3
-    first, second, third = (losses[i * count : (i + 1) * count] for i in range(3))
-    fall = mean(second) - mean(third)
-    variance = mean((b - a) ** 2 for a, b in pairwise([*second, *third])) / 2
-    if fall <= sure * math.sqrt(2 * variance / count):
-        return 0.0
-    # A fall that does not slow down is a straight line.
-    ratio = min(fall / max(mean(first) - mean(second), fall), 1 - 1e-6)
-    q = ratio ** (1 / count)
-    left = fall * count * (1 - q) * ratio**2 / (q * (1 - ratio) ** 2)
-    return left * (1 - q**more)
 
 
 def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:

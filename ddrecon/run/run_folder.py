@@ -185,10 +185,10 @@ class RunFolder(Checkpoints):
         dump_scene(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         self._pictures(findings, "")
-        rows = self.log.rows(run.iteration)
         summary, support = _summary(run) | {"views": findings.quality}, run.problem.support
-        results = scene, findings.images, findings.quality, rows
-        summary["diagnoses"] = diagnose(*results, support, summary.get("support"))
+        results = scene, findings.images, findings.quality
+        fall = run.iteration, run.search.gain
+        summary["diagnoses"] = diagnose(*results, *fall, support, summary.get("support"))
         seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
             summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
@@ -294,7 +294,7 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     summary |= describe_loss(problem.settings, problem.train)
     if problem.loss == "photon":
         summary["noise"] = {name: vars(noise) for name, noise in problem.noises.items()}
-    summary["ended"] = run.schedule.ending(run.iteration)
+    summary["ended"] = run.ending()
     if problem.support is not None:
         summary["support"] = describe_support([problem.support], problem.scene.volume.grid)
     return summary

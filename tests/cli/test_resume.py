@@ -12,14 +12,14 @@ from click.testing import Result
 
 from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import LOCK, hold
-from ddrecon.reconstruct import recording
-from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct import recording, tuning
+from ddrecon.reconstruct.search import Search
 from ddrecon.report.page import REFRESH
 from ddrecon.run import drive, quality
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
-FINER = ["-D", "volume.resolution=[16, 8, 8]", "-D", "optimize.refine_at=[0.5]"]
+FINER = ["-D", "volume.resolution=[16, 8, 8]"]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "--iterations", "4", *FINER, "-o"]
 
 
@@ -47,10 +47,16 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
     monkeypatch.setattr(owner, name, pressed)
 
 
+@pytest.fixture(autouse=True)
+def coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has runs begin with cells twice as large."""
+    monkeypatch.setattr(tuning, "FEWEST_CELLS", 4)
+
+
 MOMENTS = {
     "after a render at a new resolution": (recording, "differentiate", 3),
-    "after the first step": (Parameter, "step", 1),
-    "after a later step": (Parameter, "step", 3),
+    "after the first step": (Search, "judge", 1),
+    "after a later step": (Search, "judge", 3),
 }
 
 
@@ -91,7 +97,7 @@ def test_the_report_is_there_while_a_run_goes_on(
     monkeypatch.setattr("ddrecon.run.run_folder.PAGE_SECONDS", 0.0)
     succeed(*OPTIMIZE, "whole")
     with monkeypatch.context() as patch:
-        press_ctrl_c_in(patch, Parameter, "step", 3)
+        press_ctrl_c_in(patch, Search, "judge", 3)
         assert run(*OPTIMIZE, "out").exit_code == 130
     begun = Path("out/report.html").read_text()
     assert "It goes on." in begun and REFRESH in begun

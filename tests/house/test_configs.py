@@ -37,7 +37,7 @@ KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" 
 
 def small(config: Path) -> Scene:
     """The scene about 8 cells along its shortest side, and as much coarser in two pictures."""
-    closely = ["optimize.refine_at=[]", "diffusion.tolerance=1e-13"]
+    closely = ["diffusion.tolerance=1e-13"]
     scene = load_scene(config, overrides=closely, dtype=torch.float64)
     scene = replace(scene, views=[scene.views[0], scene.views[-1]])
     scene = scene_at_level(scene, min(scene.volume.grid.shape) // 8)

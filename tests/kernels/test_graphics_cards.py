@@ -32,7 +32,7 @@ def test_kernels_of_iterations_fit_into_registers(
     use_engine("warp")
     kernels = dict[Any, None]()
     for name in ("plume", "capture"):
-        scene = load_scene(CONFIGS / f"{name}.yaml", overrides=["optimize.refine_at=[]"])
+        scene = load_scene(CONFIGS / f"{name}.yaml")
         factor = max(scene.volume.grid.shape) // 8
         with as_on_a_gpu() as launched:
             Reconstruction(scene_at_level(scene, factor)).step()

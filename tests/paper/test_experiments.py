@@ -22,7 +22,6 @@ RECONSTRUCTIONS = [name for name in CONFIGS if name != "fig08"]
 ITERATIONS = 12
 COARSE = [
     f"optimize.iterations={ITERATIONS}",
-    "optimize.refine_at=[0.98, 0.99]",
     "diffusion.tolerance=1e-3",
 ]
 """All iterations are made in cells and pixels four times as large as the scene's."""

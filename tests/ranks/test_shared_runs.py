@@ -28,7 +28,6 @@ lights:
   - {type: directional, direction: [-1, -2, -1], irradiance: 3}
 diffusion: {transport_rounds: 0}
 optimize:
-  views_per_iteration: 2
   loss: l2
   parameters:
     density: {init: 0.4, tv: 1e-3}

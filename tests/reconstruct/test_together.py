@@ -15,7 +15,7 @@ NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 @pytest.fixture
 def still() -> Scene:
     """The ball, with numbers to find beside its density, in float64; cameras need more pictures."""
-    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=4", "optimize.refine_at=[]"]
+    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=4"]
     sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
     return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
 

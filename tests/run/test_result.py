@@ -40,7 +40,7 @@ views:
     camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1,
       resolution: [5, 4]}}
 diffusion: {{transport_rounds: 0}}
-optimize: {{iterations: 2, refine_at: [], parameters: {{{parameters}}}}}
+optimize: {{iterations: 2, parameters: {{{parameters}}}}}
 """
 VARIED = [
     ("density: {init: 0.2}", ["density"]),

@@ -47,9 +47,8 @@ diffusion:
 optimize:
   iterations: 300
   loss: l2                 # l2 | l1 | huber | relative_l2
-  refine_at: [0.3, 0.6]    # coarse-to-fine, fractions of the run
   parameters:
-    density: {init: 0.0, lr: 0.05, min: 0, tv: 1e-4}
+    density: {init: 0.0, min: 0, tv: 1e-4}
 """
 
 
@@ -62,8 +61,8 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
     assert tree.lights == (sun, AmbientSection((0.2, 0.3, 0.5)))
     assert tree.views[0].image == tmp_path / "targets/front.exr" and tree.views[0].split == "train"
     assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings(steps_per_voxel=1)
-    density = ParameterSettings(init=0.0, lr=0.05, min=0.0, tv=1e-4)
-    assert tree.optimize == OptimizeSettings({"density": density}, loss="l2", refine_at=(0.3, 0.6))
+    density = ParameterSettings(init=0.0, min=0.0, tv=1e-4)
+    assert tree.optimize == OptimizeSettings({"density": density}, 300, loss="l2")
 
 
 def test_every_error_is_told_at_once_with_its_place(refusal: Refusal):
@@ -90,10 +89,10 @@ def test_left_out_names_count_from_zero_and_all_are_unique(read: Read, refusal: 
 
 def test_overrides_replace_add_and_reach_into_lists(read: Read):
     overrides = ["volume.g=0.5", "lights.1.radiance=[1, 2, 3]", "volume.g=0.6", "render={}"]
-    overrides += ["optimize.parameters.density.lr=1e-2"]
+    overrides += ["optimize.parameters.density.tv=1e-2"]
     tree = read(SCENE, *overrides).tree
     assert tree.volume.g == 0.6 and tree.lights[1] == AmbientSection((1, 2, 3))
-    assert tree.optimize is not None and tree.optimize.parameters["density"].lr == 0.01
+    assert tree.optimize is not None and tree.optimize.parameters["density"].tv == 0.01
 
 
 RING = {"count": 1, "radius": 3, "fov": 30}
@@ -132,8 +131,8 @@ def test_paths_that_are_typed_start_at_the_current_folder(
 @pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])
 def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
     text = SCENE + "optimize: {parameters: {density: {}}}\n"
-    optimize = read(text, f"optimize.parameters.{name}.lr=2").tree.optimize
-    assert optimize is not None and optimize.parameters[name].lr == 2
+    optimize = read(text, f"optimize.parameters.{name}.max=0.5").tree.optimize
+    assert optimize is not None and optimize.parameters[name].max == 0.5
     optimize = read(text, f"optimize.parameters.{name}={{}}").tree.optimize
     assert optimize.parameters.keys() == {"density", name}
 

@@ -113,8 +113,6 @@ optimize.optimizer=adam => optimize.optimizer: unknown key; known: parameters, i
 optimize={{iterations: 10}} => optimize: missing key 'parameters'
 optimize.parameters={{}} => optimize.parameters: names no parameter; known: density
 optimize.loss=l3 => optimize.loss: expected one of l2, l1, huber, relative_l2, display, photon
-optimize.refine_at=[0.6, 0.3] => optimize.refine_at: must increase
-optimize.refine_at=[0, 0.5] => optimize.refine_at.0: must be above 0
 optimize.parameters.densty={{}} => parameters.densty: unknown parameter; did you mean 'density'?
 optimize.parameters={{media.cloud.rho: {{}}}} => media.cloud.rho: unknown parameter
 optimize.parameters.media.cloud.g={{field: true}} => it is not a field, so it has none

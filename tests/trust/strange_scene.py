@@ -37,10 +37,8 @@ diffusion: {model: p1, closure: geometric, tolerance: 1e-4, transport_rounds: 1}
 optimize:
   iterations: 4
   loss: l2
-  refine_at: [0.5]
-  views_per_iteration: 1
   parameters:
-    density: {init: 0, lr: 0.1, min: 0}
+    density: {init: 0, min: 0}
     g: {init: 0.1}
     lights.0.irradiance: {init: [1, 2, 3]}
     views.front.camera: {}

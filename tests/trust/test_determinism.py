@@ -32,7 +32,7 @@ def cloud(
     path: Path, dtype: torch.dtype = torch.float32, cells: str = "[12, 10, 9]", **settings: str
 ) -> Scene:
     """The tiny scene, not so tiny, with a lumpy density."""
-    overrides = [f"volume.resolution={cells}", "render.tolerance=0", "optimize.refine_at=[]"]
+    overrides = [f"volume.resolution={cells}", "render.tolerance=0"]
     overrides += ["diffusion.tolerance=1e-6", "diffusion.transport_rounds=1"]
     overrides += [f"{key}={value}" for key, value in settings.items()]
     scene = load_scene(path, overrides=overrides, dtype=dtype)
@@ -62,20 +62,18 @@ def distance(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     return max(float((a - b).norm() / b.norm()) for a, b in pairs)
 
 
-def test_same_seed_same_bits(path: Path) -> None:
+def test_a_run_has_the_same_bits_each_time_whatever_the_seed(path: Path) -> None:
     scene, runs = load_scene(path, overrides=["optimize.iterations=5"]), []
-    for seed in (3, 3, 4):
+    for seed in (3, 4):
         torch.manual_seed(seed)
         result = optimize(scene)
         losses = torch.tensor([row.loss for row in result.rows])
         runs.append([result.scene.volume.density, result.scene.volume.g, losses])
-    assert all(torch.equal(one, other) for one, other in zip(runs[0], runs[1], strict=True))
-    assert not torch.equal(runs[0][0], runs[2][0])
+    assert all(torch.equal(one, other) for one, other in zip(*runs, strict=True))
 
 
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
-    overrides = ["optimize.iterations=2", "optimize.views_per_iteration=0"]
-    scene = load_scene(path, overrides=overrides, dtype=torch.float64)
+    scene = load_scene(path, overrides=["optimize.iterations=2"], dtype=torch.float64)
     turned = replace(scene, views=scene.views[::-1])
     one, other = (optimize(each).scene.volume for each in (scene, turned))
     assert torch.allclose(one.density, other.density, rtol=EQUAL)

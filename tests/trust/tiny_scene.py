@@ -29,8 +29,6 @@ views:
 diffusion: {transport_rounds: 0}
 optimize:
   iterations: 6
-  views_per_iteration: 1
-  refine_at: [0.5]
   parameters: {density: {init: 0.1, tv: 1e-3}, g: {init: 0.1}, views.front.camera: {}}
 """
 
