@@ -170,6 +170,7 @@ class Together:
 
     def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
         """The next candidate whose objective can be evaluated, and that of each frame."""
+        before = self.search.state()
         while True:
             is_first = not self.search.values
             candidate = self.search.candidate() if not is_first else self._values()
@@ -184,6 +185,7 @@ class Together:
                     self.search.judge(candidate, Objective(math.inf, 0.0, {}, {}))
                     self._put(self.search.values)
                 if is_first or self.search.is_stuck:
+                    self.search.restore(before, candidate)
                     raise failure from error.__cause__
             except RanksError:
                 self._put(candidate if is_first else self.search.values)

@@ -42,14 +42,15 @@ class Progress:
 def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> list[Stage]:
     """The stages of a run that seeks `parameters` of `scene` through `levels`, coarse to fine.
 
-    Fields that begin with a structure keep it: they are never coarsened. While fields begin empty,
-    numbers wait: pictures of nothing say nothing of them. So does what glows among what is lit:
-    what is lit could as well glow.
+    Fields that begin with a structure keep it: they are never coarsened. While there is nothing,
+    numbers and coefficients wait: pictures of nothing say nothing of them. So does what glows among
+    what is lit: what is lit could as well glow.
     """
     fields = [p for p in parameters if p.is_field]
     has_structure = any(bool((p.start != p.start.flatten()[0]).any()) for p in fields)
     stages = [Stage(level) for level in range(levels - 1 if has_structure else 0, levels)]
-    lit = [p for p in fields if not (scene.lights and p.key == "emission" and len(fields) > 1)]
+    shown = [p for p in fields if p.key in ("density", "emission")]
+    lit = [p for p in shown if not (scene.lights and p.key == "emission" and len(shown) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
     return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages

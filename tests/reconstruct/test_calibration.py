@@ -25,7 +25,7 @@ GRID = Grid(SHAPE, (0.0, 0.0, 0.0), (1.2, 1.4, 1.0))
 
 
 def parameter_of(name: str, value: Tensor) -> Parameter:
-    return Parameter(name, ParameterSettings(), 0.1, value, GRID)
+    return Parameter(name, ParameterSettings(), value, GRID)
 
 
 def found_of(values: dict[str, Tensor], information: float = 1e12) -> Uncertainty:

@@ -33,7 +33,7 @@ def small_scene(dtype: torch.dtype, rounds: int = 1) -> Scene:
 
 def curvature_of(scene: Scene, loss: str = "l2") -> Curvature:
     parameters = [
-        Parameter(name, ParameterSettings(), 0.1, value_of(scene, name), scene.volume.grid)
+        Parameter(name, ParameterSettings(), value_of(scene, name), scene.volume.grid)
         for name in NAMES
     ]
     targets = {view.name: Target.of(view.image, view.mask, loss) for view in scene.views}

@@ -1,12 +1,14 @@
-"""Coarse to fine: what resampling keeps, and which stage an iteration belongs to."""
+"""Coarse to fine: what resampling keeps, and how coarse a run begins."""
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from ddrecon.cameras import Camera, cast_rays
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
+from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.levels import factors, resample, scene_at_level
 
 
 def test_coarsening_keeps_the_mass(ball_scene) -> None:
@@ -48,9 +50,10 @@ def test_what_a_coarser_scene_starts_from_is_coarser_too(ball_scene) -> None:
     assert torch.equal(coarse.starts["sigma_a"], starts["sigma_a"])
 
 
-def test_stages_follow_the_fractions() -> None:
-    assert [stage_of(i, 10, (0.3, 0.6)) for i in range(10)] == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2]
-
-
-def test_small_grids_are_not_coarsened_away(ball_scene) -> None:
-    assert factors(ball_scene, (0.3, 0.6)) == [2, 2, 1]
+@pytest.mark.parametrize(("side", "wanted"), [(31, [1]), (32, [2, 1]), (64, [4, 2, 1])])
+def test_small_grids_are_not_coarsened_away(ball_scene, side: int, wanted: list[int]) -> None:
+    """The shortest side keeps `FEWEST_CELLS`."""
+    assert tuning.FEWEST_CELLS == 16
+    grid = replace(ball_scene.volume.grid, shape=(96, side, 80))
+    volume = replace(ball_scene.volume, grid=grid)
+    assert factors(replace(ball_scene, volume=volume)) == wanted

@@ -30,7 +30,7 @@ def curvature() -> Curvature:
     two = replace(two, exposure=density.new_tensor([1.1, 1.2, 0.9]), offset=density.new_zeros(1))
     scene = replace(base, views=[one, two])
     parameters = [
-        Parameter(name, ParameterSettings(), 0.1, value_of(scene, name), scene.volume.grid)
+        Parameter(name, ParameterSettings(), value_of(scene, name), scene.volume.grid)
         for name in NAMES
     ]
     # Twists are about cameras as they were told: the derivative is where it has moved to.

@@ -67,9 +67,9 @@ def photographed(scene: Scene) -> Scene:
 def recovered(
     scene: Scene, starts: dict[str, Tensor], iterations: int, **settings: ParameterSettings
 ) -> Scene:
-    """What the loop makes of `scene` from `starts`, at one resolution, by defaults unless given."""
+    """What the loop makes of `scene` from `starts`, by defaults unless given."""
     parameters = {name: settings.get(name, ParameterSettings()) for name in starts}
-    wanted = OptimizeSettings(parameters, iterations, refine_at=())
+    wanted = OptimizeSettings(parameters, iterations)
     return optimize(replace(scene, starts=starts, optimize=wanted)).scene
 
 

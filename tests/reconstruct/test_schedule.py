@@ -1,91 +1,118 @@
-"""When a run ends by itself: at rest, or at the most, and the same when resumed."""
+"""When a run goes on to its next stage, when it ends, and that it does so when resumed."""
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from media import box_grid
 
-from ddrecon.reconstruct.levels import stage_of
-from ddrecon.reconstruct.schedule import Progress, Schedule, rate_at
-from ddrecon.reconstruct.tuning import FALL, MOST_ITERATIONS, PLANNED, WINDOW
-from ddrecon.settings import AUTO, OptimizeSettings, ParameterSettings
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.schedule import Progress, Schedule, Stage, find_stages
+from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST
+from ddrecon.scene import Scene
+from ddrecon.settings import AUTO, ParameterSettings
 
-LossOf = Callable[[int], float]
-
-
-def schedule_of(
-    count: int = 1, iterations: int | str = AUTO, drawn: int = 0, begin_at: float = 0.0
-) -> Schedule:
-    parameters, refine_at = {"density": ParameterSettings()}, (0.4, 0.8)
-    settings = OptimizeSettings(
-        parameters, iterations, None, None, drawn, refine_at=refine_at, begin_at=begin_at
-    )
-    return Schedule(settings, count)
+STAGES = [Stage(0), Stage(1), Stage(2)]
 
 
-def drive(schedule: Schedule, loss_of: LossOf) -> list[int]:
-    """The stages of the iterations until `schedule` is over, for these losses."""
-    stages: list[int] = []
-    while not schedule.is_over(len(stages)):
-        made = len(stages)
-        stages.append(schedule.stage(made))
-        schedule.note(made, loss_of(made))
-    return stages
+class FakeSearch(SimpleNamespace):
+    """A search whose loss of images is `loss`, with a prior, and that can still gain `gain`."""
+
+    def __init__(self, loss: float, gain: float):
+        super().__init__(gain=gain, weight=1.0, objective=SimpleNamespace(loss=loss, prior=1.0))
+
+    def reweigh(self, weight: float) -> None:
+        self.weight = weight
 
 
-def test_a_number_of_iterations_is_made_whatever_the_loss() -> None:
-    schedule = schedule_of(iterations=50)
-    stages = drive(schedule, lambda _: 1.0)
-    assert stages == [stage_of(i, 50, (0.4, 0.8)) for i in range(50)]
-    rates = [schedule.rate(i, 0.2) for i in range(50)]
-    assert rates == [rate_at(i, 50, 10, 0.2) for i in range(50)]
-    assert schedule.ending(50)["kind"] == "iterations"
+def drive(schedule: Schedule, gain: float, loss: float = 1.0) -> list[int]:
+    """The levels of the iterations until `schedule` is over, by a search that stays as it is."""
+    levels, search = list[int](), FakeSearch(loss, gain)
+    while not schedule.is_over(len(levels)):
+        levels.append(schedule.stage.level)
+        schedule.note(len(levels), search, 0.0)
+    return levels
 
 
-def test_a_run_begun_later_is_the_rest_of_a_whole_one() -> None:
-    whole, rest = schedule_of(iterations=60), schedule_of(iterations=60, begin_at=0.7)
-    stages = drive(rest, lambda _: 1.0)
-    assert stages == drive(whole, lambda _: 1.0)[42:]
-    assert [rest.rate(i, 0.2) for i in range(18)] == [whole.rate(i, 0.2) for i in range(42, 60)]
+def test_a_stage_ends_at_rest_and_the_last_one_ends_the_run() -> None:
+    schedule = Schedule(AUTO, STAGES)
+    # The prior counts half as much once, and the loss does not fall by that.
+    assert drive(schedule, 0.9 * REST) == [0, 1, 2, 2]
+    assert schedule.ending(4)["kind"] == "rest"
 
 
-def test_a_loss_that_falls_goes_on_as_planned_and_then_to_the_most() -> None:
-    schedule = schedule_of()
-    # By a little more in a window than what counts as rest.
-    stages = drive(schedule, lambda made: (1 - 1.01 * FALL) ** (made / WINDOW))
-    assert len(stages) == MOST_ITERATIONS and schedule.ending(MOST_ITERATIONS)["kind"] == "bound"
-    assert stages == [stage_of(i, PLANNED, (0.4, 0.8)) for i in range(MOST_ITERATIONS)]
-    assert schedule.rate(MOST_ITERATIONS - 1, 0.0) == pytest.approx(schedule.final_rate)
+@pytest.mark.parametrize(("iterations", "most"), [(AUTO, MOST_ITERATIONS), (50, 50), (1, 1)])
+def test_a_run_that_never_rests_ends_at_its_bound_at_full_resolution(
+    iterations: Any, most: int
+) -> None:
+    """Later stages have at least half of what is left."""
+    schedule = Schedule(iterations, STAGES)
+    levels = drive(schedule, 1.1 * REST)
+    assert len(levels) == most and levels == sorted(levels)
+    assert levels.count(0) <= max(most // 2, 1) and levels.count(1) <= max(most // 4 + 1, 1)
+    assert schedule.ending(most)["kind"] == ("bound" if iterations == AUTO else "iterations")
 
 
-def test_a_loss_at_rest_ends_a_part_after_two_windows() -> None:
-    schedule = schedule_of()
-    stages = drive(schedule, lambda made: (1 - 0.99 * FALL) ** (made / WINDOW))
-    # The last resolution has two parts, the second at the lowest rates.
-    assert stages == [0] * 2 * WINDOW + [1] * 2 * WINDOW + [2] * 4 * WINDOW
-    assert schedule.ending(len(stages))["kind"] == "rest"
-
-
-def test_a_window_tells_no_view_from_another() -> None:
-    """Views whose losses differ a hundredfold are drawn in turn, and none comes down."""
-    schedule = schedule_of(count=50, drawn=4)
-    stages = drive(schedule, lambda made: 100.0 if made % 25 < 8 else 1.0)
-    assert schedule.window == 25 and stages == [0] * 50 + [1] * 50 + [2] * 100
+def test_the_prior_is_halved_until_the_loss_is_the_noise() -> None:
+    """Or hardly falls by that: by less than the power `ELASTICITY` of its weight."""
+    for noise, power, halved in ((0.3, 0.5, 4), (0.0, 0.9 * ELASTICITY, 1)):
+        schedule, search, made = Schedule(AUTO, STAGES[:1]), FakeSearch(1.0, 0.0), 0
+        while not schedule.is_over(made):
+            made += 1
+            schedule.note(made, search, noise)
+            # What the loss falls to with the weight that counts from here.
+            search.objective.loss = search.weight**power
+        assert search.weight == 2.0**-halved
 
 
 def test_a_schedule_goes_on_as_if_it_had_never_stopped() -> None:
     random = torch.rand(MOST_ITERATIONS, generator=torch.Generator().manual_seed(3)).tolist()
-    whole, parts, made = schedule_of(), schedule_of(), 0
-    while not whole.is_over(made):
-        assert not parts.is_over(made) and parts.stage(made) == whole.stage(made)
-        loss = 0.97**made + 0.1 * random[made]
+    whole, parts, count = Schedule(AUTO, STAGES), Schedule(AUTO, STAGES), 0
+    while not whole.is_over(count):
+        assert not parts.is_over(count) and parts.stage == whole.stage
         for schedule in (whole, parts):
-            schedule.note(made, loss)
-        if made % 9 == 0:
-            state = json.loads(json.dumps(asdict(parts.progress)))
-            parts = schedule_of()
-            parts.progress = Progress(**state)
-        made += 1
-    assert parts.is_over(made) and parts.progress == whole.progress
+            search = FakeSearch(0.97**count + 0.1 * random[count], 40 * REST * random[count])
+            schedule.note(count + 1, search, 0.1)
+        state = json.loads(json.dumps(asdict(parts.progress)))
+        parts = Schedule(AUTO, STAGES)
+        parts.progress = Progress(**state)
+        count += 1
+    assert parts.is_over(count) and parts.progress == whole.progress
+
+
+@pytest.mark.parametrize(
+    ("others", "is_lit", "waiting"),
+    [
+        (["density"], True, {"emission", "g"}),
+        (["density"], False, {"g"}),
+        ([], True, {"g"}),
+    ],
+)
+def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
+    ball_scene: Scene, others: list[str], is_lit: bool, waiting: set[str]
+) -> None:
+    """In the dark, or alone, glow is all that pictures can show."""
+    grid, scene = box_grid((4, 4, 4)), replace(ball_scene)
+    scene.lights = scene.lights if is_lit else []
+    empty = torch.zeros(grid.shape)
+    values = dict.fromkeys([*others, "emission"], empty) | {"g": torch.tensor(0.1)}
+    parameters = [Parameter(n, ParameterSettings(), v, grid) for n, v in values.items()]
+    stages = find_stages(3, scene, parameters)
+    assert [stage.level for stage in stages] == [0, 0, 1, 2]
+    assert stages[0].waiting == waiting and not any(stage.waiting for stage in stages[1:])
+    for parameter in parameters:
+        parameter.start = torch.rand(grid.shape) if parameter.is_field else parameter.start
+    # A structure is never coarsened, and numbers are seen by it.
+    assert find_stages(3, scene, parameters) == [Stage(2)]
+
+
+def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
+    run = Reconstruction(ball_scene, AUTO)
+    while not run.is_done:
+        run.step()
+    ending = run.ending()
+    assert ending["kind"] == "rest" and ending["residual"] < 3 * ending["noise"]

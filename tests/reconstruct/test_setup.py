@@ -10,7 +10,7 @@ from ddrecon.errors import FormatError, SceneError
 from ddrecon.light.lights import AmbientLight, EnvironmentLight
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.setup import Problem, choose_loss, start_parameters, targets_of
+from ddrecon.reconstruct.setup import Problem, choose_loss, targets_of
 from ddrecon.scene import Scene
 from ddrecon.settings import NoiseSettings, ParameterSettings
 
@@ -39,21 +39,6 @@ def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: 
             else pytest.raises(error, match=r"shows anything|none shines")
         ):
             Reconstruction(replace(scene, **change))
-
-
-@pytest.mark.parametrize(
-    ("others", "is_lit", "waits"),
-    [(["density"], True, True), (["density"], False, False), ([], True, False)],
-)
-def test_emission_waits_for_what_is_lit_beside_it(
-    ball_scene: Scene, others: list[str], is_lit: bool, waits: bool
-) -> None:
-    """In the dark, or alone, it is all that pictures can show."""
-    volume = replace(ball_scene.volume, emission=torch.ones(3, *ball_scene.volume.grid.shape))
-    sought = {name: ParameterSettings() for name in [*others, "emission"]}
-    scene = replace(ball_scene, volume=volume, lights=ball_scene.lights if is_lit else [])
-    *_, emission = start_parameters(scene, replace(ball_scene.optimize, parameters=sought))
-    assert (emission.release > 0) == waits
 
 
 def with_steps(scene: Scene, *steps: float) -> Scene:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ddrecon import Scene, load_scene
+from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.loop import Reconstruction, Together
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
@@ -20,35 +21,35 @@ def still() -> Scene:
     return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
 
 
-def values(run: Reconstruction) -> dict[str, Tensor]:
+def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
     return {p.name: p.value.detach() for p in run.parameters}
 
 
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
     single, together = Reconstruction(still), Together([still, still])
     while not single.is_done:
-        row, rows = single.step(), together.step()
+        row, rows = single.step(), together.advance()
         assert [other.loss for other in rows] == pytest.approx([row.loss] * 2, rel=1e-6)
     assert together.is_done
-    for run in together.runs:
+    for run in together.frames:
         torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
     # Copies have nothing to disagree on.
-    assert all(float(spread.max()) < 1e-4 for spread in together.spread().values())
+    assert all(float(spread.max()) < 1e-4 for spread in together.deviations().values())
 
 
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
     together = Together([still, other])
-    together.step()
+    together.advance()
     state = together.state()
-    rows = together.step()
-    one, two = map(values, together.runs)
+    rows = together.advance()
+    one, two = map(values, together.frames)
     for name in one:
         assert torch.equal(one[name], two[name]) == (name != "density")
-    assert any(float(spread.max()) > 0 for spread in together.spread().values())
+    assert any(float(spread.max()) > 0 for spread in together.deviations().values())
     # It goes on from its state to the same bits.
     again = Together([still, other])
     again.restore(state)
-    assert [row.loss for row in again.step()] == [row.loss for row in rows]
-    for run, resumed in zip(together.runs, again.runs, strict=True):
+    assert [row.loss for row in again.advance()] == [row.loss for row in rows]
+    for run, resumed in zip(together.frames, again.frames, strict=True):
         torch.testing.assert_close(values(resumed), values(run), rtol=0, atol=0)

@@ -60,8 +60,7 @@ def scene_of(kind: str) -> Scene:
         )
         for seed, (view, image) in enumerate(zip(views, images, strict=True))
     ]
-    how = {"iterations": 3, "refine_at": (), "views_per_iteration": 0}
-    settings = OptimizeSettings(SOUGHT[kind], noise=NoiseSettings(read=0.05), **how)
+    settings = OptimizeSettings(SOUGHT[kind], iterations=3, noise=NoiseSettings(read=0.05))
     world = replace(world, views=shown, optimize=settings)
     volume, starts = world.volume, {"density": torch.zeros_like(density)}
     if kind == "cameras":

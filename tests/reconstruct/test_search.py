@@ -1,0 +1,178 @@
+"""The search for a minimum within bounds, of quadratics and of what bends more."""
+
+import io
+from collections.abc import Callable
+
+import pytest
+import torch
+from media import random_values
+from torch import Tensor
+
+from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.search import Objective, Search, Space, Values
+
+COUNT = 12
+Function = Callable[[Tensor], Tensor]
+
+
+def positive_matrix() -> Tensor:
+    """A matrix whose eigenvalues spread over three decades."""
+    basis = torch.linalg.qr(random_values(COUNT, COUNT) - 0.5)[0]
+    return basis @ torch.logspace(-1, 2, COUNT).double().diag() @ basis.T
+
+
+MATRIX = positive_matrix()
+TARGET = random_values(COUNT, seed=1) - 0.3
+
+
+def quadratic(x: Tensor) -> Tensor:
+    return (x - TARGET) @ MATRIX @ (x - TARGET) / 2
+
+
+def rosenbrock(x: Tensor) -> Tensor:
+    return (100 * (x[1::2] - x[::2] ** 2) ** 2 + (1 - x[::2]) ** 2).sum()
+
+
+def space_of(metric: Tensor, low: float) -> Space:
+    """Entries at least `low` in the diagonal `metric`."""
+
+    def free(values: Values, slopes: Values) -> Values:
+        return {n: (~((v <= low) & (slopes[n] > 0))).to(v) for n, v in values.items()}
+
+    return Space(
+        lambda values: {n: v.clamp(min=low) for n, v in values.items()},
+        free,
+        lambda values, residual, free: {"x": residual["x"] * free["x"] / metric},
+    )
+
+
+def objective_of(function: Function, x: Tensor, prior: Function | None = None) -> Objective:
+    """The objective at `x`, whose `prior` is none unless given."""
+    leaf = x.clone().requires_grad_()
+    loss = function(leaf)
+    (slope,) = torch.autograd.grad(loss, leaf)
+    if prior is None:
+        return Objective(float(loss), 0.0, {"x": slope}, {})
+    penalty = prior(leaf)
+    (bar,) = torch.autograd.grad(penalty, leaf)
+    return Objective(float(loss), float(penalty), {"x": slope}, {"x": bar})
+
+
+def begin(function: Function, x: Tensor, space: Space, prior: Function | None = None) -> Search:
+    search = Search(space)
+    search.judge({"x": x}, objective_of(function, x, prior))
+    return search
+
+
+def advance(search: Search, function: Function, count: int) -> Tensor:
+    """Where `search` is after `count` candidates, or when no step helps."""
+    for _ in range(count):
+        if not search.is_stuck:
+            candidate = search.candidate()
+            search.judge(candidate, objective_of(function, candidate["x"]))
+    return search.values["x"]
+
+
+@pytest.mark.parametrize("low", [-10.0, 0.0])
+def test_a_quadratic_within_bounds_is_solved(low: float) -> None:
+    """What is not at a bound has no slope, and what is there would go beyond."""
+    search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), low))
+    x = advance(search, quadratic, 100)
+    slope = MATRIX @ (x - TARGET)
+    is_held = x <= low
+    assert bool(is_held.any()) == (low == 0)
+    scale = float(MATRIX.diagonal().max())
+    assert float(slope[~is_held].abs().max()) < 1e-6 * scale and bool((slope[is_held] > 0).all())
+
+
+def test_its_loss_never_rises_and_reaches_the_end_of_a_curved_valley() -> None:
+    space = space_of(torch.ones(COUNT).double(), -10.0)
+    search, losses = begin(rosenbrock, -torch.ones(COUNT).double(), space), list[float]()
+    while search.loss > 1e-12:
+        advance(search, rosenbrock, 1)
+        losses.append(search.loss)
+        assert len(losses) < 200
+    assert losses == sorted(losses, reverse=True)
+
+
+def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope() -> None:
+    """The matrix of Broyden, Fletcher, Goldfarb and Shanno, updated pair by pair as a whole."""
+    metric = 1 + random_values(COUNT, seed=2)
+    search = begin(rosenbrock, random_values(COUNT, seed=3), space_of(metric, -10.0))
+    advance(search, rosenbrock, 6)
+    assert 3 <= len(search.pairs) < tuning.PAIRS
+    inverse = search.scale * metric.reciprocal().diag()
+    for move, change, _ in search.pairs:
+        s, y = move["x"], change["x"]
+        rest = torch.eye(COUNT).double() - torch.outer(y, s) / (s @ y)
+        inverse = rest.T @ inverse @ rest + torch.outer(s, s) / (s @ y)
+    slope = search.objective.gradients["x"]
+    torch.testing.assert_close(search.direction["x"], -inverse @ slope, rtol=1e-9, atol=1e-12)
+    # The last move is what the last change of the slope asks for.
+    move, change, _ = search.pairs[-1]
+    torch.testing.assert_close(inverse @ change["x"], move["x"])
+    assert search.gains[-1] == pytest.approx(float(slope @ inverse @ slope) / 2 / search.loss)
+
+
+def test_units_of_unknowns_change_nothing() -> None:
+    """Where the metric is in the same units."""
+    unit, start = 10 ** (4 * random_values(COUNT, seed=4) - 2), random_values(COUNT, seed=3)
+    metric = 1 + random_values(COUNT, seed=2)
+    plain = begin(rosenbrock, start, space_of(metric, -10.0))
+
+    def scaled(x: Tensor) -> Tensor:
+        return rosenbrock(x * unit)
+
+    other = begin(scaled, start / unit, space_of(metric * unit**2, -1e9))
+    for _ in range(12):
+        one, two = advance(plain, rosenbrock, 1), advance(other, scaled, 1)
+        torch.testing.assert_close(two * unit, one, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("loss", [float("nan"), float("inf"), 1e9])
+def test_a_candidate_that_is_no_better_shortens_the_step(loss: float) -> None:
+    search = begin(quadratic, torch.ones(COUNT).double(), space_of(MATRIX.diagonal(), -10.0))
+    before, step, values = search.loss, search.step, search.values
+    nothing = {"x": torch.full((COUNT,), torch.nan).double()}
+    assert not search.judge(search.candidate(), Objective(loss, 0.0, nothing, {}))
+    assert 0.1 * step <= search.step <= 0.5 * step
+    assert search.loss == before and search.values is values and not search.pairs
+    # Where no step helps it says so, and does not move.
+    for _ in range(100):
+        if not search.is_stuck:
+            search.judge(search.candidate(), Objective(loss, 0.0, nothing, {}))
+    assert search.is_stuck and search.gain == 0.0 and search.values is values
+
+
+def test_pairs_know_both_curvatures_by_whatever_weight_the_prior_has() -> None:
+    """So a search whose prior is reweighed goes on as if it had always had that weight."""
+
+    def prior(x: Tensor) -> Tensor:
+        return x.square().sum()
+
+    start, space = random_values(COUNT, seed=3), space_of(MATRIX.diagonal(), -10.0)
+    search = begin(quadratic, start, space, prior)
+    for _ in range(4):
+        candidate = search.candidate()
+        search.judge(candidate, objective_of(quadratic, candidate["x"], prior))
+    search.reweigh(0.25)
+    slope = search.objective.slopes(0.25)["x"]
+    x = search.values["x"]
+    torch.testing.assert_close(slope, MATRIX @ (x - TARGET) + 0.5 * x)
+    move, of_loss, of_prior = search.pairs[-1]
+    torch.testing.assert_close(of_loss["x"], MATRIX @ move["x"])
+    torch.testing.assert_close(of_prior["x"], 2 * move["x"])
+    assert search.slope == pytest.approx(float(search.direction["x"] @ slope)) and search.slope < 0
+
+
+def test_a_search_goes_on_from_its_state_to_the_same_bits() -> None:
+    space = space_of(torch.ones(COUNT).double(), -10.0)
+    whole = begin(rosenbrock, random_values(COUNT, seed=3), space)
+    for _ in range(15):
+        file = io.BytesIO()
+        torch.save(whole.state(), file)
+        file.seek(0)
+        resumed = Search(space)
+        resumed.restore(torch.load(file, weights_only=True), whole.values)
+        both = [advance(search, rosenbrock, 1) for search in (whole, resumed)]
+        assert torch.equal(*both) and resumed.step == whole.step
