@@ -104,7 +104,11 @@ class Frame:
     ) -> dict[str, Tensor]:
         """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
         point = self.point(compared)
-        return find_diagonals(point.scene, parameters, point.values, point.weights, self.memory)
+        # Random pictures need no exact light, and their adjoint is near to no other.
+        memory = replace(
+            self.memory, last=dict(self.memory.last), tolerance_floor=solve_tolerances(1.0)
+        )
+        return find_diagonals(point.scene, parameters, point.values, point.weights, memory)
 
     def point(self, compared: Comparison) -> Point:
         """Where the parameters stand, with how strongly the pixels `compared` count."""

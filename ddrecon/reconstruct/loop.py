@@ -173,7 +173,7 @@ class Together:
         before = self.search.state()
         while True:
             is_first = not self.search.values
-            candidate = self.search.candidate() if not is_first else self._values()
+            candidate = self._project(self._values()) if is_first else self.search.candidate()
             self._put(candidate)
             try:
                 return candidate, [frame.evaluate() for frame in self.frames]

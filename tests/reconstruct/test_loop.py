@@ -7,10 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from ddrecon.errors import DivergenceError, FormatError, SceneError
+from ddrecon.errors import DivergenceError, FormatError, SceneError, SolveError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct.frame import Evaluation, Frame
+from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction, optimize
+from ddrecon.reconstruct.objective import Comparison
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint
 from ddrecon.scene import Scene, View
 
@@ -23,9 +26,7 @@ def error_of(density: torch.Tensor) -> float:
 
 
 def test_an_empty_volume_comes_closer_to_the_truth(ball_scene: Scene) -> None:
-    assert ball_scene.optimize is not None
-    by_all_views = replace(ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0))
-    result = optimize(by_all_views, iterations=12)
+    result = optimize(ball_scene, iterations=12)
     losses = [row.loss for row in result.rows]
     assert losses[-1] < 0.25 * losses[0]
     assert error_of(result.scene.volume.density) < 0.9 * error_of(ball_scene.starts["density"])
@@ -48,12 +49,11 @@ def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
 
 
 def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
-    settings = replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
     first, second = ball_scene.views[:2]
     second = replace(second, image=first.image.flip(2))  # as bright, which is the unit of losses
 
     def found(*views: View) -> Result:
-        return optimize(replace(ball_scene, views=[*views], optimize=settings), iterations=2)
+        return optimize(replace(ball_scene, views=[*views]), iterations=2)
 
     heavy = found(replace(first, weight=6.0), replace(second, weight=3.0))
     twice, once = found(first, replace(first, name="again"), second), found(first, second)
@@ -86,22 +86,58 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
 def test_divergence_keeps_the_last_good_state(
     ball_scene: Scene, flaw: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
-    run = Reconstruction(replace(ball_scene, optimize=settings))
+    """Where no candidate, however near, can be looked at."""
+    run, again = Reconstruction(ball_scene), Reconstruction(ball_scene)
+    run.step()
     run.step()
     good = run.parameters[0].value.detach().clone()
+    with monkeypatch.context() as patch:
+        if flaw == "loss of view":
+            patch.setattr(Comparison, "loss_of", lambda *_: torch.tensor(math.nan))
+        else:
+            gradients = {"density": torch.full_like(good, math.nan)}
+            flawed = Differentiated([], torch.tensor(1.0), gradients)
+            patch.setattr(Frame, "_differentiate", lambda *_: flawed)
+        with pytest.raises(DivergenceError, match=f"{flaw} .* is not finite"):
+            run.step()
+    assert torch.equal(run.parameters[0].value, good) and run.iteration == 2
+    # It goes on as if nothing had been.
+    for _ in range(3):
+        again.step()
     run.step()
-    if flaw == "loss of view":
-        run.level.train.views[0].image[0, 3, 4] = math.inf
-    else:
-        gradients = {"density": torch.full_like(good, math.nan)}
-        monkeypatch.setattr(
-            "ddrecon.reconstruct.loop.add_penalties", lambda found, *_: (found.loss, gradients)
-        )
-    with pytest.raises(DivergenceError, match=f"{flaw} .* is not finite"):
-        run.step()
-    assert torch.equal(run.parameters[0].value, good)
-    assert run.iteration == 1
+    assert torch.equal(run.parameters[0].value, again.parameters[0].value)
+
+
+def test_light_that_cannot_be_solved_for_shortens_a_step(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, failed = Reconstruction(ball_scene), list[str]()
+    run.step()
+    candidate, evaluate = run.search.candidate()["density"], Frame.evaluate
+
+    def fail_once(frame: Frame) -> Evaluation:
+        if not failed:
+            failed.append("once")
+            raise SolveError("no light", 9, 1.0, "")
+        return evaluate(frame)
+
+    monkeypatch.setattr(Frame, "evaluate", fail_once)
+    row = run.step()
+    assert row.iteration == 2 and failed
+    torch.testing.assert_close(run.parameters[0].value.detach(), candidate / 2)
+
+
+def test_a_candidate_that_is_refused_is_logged_and_not_kept(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Reconstruction(ball_scene)
+    row, before = run.step(), run.parameters[0].value.detach().clone()
+    # A step so long that all is fog.
+    run.search.step *= 1e3
+    refused = run.step()
+    assert refused.loss > row.loss and refused.iteration == run.total.iteration == 2
+    assert torch.equal(run.parameters[0].value, before)
+    assert (run.total.loss, run.total.psnr) == (row.loss, row.psnr)
 
 
 def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:

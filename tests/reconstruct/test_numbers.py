@@ -8,7 +8,7 @@ from media import data_product, make_camera, make_scene, random_values
 
 from ddrecon.losses import Target
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.numbers import Point, _sum_between, find_curvatures, single_numbers
+from ddrecon.reconstruct.numbers import Point, find_matrix, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
@@ -42,25 +42,22 @@ def curvature() -> Curvature:
 def test_it_is_the_part_of_the_matrix_between_numbers(
     curvature: Curvature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And the levels of fields, by differences: to first order in how long these are."""
+    """By differences: to first order in how long these are."""
     numbers = single_numbers(curvature.parameters)
     assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
-    parts = []
-    for p in curvature.parameters:
-        entries = torch.eye(p.value.numel()).double().view(-1, *p.value.shape)
-        for way in p.value.detach()[None] if p.is_field else entries:
-            parts.append(curvature.join({p.name: way}))
-    basis = torch.stack(parts, 1)
-    wanted = basis.T @ torch.stack([data_product(curvature, part) for part in basis.T], 1)
+    ways = [
+        curvature.join({p.name: entry})
+        for p in numbers
+        for entry in torch.eye(p.value.numel()).double().view(-1, *p.value.shape)
+    ]
+    basis = torch.stack(ways, 1)
+    wanted = basis.T @ torch.stack([data_product(curvature, way) for way in ways], 1)
     size = wanted.diagonal().sqrt()
-    point = Point(curvature.scene, curvature.values, curvature.solutions)
-    views = [view.name for view in curvature.scene.views]
+    point = Point(curvature.scene, curvature.values, curvature.weights, curvature.solutions)
     monkeypatch.setattr(tuning, "CLOSE", 1e-10)
     errors = []
     for apart in (1e-3, 2e-3):
         monkeypatch.setattr(tuning, "APART", apart)
-        by_view = find_curvatures(point, curvature.parameters, views, curvature.weights)
-        found = _sum_between(curvature.parameters, by_view, curvature.parameters)
-        errors.append((found - wanted) / size / size[:, None])
+        errors.append((find_matrix(point, numbers) - wanted) / size / size[:, None])
     torch.testing.assert_close(errors[1], 2 * errors[0], rtol=0, atol=1e-5)
     assert errors[0].abs().max() < 1e-3

@@ -14,6 +14,7 @@ from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.hull import find_shown, hull_of
 from ddrecon.pictures import srgb
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
@@ -98,8 +99,9 @@ def ball(*overrides: str) -> Scene:
     return load_scene(BALL, overrides=["optimize.iterations=8", *overrides])
 
 
-def test_outside_of_its_support_a_volume_stays_empty() -> None:
+def test_outside_of_its_support_a_volume_stays_empty(monkeypatch: pytest.MonkeyPatch) -> None:
     """At every level, whatever `min` says, and rays know it; and the ball itself is inside."""
+    monkeypatch.setattr(tuning, "FEWEST_CELLS", 6)
     scene = ball("optimize.parameters.density={support: masks, support_margin: 1, min: 0.01}")
     for view in scene.views:
         view.mask = (view.image.amax(0) > 0.26).to(view.image)
