@@ -63,7 +63,6 @@ class Together:
             require_legal(scene)
         forget_changed()
         self.frames = [Frame(scene, iterations) for scene in scenes]
-        self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
         self.blocks: dict[str, Parameter] = {}
         shared = {p.name: p for p in self.frames[0].parameters if not p.is_field}
         for frame in self.frames:
@@ -141,7 +140,6 @@ class Together:
             "search": self.search.state(),
             "diagonals": self.diagonals,
             "numbers": self.numbers.state(),
-            "seed": self.seed,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -156,7 +154,6 @@ class Together:
         self.search.restore(state["search"], like)
         self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
         self.numbers.restore(state["numbers"])
-        self.seed = state["seed"]
 
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""
@@ -203,7 +200,7 @@ class Together:
                 gradients[key] = gradients[key] + bar if key in gradients else bar
                 if p.name in objective.prior_gradients:
                     prior_gradients[key] = objective.prior_gradients[p.name]
-        return Objective(loss, prior, gradients, prior_gradients)
+        return Objective(loss, from_first(prior), gradients, prior_gradients)
 
     def _find_metric(self, evaluations: Sequence[Evaluation]) -> None:
         """Takes the metric where the parameters stand."""

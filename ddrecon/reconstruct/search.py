@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.ranks import from_first
 from ddrecon.reconstruct import tuning
 
 Values = dict[str, Tensor]
@@ -108,7 +109,7 @@ class Search:
         """
         if self.values:
             move = {name: value - self.values[name] for name, value in values.items()}
-            promise = float(_dot(move, self.objective.slopes(self.weight)))
+            promise = _read(_dot(move, self.objective.slopes(self.weight)))
             loss = objective.total(self.weight)
             if not loss <= self.loss + tuning.SUFFICIENT * promise:
                 self._shorten(loss, promise)
@@ -132,7 +133,7 @@ class Search:
         """Sets out anew from the values accepted last."""
         gradients = self.objective.slopes(self.weight)
         self.direction = self._find_direction(gradients, self.space.free(self.values, gradients))
-        self.slope = min(float(_dot(self.direction, gradients)), 0.0)
+        self.slope = min(_read(_dot(self.direction, gradients)), 0.0)
         self.is_stuck = self.slope == 0
         # A loss of squares is never below 0, so the first step need not promise more than that.
         self.step = 1.0 if self.scale or self.is_stuck else min(1.0, self.loss / -self.slope)
@@ -168,7 +169,7 @@ class Search:
             # The metric knows directions; how long it is, the last move tells.
             move, change, _ = pairs[-1]
             length = _dot(change, self.space.precondition(self.values, change, free))
-            ratio = float(_dot(move, change) / length)
+            ratio = _read(_dot(move, change) / length)
             self.scale = ratio if 0 < ratio < math.inf else self.scale
         if self.scale:
             result = {name: value * self.scale for name, value in result.items()}
@@ -201,6 +202,11 @@ def _dot(first: Values, second: Values) -> Tensor:
     """The sum of products of entries, in float64."""
     products = [(bar * second[name]).sum(dtype=torch.float64) for name, bar in first.items()]
     return torch.stack(products).sum()
+
+
+def _read(number: Tensor) -> float:
+    """The `number` as the first rank has it, by which all of them decide alike."""
+    return from_first(float(number))
 
 
 def _combine(first: Values, second: Values, weight: float) -> Values:

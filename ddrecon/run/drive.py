@@ -47,7 +47,7 @@ def open_run(
     write_scene(scene_file, path)
     if loaded is None:
         claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])
-    folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
+    folder = RunFolder(path, scene_file, result_of, environment)
     if loaded is None:
         folder.start(run)
     else:

@@ -19,6 +19,7 @@ from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.schema import PhaseSection
 from ddrecon.settings import DiffusionSettings, OptimizeSettings
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import variable_names, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")
@@ -79,7 +80,8 @@ def test_the_derivative_of_what_a_config_makes_small_is_its_difference(config: P
     level, values, ways = problem.at(0), dict[str, Tensor](), dict[str, Tensor]()
     for one in start_parameters(problem.train, problem.settings):
         start = one.value.detach()
-        way = one.rate * (0.5 + random_values(*start.shape))
+        rate = kind_of(one.name).rate(problem.train, one.name, start)
+        way = rate * (0.5 + random_values(*start.shape))
         ways[one.name] = torch.where(start + 2 * way < one.high, way, -way)
         values[one.name] = start + ways[one.name]
 

@@ -174,7 +174,7 @@ def test_a_killed_rank_loses_nothing(runs: Runs) -> None:
 def test_a_checkpoint_stands_where_the_first_rank_is_killed(runs: Runs) -> None:
     assert runs.codes["first killed"] == [-9, 5]
     state = load_checkpoint(runs.folder / "headless" / "checkpoints")[0]
-    assert state["total"]["iteration"] == 0
+    assert state["frames"][0]["total"]["iteration"] == 0
 
 
 def test_a_rank_that_fails_says_why(runs: Runs) -> None:
