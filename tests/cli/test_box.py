@@ -80,7 +80,7 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
     np.testing.assert_allclose(cells, 2 * pixel, rtol=0.05)
     np.testing.assert_allclose(cells, cells[0], rtol=1e-6)
     dump_scene(describe(found), Path("plain.yaml"))
-    assert "auto" not in Path("plain.yaml").read_text()
+    assert "bounds: auto" not in Path("plain.yaml").read_text()
     assert read_scene("plain.yaml").tree == found.tree
 
 

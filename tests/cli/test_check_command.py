@@ -94,7 +94,7 @@ def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
 def test_every_command_tells_the_same_doubts(succeed: Run) -> None:
     """Each once, on stderr, whatever is printed."""
     thick = "-D", "volume.sigma_s=300", "-D", "optimize.parameters.density.init=1"
-    succeed("optimize", "scene.yaml", "-o", "run", "-D", *thick)
+    succeed("optimize", "scene.yaml", "-o", "run", *thick)
     (told,) = succeed("check", "scene.yaml", *thick).stderr.splitlines()
     assert "cells at the faces of the box" in told
     for command in (

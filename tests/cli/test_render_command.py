@@ -119,7 +119,7 @@ def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run, o
         Path("scene.yaml").write_text(text.replace("rounds: null", f"rounds: {said}"))
         path = of
         if of == "run":
-            succeed("optimize", "scene.yaml", "-o", of, "-q", "--iterations", "1", "--overwrite")
+            succeed("optimize", "scene.yaml", "-o", of, "-q", "--iterations", "2", "--overwrite")
             path = "run/result.yaml"
         one, two = (
             ddrecon.fluence(
