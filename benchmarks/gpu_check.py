@@ -123,7 +123,7 @@ class Check:
 
     def load(self, name: str) -> Scene:
         path = CONFIGS / f"{name}.yaml"
-        return load_scene(path, overrides=["optimize.refine_at=[]"], device=self.device)
+        return load_scene(path, device=self.device)
 
 
 def machine(check: Check) -> Iterator[str]:
@@ -343,7 +343,7 @@ def shortage(check: Check) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-c", text, "optimize", str(CONFIGS / "plume.yaml")]
         command += ["-o", folder, "--overwrite", "--device", "cuda"]
-        command += ["-D", "volume.resolution=[192,288,192]", "-D"]
+        command += ["-D", "volume.resolution=[192,288,192]"]
         end = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     yield f"exit {end.returncode}: {end.stderr[-900:]}"
 

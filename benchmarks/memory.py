@@ -16,7 +16,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -89,7 +88,7 @@ def scene_of(
             parameters |= {
                 name: {"init": volume[name], "field": True} for name in ("sigma_a", "sigma_s")
             }
-        scene["optimize"] = {"iterations": 1, "refine_at": [], "parameters": parameters}
+        scene["optimize"] = {"iterations": 20, "parameters": parameters}
     return scene
 
 
@@ -150,7 +149,6 @@ def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, flo
     path = folder / "scene.yaml"
     path.write_text(json.dumps(scene_of(cells, 16, case, is_optimized=True)))
     scene = load_scene(path)
-    scene.optimize = replace(scene.optimize, iterations=3)
     with Alive() as render, torch.no_grad():
         scene.volume.density = scene.volume.density.clone()
         render_each(scene, scene.views, SolveMemory())

@@ -87,11 +87,11 @@ class Experiment:
 
 G_ALONE = (
     *(f"volume.{name}={{file: {SHAPES}/cloud.npz}}" for name in ("sigma_a", "sigma_s")),
-    "optimize.parameters={g: {init: 0.67, lr: 0.1}}",
+    "optimize.parameters={g: {init: 0.67}}",
     "optimize.iterations=100",
 )
 """Overrides that leave nothing but g to be found."""
-HALF = ("volume.resolution=[32, 48, 32]", "optimize.refine_at=[0.5]", "optimize.iterations=120")
+HALF = ("volume.resolution=[32, 48, 32]", "optimize.iterations=120")
 """Fig. 13 in cells twice as large, where the printed scheme, by Jacobi iteration, comes to an end.
 """
 ROUNDS = {
@@ -141,12 +141,8 @@ def optimize(name: str, folder: Path, overrides: list[str]) -> Run:
 def at_paper_size(
     experiment: Experiment, output: Path, iterations: int | None, paths: int | None
 ) -> list[str]:
-    """Overrides for the paper's size, its pictures traced by so many `paths`; given `iterations`,
-    all of them are at full resolution.
-    """
-    fewer = (
-        () if iterations is None else (f"optimize.iterations={iterations}")
-    )
+    """Overrides for the paper's size, its pictures traced by so many `paths`, and `iterations`."""
+    fewer = () if iterations is None else (f"optimize.iterations={iterations}",)
     size = [*experiment.paper_size, *fewer]
     if experiment.known:
         output.mkdir(parents=True, exist_ok=True)

@@ -23,15 +23,12 @@ SCRIPT = "paper_g.py"
 COARSER = 4
 STARTS = {"sigma_a": "[0.5, 0.5, 0.5]", "sigma_s": "[10, 10, 10]"}
 FIELDS, NUMBERS = (
-    [
-        f"optimize.parameters.{name}={{init: {start}, lr: 0.2{more}}}"
-        for name, start in STARTS.items()
-    ]
+    [f"optimize.parameters.{name}={{init: {start}{more}}}" for name, start in STARTS.items()]
     for more in (", field: true, tv: 1e-4", "")
 )
 TRUE = [
     *(f"volume.{name}={{file: {SHAPES}/cloud.npz}}" for name in STARTS),
-    "optimize.parameters={g: {init: 0.67, lr: 0.1}}",
+    "optimize.parameters={g: {init: 0.67}}",
 ]
 ALIKE = [f"views.{index}.weight=1" for index in range(4)]
 WEIGHTS = {

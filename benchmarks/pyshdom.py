@@ -133,7 +133,7 @@ def write_scene(copy: Path, folder: Path) -> None:
         "views": views,
     }
     density = {"init": 0, "support": "masks", "support_margin": 0}
-    sought = {"iterations": 300, "refine_at": [0.15, 0.3], "parameters": {"density": density}}
+    sought = {"parameters": {"density": density}}
     (folder / "true.yaml").write_text(json.dumps(scene))  # JSON is YAML
     (folder / "sought.yaml").write_text(json.dumps(scene | {"optimize": sought}))
 

@@ -32,11 +32,9 @@ FRAMES = 5
 """Frames of the film that are reconstructed, from the first on."""
 PLUME = {
     "as the config has it": (),
-    "30 iterations": ("--iterations", "30", "-D", "optimize.refine_at=[0.5, 0.9]"),
-    "300 iterations": ("--iterations", "300"),
+    "30 iterations": ("--iterations", "30"),
     "diffusion alone": ("-D", "diffusion.transport_rounds=0"),
     "two rounds": ("-D", "diffusion.transport_rounds=2"),
-    "all views in every iteration": ("-D", "optimize.views_per_iteration=0"),
     "loss: display": ("-D", "optimize.loss=display"),
     "loss: photon": ("-D", "optimize.loss=photon"),
     "engine torch": ("--engine", "torch"),

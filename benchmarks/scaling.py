@@ -72,7 +72,7 @@ def start_run(scene: Scene, names: Sequence[str] = ("density",)) -> Reconstructi
         images = render_each(scene, scene.views, SolveMemory())
     views = [replace(view, image=image) for view, image in zip(scene.views, images, strict=True)]
     fields = {name: ParameterSettings(field=True) for name in names}
-    settings = OptimizeSettings(fields, iterations=1000, refine_at=(), views_per_iteration=0)
+    settings = OptimizeSettings(fields, iterations=1000)
     starts = {name: 0.5 * getattr(scene.volume, name) for name in names}
     return Reconstruction(replace(scene, views=views, optimize=settings, starts=starts))
 

@@ -77,8 +77,11 @@ def result_of(out: Path) -> dict[str, object]:
     seconds = rows[0].index("seconds")
     log = [row[:seconds] + row[seconds + 1 :] for row in rows]
     files = [*sorted(out.glob("previews/*")), out / "parameters.json"]
-    state = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]["parameters"]
-    tensors = {name: [entry["value"], *entry["moments"]] for name, entry in state.items()}
+    search = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]["search"]
+    pairs = [(n, v) for pair in search["pairs"] for part in pair for n, v in part.items()]
+    tensors = {name: [value, search["direction"][name]] for name, value in search["values"].items()}
+    for name, value in pairs:
+        tensors[name].append(value)
     return {
         "log": log,
         "files": {path.name: path.read_bytes() for path in files},
