@@ -81,7 +81,7 @@ def numbers_in_cell(
         rendered += 12
     elif settings.rounds:
         rendered += 13 + 1.2 * moments
-    return colors * rendered * (2 if varied else 1) + 13 * varied
+    return colors * rendered * (2 if varied else 1) + 38 * varied
 
 
 def refuse_excess(needs: Needs, device: torch.device) -> str | None:

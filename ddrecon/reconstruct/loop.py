@@ -74,6 +74,9 @@ class Together:
         stages = find_stages(len(problem.factors), problem.train, every)
         self.schedule = Schedule(problem.settings.iterations, stages)
         self.diagonals: Values = {}
+        # What the stiffness of smoothing was taken at, and what it was there.
+        self.stiffened: Values | None = None
+        self.stiffness: dict[str, Tensor | None] = {}
         self.search = Search(Space(self._project, self._free, self._precondition))
         self._enter_stage()
 
@@ -230,10 +233,14 @@ class Together:
         }
 
     def _precondition(self, values: Values, residual: Values, free: Values) -> Values:
+        if self.stiffened is not values:
+            stiffness = {key: self.blocks[key].stiffness(values[key]) for key in self.diagonals}
+            self.stiffened, self.stiffness = values, stiffness
         result = dict[str, Tensor]()
         for key, diagonal in self.diagonals.items():
-            stiffness = self.blocks[key].stiffness(values[key])
-            total = diagonal if stiffness is None else diagonal + self.search.weight * stiffness
+            total, stiffness_there = diagonal, self.stiffness[key]
+            if stiffness_there is not None:
+                total = torch.add(diagonal, stiffness_there, alpha=self.search.weight)
             result[key] = residual[key] * free[key] / total
         return result | self.numbers.precondition(residual, free)
 

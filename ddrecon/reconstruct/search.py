@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import torch
@@ -201,7 +202,7 @@ class Search:
 def _dot(first: Values, second: Values) -> Tensor:
     """The sum of products of entries, in float64."""
     products = [(bar * second[name]).sum(dtype=torch.float64) for name, bar in first.items()]
-    return torch.stack(products).sum()
+    return reduce(torch.add, products)
 
 
 def _read(number: Tensor) -> float:
