@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of
@@ -20,18 +21,16 @@ CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper")
 RECONSTRUCTIONS = [name for name in CONFIGS if name != "fig08"]
 """Fig. 8 is of derivatives, which tests/test_tangents.py checks."""
 ITERATIONS = 12
-COARSE = [
-    f"optimize.iterations={ITERATIONS}",
-    "diffusion.tolerance=1e-3",
-]
-"""All iterations are made in cells and pixels four times as large as the scene's."""
+CHANGES = [f"optimize.iterations={ITERATIONS}", "diffusion.tolerance=1e-3"]
+COARSER = 4
+"""How many times larger than the scene's cells and pixels are here."""
 
 
 def coarse(field: np.ndarray) -> Tensor:
-    """Means of `field` [z, y, x] or [z, y, x, 3] over 4^3 cells."""
+    """Means of `field` [z, y, x] or [z, y, x, 3] over so many cells along each axis."""
     values = torch.from_numpy(field)
     return torch.nn.functional.avg_pool3d(
-        values.movedim(-1, 0) if values.ndim == 4 else values[None], 4
+        values.movedim(-1, 0) if values.ndim == 4 else values[None], COARSER
     )
 
 
@@ -65,7 +64,7 @@ FIELDS = {
 def test_a_reconstruction_comes_closer(config: str) -> None:
     """To its pictures, and to the truth where it is known; coefficients are per length."""
     fewer = ["optimize.iterations=4"] if config == "fig10" else []  # each takes seconds
-    scene = load_scene(CONFIGS[config], overrides=[*COARSE, *fewer])
+    scene = scene_at_level(load_scene(CONFIGS[config], overrides=[*CHANGES, *fewer]), COARSER)
     result = optimize(scene)
     assert result.rows[-1].loss < 0.5 * result.rows[0].loss
     if config == "fig06_light":
@@ -74,16 +73,14 @@ def test_a_reconstruction_comes_closer(config: str) -> None:
     if config not in FIELDS:
         return
     name, shape, is_flat = FIELDS[config]
-    density = coarse(scene.volume.density.numpy()) if name != "density" else 1
+    density = scene.volume.density if name != "density" else 1
 
     def seen(field: Tensor) -> Tensor:
         return (field * density).sum(-3) if is_flat else field * density
 
     truth = seen(true_field(shape, name))
     before, after = (
-        (seen(coarse(value.movedim(0, -1).numpy() if value.ndim == 4 else value.numpy())) - truth)
-        .abs()
-        .sum()
+        (seen(value) - truth).abs().sum()
         for value in (scene.starts[name], value_of(result.scene, name))
     )
     assert after < 0.9 * before
