@@ -82,8 +82,8 @@ class Numbers:
         for p, precision in self.precisions.items():
             # As strong as what one picture says of a shift in the image by `TRUST` pixels.
             at = self.places[p]
-            rate = torch.as_tensor(kind_of(p.name).rate(points[0].scene, p.name, p.value.detach()))
-            pixel = rate[3:5].double().cpu() / PIXELS
+            unit = kind_of(p.name).change(points[0].scene, p.name, p.value.detach())
+            pixel = torch.as_tensor(unit)[3:5].double().cpu() / PIXELS
             shifts = (matrix[at, at][3:5] * pixel**2).mean() / len(points)
             prior[at[:, None], at] = precision * tuning.TRUST**2 * shifts
         # As the first rank has it: another machine may round in another way.
@@ -229,12 +229,12 @@ def _places(numbers: Sequence[Parameter]) -> dict[Parameter, Tensor]:
 def _small_changes(point: Point, p: Parameter) -> tuple[Tensor, Tensor]:
     """Small changes [m, *shape] of `p` at `point`, and how far each of its entries goes [n].
 
-    They are parts of default rates, and go downwards at the upper bound. Colors do not mix, so that
-    all change at once.
+    They are parts of the change of its kind, and go downwards at the upper bound. Colors do not
+    mix, so that all change at once.
     """
     value = point.values[p.name]
-    rate = torch.as_tensor(kind_of(p.name).rate(point.scene, p.name, value)).to(value)
-    lengths = tuning.APART * rate.expand(value.numel())
+    change = torch.as_tensor(kind_of(p.name).change(point.scene, p.name, value)).to(value)
+    lengths = tuning.APART * change.expand(value.numel())
     lengths = torch.where(value.flatten() + lengths > p.high, -lengths, lengths)
     if kind_of(p.name).is_color:
         return lengths.view_as(value)[None], lengths

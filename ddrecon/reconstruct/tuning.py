@@ -1,7 +1,7 @@
 """Every constant of this room that is no law of physics, and what it was chosen on.
 
-Rates stand with their variables (`variables/kinds.py`), knees with their losses (`losses.py`), for
-rooms below have them. A module reads these as `tuning.NAME`, so that an ablation changes one place.
+Sizes of changes stand with their variables (`variables/kinds.py`), knees with their losses
+(`losses.py`), for rooms below have them. A module reads these as `tuning.NAME`, so that an ablation changes one place.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ which the loss of images falls at least, or else it is not the prior that keeps 
 
 # The metric of numbers (E10.2).
 APART, CLOSE = 0.5, 1e-5
-"""Parts of a default rate by which differences of pictures are taken, and the largest tolerance of
-the light in them. Of smaller parts, such as a tenth, what solves leave undone is seen: a sun's
+"""Parts of a kind's change by which differences of pictures are taken, and the largest tolerance
+of the light in them. Of smaller parts, such as a tenth, what solves leave undone is seen: a sun's
 direction then takes twice as many steps."""
 LEAST = 1e-4
 """Least curvature, as a part of the parameter's largest: what no picture shows stays."""

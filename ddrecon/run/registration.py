@@ -21,7 +21,7 @@ from ddrecon.picture import view_picture
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.objective import fit_held_out
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import pose_rate
+from ddrecon.variables.kinds import pose_change
 from ddrecon.variables.values import extinction_of, with_values
 
 STEPS = 8
@@ -40,7 +40,7 @@ def register(
     And by how many pixels its smoke moved. `sizes` are as for `fit_held_out`.
     """
     name = f"views.{view.name}.camera"
-    unit = pose_rate(scene, name, view.camera.pose)
+    unit = pose_change(scene, name, view.camera.pose)
 
     def see_by(change: Tensor) -> tuple[View, Tensor]:
         world = with_values(scene, {name: change})

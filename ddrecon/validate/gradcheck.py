@@ -263,7 +263,7 @@ def starting_point(
     for name, value in point.items():
         kind = kind_of(name)
         if kind.difference_steps == SHORT_STEPS and not is_of_volume(name):
-            step = kind.rate(scene, name, value)
+            step = kind.change(scene, name, value)
             point[name] = value + step * random_like(value, generator)
     return point
 

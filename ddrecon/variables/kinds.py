@@ -4,9 +4,9 @@ A kind is named by a pattern: N is the place in a list, counted from 0, and NAME
 `*` for all training views. Where there are two media, `media.cloud.density` is of the same kind as
 `density`. `ddrecon.variables.values` reads and replaces the values.
 
-Default learning rates are the largest change of a variable in one step, in the variable's own unit.
-Those of densities, cross sections, brightness, positions and directions follow the scene's units:
-the same scene in other units of density or length moves alike.
+A kind knows a change of it that pictures show clearly, in the variable's own unit: differences are
+taken over parts of it. Those of densities, cross sections, brightness, positions and directions
+follow the scene's units.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
     from ddrecon.scene import Scene, View
 
-Rate = Callable[["Scene", str, "Tensor"], "float | Tensor"]
-"""The rate of a variable, or of each entry, by the scene, its name and its value at the start."""
+Change = Callable[["Scene", str, "Tensor"], "float | Tensor"]
+"""The change of a variable, or of each entry, by the scene, its name and its value."""
 
-DENSITY_STEP = 1.7
-"""Optical depth that one step may lay across the box's shortest side."""
+DENSITY_CHANGE = 1.7
+"""A change of the optical depth across the box's shortest side."""
 SOUGHT_DEPTH = 20.0
 """Optical depth that the densest medium may have across the box, where density is not known yet."""
-EMISSION_STEP = 5.0
-"""Brightness of the pictures that one step may add across the box's shortest side."""
+EMISSION_CHANGE = 5.0
+"""A change of what shines across the box's shortest side, in brightnesses of the pictures."""
 PIXELS = 0.25
-"""Pixels by which one step of a camera's pose may move the image."""
-EXPOSURE_STEP = 0.05
-"""Change of an exposure in one step, as a part of it."""
-OFFSET_STEP = 0.01
-"""Change of an offset in one step, as a part of the root mean square of the picture."""
-RELATIVE_STEP = 0.1
-"""Change, in one step, of a quantity as a part of its mean, or of the box's shortest side."""
+"""Pixels by which a change of a camera's pose moves the image."""
+EXPOSURE_CHANGE = 0.05
+"""Change of an exposure, as a part of it."""
+OFFSET_CHANGE = 0.01
+"""Change of an offset, as a part of the root mean square of the picture."""
+RELATIVE_CHANGE = 0.1
+"""Change of a quantity as a part of its mean, or of the box's shortest side."""
 LONG_STEPS = (1e-2, 1e-3, 1e-4)
 """Changes for finite differences, as parts of the variable's largest value."""
 SHORT_STEPS = (1e-4, 1e-5, 1e-6)
@@ -51,18 +51,18 @@ STEEPEST_G = 0.99
 XYZ = ("x", "y", "z")
 
 
-def cross_section_rate(scene: Scene, name: str, start: Tensor) -> float:
+def cross_section_change(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the mean [1/u], which counts as at least what has an optical depth of 1."""
-    return RELATIVE_STEP * max(float(start.mean()), unit_of(scene, name))
+    return RELATIVE_CHANGE * max(float(start.mean()), unit_of(scene, name))
 
 
-def brightness_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the mean, which counts as at least `RELATIVE_STEP`, seen from the box's side."""
+def brightness_change(scene: Scene, name: str, start: Tensor) -> float:
+    """A part of the mean, which counts as at least `RELATIVE_CHANGE`, seen from the box's side."""
     unit = _side(scene) ** 2 if name.endswith((".intensity", ".power")) else 1.0
-    return RELATIVE_STEP * max(float(start.mean()), RELATIVE_STEP * unit)
+    return RELATIVE_CHANGE * max(float(start.mean()), RELATIVE_CHANGE * unit)
 
 
-def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
+def pose_change(scene: Scene, name: str, start: Tensor) -> Tensor:
     """What moves the image by `PIXELS` where the volume is: three turns [rad], three shifts [u].
 
     A turn about the box's center moves its corners, a shift along the axis makes it larger.
@@ -76,10 +76,10 @@ def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
     return PIXELS * start.new_tensor([turn, turn, turn, pixel, pixel, pixel * depth])
 
 
-def offset_rate(scene: Scene, name: str, start: Tensor) -> float:
+def offset_change(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the root mean square of the view's picture, or of 1 where there is none."""
     view = _view_of(scene, name)
-    return OFFSET_STEP * (1.0 if view.image is None else float(view.seen.square().mean().sqrt()))
+    return OFFSET_CHANGE * (1.0 if view.image is None else float(view.seen.square().mean().sqrt()))
 
 
 def unit_of(scene: Scene, name: str) -> float:
@@ -115,14 +115,14 @@ def shown_emission(scene: Scene) -> float:
     return (squares / total if total > 0 else 1.0) / _side(scene)
 
 
-def side_rate(scene: Scene, name: str, start: Tensor) -> float:
+def side_change(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the box's shortest side [u]."""
-    return RELATIVE_STEP * _side(scene)
+    return RELATIVE_CHANGE * _side(scene)
 
 
-def fixed_rate(rate: float) -> Rate:
-    """`rate` in every scene, for a variable with a natural unit."""
-    return lambda scene, name, start: rate
+def fixed_change(change: float) -> Change:
+    """`change` in every scene, for a variable with a natural unit."""
+    return lambda scene, name, start: change
 
 
 def _view_of(scene: Scene, name: str) -> View:
@@ -139,7 +139,7 @@ def _side(scene: Scene) -> float:
 class Kind:
     """One kind of variable.
 
-    `rate`: the default learning rate; values are kept within [`low`, `high`]. `is_color`: values
+    `change`: one that pictures show; values are kept within [`low`, `high`]. `is_color`: values
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components`:
     names of a vector's entries, which change one at a time. `is_direction`: only where a vector
     points matters, and a step keeps its length. `tv`: the default weight of total variation, of
@@ -147,7 +147,7 @@ class Kind:
     sought and it only suppresses noise. `difference_steps`: those of finite differences.
     """
 
-    rate: Rate
+    change: Change
     low: float = -math.inf
     high: float = math.inf
     is_color: bool = False
@@ -169,16 +169,16 @@ class Kind:
         return bool(((values >= self.low) & (values <= self.high)).all())
 
 
-_CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
-_SHARE = Kind(fixed_rate(0.02), low=0, high=1, is_color=True)
+_CROSS_SECTION = Kind(cross_section_change, low=0, is_color=True, is_cellwise=True)
+_SHARE = Kind(fixed_change(0.02), low=0, high=1, is_color=True)
 _MEAN_COSINE = Kind(
-    fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
+    fixed_change(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
-_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
+_BRIGHTNESS = Kind(brightness_change, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
     "density": Kind(
-        lambda scene, name, start: DENSITY_STEP * unit_of(scene, name),
+        lambda scene, name, start: DENSITY_CHANGE * unit_of(scene, name),
         low=0,
         is_cellwise=True,
         tv=3e-3,
@@ -188,7 +188,7 @@ KINDS: Mapping[str, Kind] = {
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
     "emission": Kind(
-        lambda scene, name, start: EMISSION_STEP * unit_of(scene, name),
+        lambda scene, name, start: EMISSION_CHANGE * unit_of(scene, name),
         low=0,
         is_color=True,
         is_cellwise=True,
@@ -199,44 +199,44 @@ KINDS: Mapping[str, Kind] = {
     "albedo": replace(_SHARE, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": _MEAN_COSINE,
-    "phase.weight": replace(_SHARE, is_cellwise=True, rate=fixed_rate(0.05)),
+    "phase.weight": replace(_SHARE, is_cellwise=True, change=fixed_change(0.05)),
     # of one of two media: the weight of their blend differs from cell to cell, and no other number
     "media.NAME.g": _MEAN_COSINE,
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
     "lights.N.power": _BRIGHTNESS,
-    "lights.N.scale": Kind(brightness_rate, low=0),
+    "lights.N.scale": Kind(brightness_change, low=0),
     # in degrees
-    "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
+    "lights.N.rotation": Kind(fixed_change(1.0), difference_steps=SHORT_STEPS),
     # a turn by some 3 degrees
     "lights.N.direction": Kind(
-        lambda scene, name, start: RELATIVE_STEP / 2 * float(start.norm()),
+        lambda scene, name, start: RELATIVE_CHANGE / 2 * float(start.norm()),
         components=XYZ,
         is_direction=True,
         difference_steps=SHORT_STEPS,
     ),
-    "lights.N.position": Kind(side_rate, components=XYZ, difference_steps=SHORT_STEPS),
+    "lights.N.position": Kind(side_change, components=XYZ, difference_steps=SHORT_STEPS),
     "ground.albedo": _SHARE,
-    "lights.N.radius": Kind(side_rate, low=0, difference_steps=SHORT_STEPS),
+    "lights.N.radius": Kind(side_change, low=0, difference_steps=SHORT_STEPS),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
-        pose_rate,
+        pose_change,
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
     ),
     # what a camera does to radiance: a factor, and what is added to it
     "views.NAME.exposure": Kind(
-        lambda scene, name, start: EXPOSURE_STEP * float(start.mean()), low=1e-3, is_color=True
+        lambda scene, name, start: EXPOSURE_CHANGE * float(start.mean()), low=1e-3, is_color=True
     ),
-    "views.NAME.offset": Kind(offset_rate, is_color=True),
+    "views.NAME.offset": Kind(offset_change, is_color=True),
     # of a perspective camera: its focal length in widths of the image, and the rest of its lens
-    "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
+    "views.NAME.focal": Kind(fixed_change(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
     "views.NAME.principal_point": Kind(
-        fixed_rate(1e-3), components=("x", "y"), difference_steps=SHORT_STEPS
+        fixed_change(1e-3), components=("x", "y"), difference_steps=SHORT_STEPS
     ),
     "views.NAME.distortion": Kind(
-        fixed_rate(1e-3), components=LENSES["opencv"], difference_steps=SHORT_STEPS
+        fixed_change(1e-3), components=LENSES["opencv"], difference_steps=SHORT_STEPS
     ),
 }
 """Every kind of variable, by its pattern."""

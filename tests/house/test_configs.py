@@ -32,7 +32,7 @@ CONFIGS = [
 """Those with images; the derivatives of the first other are checked in tests/validate."""
 
 STEP = 1e-5
-"""A part of a rate, so small that no kink is crossed: light's way through cells has some."""
+"""A part of a change, so small that no kink is crossed: light's way through cells has some."""
 KINDS = [*sorted((ROOT / "configs" / "kinds").glob("*.yaml")), ROOT / "configs" / "ground.yaml"]
 
 
@@ -80,8 +80,8 @@ def test_the_derivative_of_what_a_config_makes_small_is_its_difference(config: P
     level, values, ways = problem.at(0), dict[str, Tensor](), dict[str, Tensor]()
     for one in start_parameters(problem.train, problem.settings):
         start = one.value.detach()
-        rate = kind_of(one.name).rate(problem.train, one.name, start)
-        way = rate * (0.5 + random_values(*start.shape))
+        change = kind_of(one.name).change(problem.train, one.name, start)
+        way = change * (0.5 + random_values(*start.shape))
         ways[one.name] = torch.where(start + 2 * way < one.high, way, -way)
         values[one.name] = start + ways[one.name]
 

@@ -82,13 +82,13 @@ def test_values_are_within_bounds_and_stay_there_as_they_move(scene: Scene, patt
     kind, name = KINDS[pattern], name_of(pattern, scene)
     value = value_of(scene, name)
     assert kind.low < kind.high and bool((value >= kind.low).all() and (value <= kind.high).all())
-    rate = kind.rate(scene, name, value)
-    assert bool((torch.as_tensor(rate) > 0).all())
+    change = kind.change(scene, name, value)
+    assert bool((torch.as_tensor(change) > 0).all())
     if kind.low == 0 and not value.any():
-        value = value + rate
+        value = value + change
     for steps in (20, -20):
         parameter = Parameter(name, ParameterSettings(), value, scene.volume.grid)
-        moved = parameter.project(value + steps * torch.as_tensor(rate).expand_as(value))
+        moved = parameter.project(value + steps * torch.as_tensor(change).expand_as(value))
         assert bool((moved >= kind.low).all() and (moved <= kind.high).all())
         assert not torch.equal(moved, value) or kind.is_direction
         if kind.is_direction:
@@ -109,12 +109,12 @@ def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -
 
 
 @pytest.mark.parametrize("name", ["emission", "views.front.offset"])
-def test_what_masked_pixels_hold_changes_no_rate(name: str) -> None:
-    rates = []
+def test_what_masked_pixels_hold_leaves_changes_alone(name: str) -> None:
+    changes = []
     for lamp in (0.0, 1000.0):
         scene = make_scene(torch.ones(2, 2, 2), emission=torch.zeros(1))
         image, mask = torch.full((3, 4, 5), 0.2), torch.ones(4, 5)
         image[:, 1, 2], mask[1, 2] = lamp, 0
         scene.views = [View("front", scene.views[0].camera, image, mask)]
-        rates.append(float(kind_of(name).rate(scene, name, torch.zeros(1))))
-    assert rates[0] == rates[1] > 0
+        changes.append(float(kind_of(name).change(scene, name, torch.zeros(1))))
+    assert changes[0] == changes[1] > 0
