@@ -1,7 +1,8 @@
 """Every constant of this room that is no law of physics, and what it was chosen on.
 
 Sizes of changes stand with their variables (`variables/kinds.py`), knees with their losses
-(`losses.py`), for rooms below have them. A module reads these as `tuning.NAME`, so that an ablation changes one place.
+(`losses.py`), for rooms below have them. A module reads these as `tuning.NAME`, so that an ablation
+changes one place.
 """
 
 from __future__ import annotations
