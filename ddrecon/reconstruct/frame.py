@@ -105,8 +105,11 @@ class Frame:
         """The diagonal of the objective's Gauss-Newton matrix, by name of the `parameters`."""
         point = self.point(compared)
         # Random pictures need no exact light, and their adjoint is near to no other.
-        memory = replace(
-            self.memory, last=dict(self.memory.last), tolerance_floor=solve_tolerances(1.0)
+        memory = SolveMemory(
+            self.memory.is_warm,
+            dict(self.memory.last),
+            self.memory.records,
+            solve_tolerances(1.0),
         )
         return find_diagonals(point.scene, parameters, point.values, point.weights, memory)
 

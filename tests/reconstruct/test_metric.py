@@ -1,4 +1,4 @@
-"""The metric of fields: random pictures tell the diagonal of the whole matrix, on average."""
+"""What pictures say of fields and of single numbers, against products with the whole matrix."""
 
 from dataclasses import replace
 from itertools import product
@@ -11,44 +11,75 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.metric import find_diagonals
+from ddrecon.reconstruct.numbers import Point, find_matrix, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
 from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import value_of
 
-SHAPE = (3, 4, 3)
-NAMES = ("density", "g")
+CELLS = (3, 3, 3)
+NAMES = "lights.0.irradiance", "density", "g", "views.one.camera"
+NAMES += "views.two.exposure", "views.two.offset"
 
 
 @pytest.fixture(scope="module")
 def curvature() -> Curvature:
-    """Two views, one of which counts twice and sees a part, of a volume and its g."""
-    base = make_scene(0.3 + random_values(*SHAPE), g=0.3, transport_rounds=0)
+    """Two views, of which one moves its camera and the other is exposed, in light of one number."""
+    density = 0.3 + random_values(*CELLS)
+    base = make_scene(density, g=0.3, ambient=(0.2, 0.3, 0.4), transport_rounds=0)
     images = random_values(2, 3, 4, 5, seed=2)
     one = View("one", make_camera((0.2, 0.3, 2.5)), images[0])
     two = View("two", make_camera((2.4, -0.3, 0.5)), images[1], weight=2.0)
-    two = replace(two, mask=random_values(4, 5, seed=4).round())
+    two = replace(two, exposure=density.new_tensor([1.1, 1.2, 0.9]), offset=density.new_zeros(1))
     scene = replace(base, views=[one, two])
-    grid = scene.volume.grid
-    parameters = [Parameter(n, ParameterSettings(), value_of(scene, n), grid) for n in NAMES]
-    targets = {view.name: Target.of(view.image, view.mask) for view in scene.views}
+    parameters = [
+        Parameter(name, ParameterSettings(), value_of(scene, name), scene.volume.grid)
+        for name in NAMES
+    ]
+    # Twists are about cameras as they were told: the derivative is where it has moved to.
+    parameters[3].value = 0.02 * random_values(6, seed=3)
+    targets = {view.name: Target.of(view.image, None) for view in scene.views}
     return Curvature(scene, parameters, targets)
+
+
+def test_it_is_the_part_of_the_matrix_between_numbers(
+    curvature: Curvature, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By differences: to first order in how long these are."""
+    numbers = single_numbers(curvature.parameters)
+    assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
+    ways = [
+        curvature.join({p.name: entry})
+        for p in numbers
+        for entry in torch.eye(p.value.numel()).double().view(-1, *p.value.shape)
+    ]
+    basis = torch.stack(ways, 1)
+    wanted = basis.T @ torch.stack([data_product(curvature, way) for way in ways], 1)
+    size = wanted.diagonal().sqrt()
+    point = Point(curvature.scene, curvature.values, curvature.weights, curvature.solutions)
+    monkeypatch.setattr(tuning, "CLOSE", 1e-10)
+    errors = []
+    for apart in (1e-3, 2e-3):
+        monkeypatch.setattr(tuning, "APART", apart)
+        errors.append((find_matrix(point, numbers) - wanted) / size / size[:, None])
+    torch.testing.assert_close(errors[1], 2 * errors[0], rtol=0, atol=1e-5)
+    assert errors[0].abs().max() < 1e-3
 
 
 def diagonal_by(curvature: Curvature, probes: int, monkeypatch: pytest.MonkeyPatch) -> torch.Tensor:
     monkeypatch.setattr(tuning, "PROBES", probes)
-    arguments = curvature.parameters[:1], curvature.values, curvature.weights, SolveMemory()
+    arguments = [curvature.parameters[1]], curvature.values, curvature.weights, SolveMemory()
     return find_diagonals(curvature.scene, *arguments)["density"]
 
 
 def test_it_is_the_mean_of_the_true_diagonal_over_neighbors(
     curvature: Curvature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cells = [curvature.join({"density": cell.view(SHAPE)}) for cell in torch.eye(36).double()]
-    true = torch.stack([cell @ data_product(curvature, cell) for cell in cells]).view(SHAPE)
+    cells = [curvature.join({"density": cell.view(CELLS)}) for cell in torch.eye(27).double()]
+    true = torch.stack([cell @ data_product(curvature, cell) for cell in cells]).view(CELLS)
     wanted = torch.zeros_like(true)
-    for z, y, x in product(*map(range, SHAPE)):
+    for z, y, x in product(*map(range, CELLS)):
         around = (slice(max(0, at - 1), at + 2) for at in (z, y, x))
         wanted[z, y, x] = true[tuple(around)].mean()
     errors = [
