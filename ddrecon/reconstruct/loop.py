@@ -55,7 +55,8 @@ class Together:
 
     Frames are scenes that differ in their pictures: one, or several of a film that share all
     parameters but their fields. `blocks` are the parameters of all, by their names in the search,
-    and `numbers` the single numbers among them. `diagonals` are the metric of fields and maps.
+    and `numbers` the single numbers among them. `diagonals` are the metric of fields and maps;
+    `rival` is the loss of images and the values that a trial has to beat.
     """
 
     def __init__(self, scenes: Sequence[Scene], iterations: Iterations | None = None):
@@ -78,6 +79,7 @@ class Together:
         self.stiffened: Values | None = None
         self.stiffness: dict[str, Tensor | None] = {}
         self.search = Search(Space(self._project, self._free, self._precondition))
+        self.rival: tuple[float, Values] = (math.inf, {})
         self._enter_stage()
 
     @property
@@ -120,6 +122,7 @@ class Together:
             for frame, evaluation in zip(self.frames, evaluations, strict=True)
         ]
         if self.schedule.stage != stage:
+            self._pass_trial(is_over=stage.is_trial)
             self._enter_stage()
         return rows
 
@@ -141,6 +144,7 @@ class Together:
             "frames": [frame.state() for frame in self.frames],
             "progress": asdict(self.schedule.progress),
             "search": self.search.state(),
+            "rival": self.rival,
             "diagonals": self.diagonals,
             "numbers": self.numbers.state(),
         }
@@ -156,7 +160,23 @@ class Together:
         like = {key: p.value for key, p in self.blocks.items()}
         self.search.restore(state["search"], like)
         self.diagonals = {key: bar.to(like[key]) for key, bar in state["diagonals"].items()}
+        loss, values = state["rival"]
+        self.rival = loss, {key: value.to(like[key]) for key, value in values.items()}
         self.numbers.restore(state["numbers"])
+
+    def _pass_trial(self, is_over: bool) -> None:
+        """Begins a trial of denser fields where one is due; ends one that `is_over`."""
+        loss, values = self.rival
+        if is_over and self.search.objective.loss > tuning.BETTER * loss:
+            self._put(values)
+        self.rival = math.inf, {}
+        if self.schedule.stage.is_trial:
+            self.rival = self.search.objective.loss, self.search.values
+            denser = {
+                key: value * (tuning.DENSER if self.blocks[key].key == "density" else 1)
+                for key, value in self.search.values.items()
+            }
+            self._put(self._project(denser))
 
     def _enter_stage(self) -> None:
         """Takes frames to the resolution of the stage; the search begins anew."""

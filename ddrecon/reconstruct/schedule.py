@@ -20,10 +20,15 @@ from ddrecon.settings import AUTO, Iterations
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of a run: at one `level` of resolution; the parameters called `waiting` rest in it."""
+    """A part of a run: at one `level` of resolution; the parameters called `waiting` rest in it.
+
+    A trial begins denser than the last stage ended, which it replaces where it explains the
+    pictures better: what is lit from all around looks alike where it is thin and where it is dark.
+    """
 
     level: int
     waiting: frozenset[str] = frozenset()
+    is_trial: bool = False
 
 
 @dataclass
@@ -53,6 +58,10 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
     lit = [p for p in shown if not (scene.lights and p.key == "emission" and len(shown) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
+    if is_empty:
+        # The stage after the trial begins with the better of two volumes.
+        again = stages[:1] if len(stages) == 1 else []
+        stages = [stages[0], Stage(stages[0].level, is_trial=True), *stages[1:], *again]
     return [Stage(stages[0].level, waiting), *stages] if is_empty and waiting else stages
 
 
@@ -82,7 +91,8 @@ class Schedule:
         progress, is_last = self.progress, self.progress.stage == len(self.stages) - 1
         share = (self.most - progress.began) // 2
         is_short = not is_last and iteration - progress.began >= max(share, 1)
-        if not (search.gain < tuning.REST or is_short):
+        is_vain = self.stage.is_trial and search.objective.loss > tuning.UNLIKE
+        if not (search.gain < tuning.REST or is_short or is_vain):
             return
         if not is_last:
             self.progress = Progress(progress.stage + 1, iteration)
