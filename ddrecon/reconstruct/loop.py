@@ -22,6 +22,7 @@ from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.frame import Evaluation, Frame
 from ddrecon.reconstruct.log import Result, Row
+from ddrecon.reconstruct.metric import FieldMetric
 from ddrecon.reconstruct.numbers import Numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
@@ -75,9 +76,8 @@ class Together:
         stages = find_stages(len(problem.factors), problem.train, every)
         self.schedule = Schedule(problem.settings.iterations, stages)
         self.diagonals: Values = {}
-        # What the stiffness of smoothing was taken at, and what it was there.
-        self.stiffened: Values | None = None
-        self.stiffness: dict[str, Tensor | None] = {}
+        # The metric of fields, and what was free where it was taken.
+        self.metrics: tuple[Values | None, dict[str, FieldMetric]] = (None, {})
         self.search = Search(Space(self._project, self._free, self._precondition))
         self.rival: tuple[float, Values] = (math.inf, {})
         self._enter_stage()
@@ -253,15 +253,17 @@ class Together:
         }
 
     def _precondition(self, values: Values, residual: Values, free: Values) -> Values:
-        if self.stiffened is not values:
-            stiffness = {key: self.blocks[key].stiffness(values[key]) for key in self.diagonals}
-            self.stiffened, self.stiffness = values, stiffness
-        result = dict[str, Tensor]()
+        if self.metrics[0] is not free:
+            weight, metrics = self.search.weight, dict[str, FieldMetric]()
+            for key, p in self.blocks.items():
+                if p.tv and p.name not in self.schedule.stage.waiting:
+                    diagonal = self.diagonals[key]
+                    metrics[key] = FieldMetric(p, values[key], diagonal, weight, free[key])
+            self.metrics = free, metrics
+        result, metrics = dict[str, Tensor](), self.metrics[1]
         for key, diagonal in self.diagonals.items():
-            total, stiffness_there = diagonal, self.stiffness[key]
-            if stiffness_there is not None:
-                total = torch.add(diagonal, stiffness_there, alpha=self.search.weight)
-            result[key] = residual[key] * free[key] / total
+            bar = residual[key] * free[key]
+            result[key] = metrics[key].solve(bar) if key in metrics else bar / diagonal
         return result | self.numbers.precondition(residual, free)
 
     def _values(self) -> Values:

@@ -2,7 +2,8 @@
 
 Of a field or map it is the diagonal of the Gauss-Newton matrix J^T W J of all pictures, found by
 random signs (Hutchinson; Bekas, Kokiopoulou and Saad 2007, doi:10.1016/j.apnum.2007.01.003), plus
-that of its total variation. Of single numbers it is the whole matrix between them (E10.2).
+all of R of its total variation (E11.2): what smoothing couples moves together, so that the bulk of
+a cloud comes before its crust. Of single numbers it is the whole matrix between them (E10.2).
 """
 
 from __future__ import annotations
@@ -14,9 +15,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solve import solve_by_multigrid
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.roughness import face_stiffness
 from ddrecon.scene import Scene, View
 
 
@@ -56,3 +60,35 @@ def _smooth(squares: Tensor, count: int) -> Tensor:
     mean = pool(colors, 3, 1, 1, count_include_pad=False).view_as(squares)
     least = tuning.FLOOR * mean.double().square().mean().sqrt()
     return mean.clamp(min=float(least) + torch.finfo(mean.dtype).tiny)
+
+
+class FieldMetric:
+    """The metric of a field at `value`, of its entries that are `free`; its prior has a `weight`.
+
+    With H the `diagonal` of the pictures' Gauss-Newton matrix it is H + S D^T V D S (E11.2), and so
+    S (H / S^2 + D^T V D) S, the inside of which is an operator as that of diffusion. What is not
+    free is held by a loss.
+    """
+
+    def __init__(
+        self, parameter: Parameter, value: Tensor, diagonal: Tensor, weight: float, free: Tensor
+    ):
+        grid, unit, factor = parameter.grid, parameter.unit, weight * parameter.tv
+        faces, slope = face_stiffness(value / unit, grid, parameter.knee)
+        self._slope, self._free = torch.ones_like(value) if slope is None else slope, free
+        z, y, x = (_with_colors(face * (factor / unit**2)) for face in faces)
+        held = tuning.HELD * max(face.max() for face in (z, y, x)) * (1 - free)
+        loss = _with_colors(diagonal / self._slope**2 + held)
+        periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
+        self._operator = Operator((z, y, x), loss, periodic, grid.spacing)
+
+    def solve(self, residual: Tensor) -> Tensor:
+        """The inverse metric times `residual`, of what is free."""
+        right = _with_colors(residual * self._free / self._slope)
+        solution = solve_by_multigrid(self._operator, right, None, 0.0, tuning.CYCLES).value
+        return solution.view_as(residual) * self._free / self._slope
+
+
+def _with_colors(field: Tensor) -> Tensor:
+    """`field` [..., z, y, x] as [C, z, y, x], laid out one cell after another."""
+    return field.reshape(-1, *field.shape[-3:]).contiguous()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.reconstruct.levels import resample
-from ddrecon.reconstruct.roughness import KNEE, stiffness_diagonal, total_variation
+from ddrecon.reconstruct.roughness import KNEE, total_variation
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -56,14 +56,6 @@ class Parameter:
             return None
         total = self.tv * total_variation(self.value / self.unit, self.grid, self.knee)
         return total.detach(), torch.autograd.grad(total, self.value)[0]
-
-    def stiffness(self, value: Tensor) -> Tensor | None:
-        """The diagonal of the second derivative of `penalty` at `value` (E11.2); None without."""
-        if not self.tv:
-            return None
-        return stiffness_diagonal(value / self.unit, self.grid, self.knee) * (
-            self.tv / self.unit**2
-        )
 
     def project(self, value: Tensor) -> Tensor:
         """`value` within bounds and support; a direction as long as it is now."""

@@ -38,20 +38,22 @@ def total_variation(field: Tensor, grid: Grid, knee: float | None = None) -> Ten
     return (_find_length(field, grid, knee) - ROUNDING).mean()
 
 
-def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
-    """The diagonal of R (E11.2) of `total_variation` at `field` [..., z, y, x].
+def face_stiffness(
+    field: Tensor, grid: Grid, knee: float | None = None
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | None]:
+    """R (E11.2) of `total_variation` at `field` [..., z, y, x], as D^T V D between S on both sides.
 
-    With a `knee` its slopes are those of the field times the slope of the compression there.
+    It returns D^T V D by the stiffness of each face above a cell along z, y, x, shaped as `field`,
+    and S, the slope of the compression: None without a `knee`.
     """
-    stiffness = 1 / (field.numel() * _find_length(field, grid, knee))
-    total = torch.zeros_like(field)
-    # What holds neighbors together counts in both.
+    stiffness, faces = 1 / (field.numel() * _find_length(field, grid, knee)), list[Tensor]()
     for axis, spacing in zip(AXES, grid.spacing, strict=True):
-        between, count = stiffness * (min(grid.extent) / spacing) ** 2, field.shape[axis]
+        face, count = stiffness * (min(grid.extent) / spacing) ** 2, field.shape[axis]
         if count == 1 or axis % 3 not in grid.periodic:
-            between.narrow(axis, count - 1, 1).zero_()
-        total.add_(between).add_(between.roll(1, axis))
-    return total if knee is None else total.mul_((3 * (field + knee)).reciprocal().square_())
+            face.narrow(axis, count - 1, 1).zero_()
+        faces.append(face)
+    z, y, x = faces
+    return (z, y, x), None if knee is None else (3 * (field + knee)).reciprocal_()
 
 
 def _find_length(field: Tensor, grid: Grid, knee: float | None) -> Tensor:

@@ -21,6 +21,9 @@ PROBES = 1
 FLOOR = 0.01
 """The least entry of that metric, as a part of the root mean square of all: what no picture shows
 does not move far."""
+CYCLES, HELD = 3, 1e3
+"""Cycles of multigrid by which the metric's inverse is taken, and how much more strongly than by
+its neighbors an entry is held that does not move."""
 GAINS, REST = 3, 0.004
 """A level ends where the last few steps could still gain less than this part of the loss."""
 
