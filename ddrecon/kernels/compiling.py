@@ -61,7 +61,8 @@ def _load_last() -> None:
     with suppress(IndexError):  # of none: others were quicker
         key = _waiting.pop()
         try:
-            _named[key].set_result(_load(*key))
+            _load(*key)
+            _named[key].set_result(None)
         except Exception as error:
             _named[key].set_exception(error)
 
