@@ -6,7 +6,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
+from media import (
+    box_grid,
+    convergence_order,
+    half_empty,
+    make_camera,
+    make_scene,
+    march_rays,
+    tensor,
+)
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -14,6 +22,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
+from ddrecon.march.box import cross_box
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
@@ -84,6 +93,13 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
     assert bool((scattered[:, ~is_miss] > 0).all()) and bool((transmittance[:, ~is_miss] < 1).all())
+
+
+def test_a_ray_that_rounding_tilts_runs_beside_a_volume_that_repeats():
+    """Else it would come in so far away that no engine knows where."""
+    grid = replace(box_grid((3, 5, 4)), periodic=(0, 2))
+    above = tensor(0.0, grid.upper[1] + 0.1, 0.0)[None]
+    assert not len(cross_box(grid, Rays(above, tensor(0.6, -4e-17, 0.8)[None], None)).hit)
 
 
 def test_a_box_behind_the_camera_is_not_seen():
