@@ -51,13 +51,6 @@ def few_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ddrecon.light.ground.UPWARDS", 4)
 
 
-@pytest.fixture
-def few_periods(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Through which light is followed: what holds of any number is tried with few."""
-    monkeypatch.setattr("ddrecon.numerics.periods.FARTHEST", 3)
-    monkeypatch.setattr("ddrecon.march.box.FARTHEST", 3)
-
-
 @pytest.fixture(scope="module")
 def shapes_by_python() -> Iterator[None]:
     """For devices of their own, of which C++ knows no shapes of sums with numbers."""

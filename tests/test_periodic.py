@@ -104,10 +104,11 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
     assert_near(fluence(moved), fluence(one).roll(shift, (1, 3)), 1e-12)
 
 
-@pytest.mark.usefixtures("few_periods")
 @pytest.mark.parametrize("kind", KINDS)
-def test_engines_tangents_and_adjoints_agree(kind: str):
-    """The tangent is along both variables."""
+def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
+    """The tangent is along both variables; light is followed through few periods."""
+    for room in ("numerics.periods", "march.box"):
+        monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
     density, settings = half_empty(*SHAPE), KINDS[kind]
     scene, outcomes = repeated(density, **settings), list[list[Tensor]]()
     names = ["density", *(["g"] if settings.get("g") else [])]

@@ -6,15 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import (
-    box_grid,
-    convergence_order,
-    half_empty,
-    make_camera,
-    make_scene,
-    march_rays,
-    tensor,
-)
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -98,8 +90,8 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
 def test_a_ray_that_rounding_tilts_runs_beside_a_volume_that_repeats():
     """Else it would come in so far away that no engine knows where."""
     grid = replace(box_grid((3, 5, 4)), periodic=(0, 2))
-    above = tensor(0.0, grid.upper[1] + 0.1, 0.0)[None]
-    assert not len(cross_box(grid, Rays(above, tensor(0.6, -4e-17, 0.8)[None], None)).hit)
+    above, along = torch.tensor([[[0, 1, 0]], [[0.6, -4e-17, 0.8]]], dtype=torch.float64)
+    assert not len(cross_box(grid, Rays(above, along, None)).hit)
 
 
 def test_a_box_behind_the_camera_is_not_seen():
