@@ -36,6 +36,7 @@ from ddrecon.light.reduced import (
     sum_unscattered_sky,
 )
 from ddrecon.light.sky import Sky, Source
+from ddrecon.march.faces import cells_at_faces
 from ddrecon.march.ground import LitGround
 from ddrecon.march.periods import HALO
 from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_medium
@@ -53,7 +54,8 @@ from ddrecon.transport.sweep import DIRECTIONS
 @dataclass(frozen=True)
 class FaceLight:
     """What transport rounds know of light at faces (E2.17): `outside` [C, 1, 1, 1], the radiance
-    that enters there, and `source` [1 or 4, C, z, y, x], moments Q0 and Q1 of light from beams.
+    that enters there, and `source` [1 or 4, C, S], moments Q0 and Q1 of light from beams, in
+    `cells_at_faces` of the wide grid.
     """
 
     outside: Tensor
@@ -91,14 +93,12 @@ class LightField:
         period = unroll(self.medium.grid, HALO)
         if not self.medium.grid.periodic:
             return period, self
-        faces = self.at_faces
         wide = replace(
             self,
             medium=self.medium.put(period.wide, period.extend),
             beams=tuple(replace(beam, mass=period.extend(beam.mass)) for beam in self.beams),
             diffuse=period.extend(self.diffuse),
             turned=tuple(replace(b, radiance=period.extend(b.radiance)) for b in self.turned),
-            at_faces=faces and replace(faces, source=period.extend(faces.source)),
         )
         return period, wide
 
@@ -174,6 +174,8 @@ def _scatter_light(
     outside = ambient if medium.index == 1 else medium.index**2 * ambient
     # L0 and L1: E2.4 to E2.6.
     scattered = solve_diffuse(cells, source, outside, settings, memory)
+    period = unroll(medium.grid, HALO)
+    received_there = cells_at_faces(period.wide, period.extend(cut(received.source)[0]))
     # Light of `unscattered` scatters by E2.3 as well; beams by E2.2 on each view ray.
     return LightField(
         medium,
@@ -181,7 +183,7 @@ def _scatter_light(
         received,
         reduce(add, unscattered, scattered),
         turned=received.turned,
-        at_faces=FaceLight(outside, cut(received.source)[0]) if settings.rounds else None,
+        at_faces=FaceLight(outside, received_there) if settings.rounds else None,
     )
 
 

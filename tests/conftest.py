@@ -24,7 +24,7 @@ if find_spec("warp") and "OPTIMIZE_KERNELS" not in os.environ:
     import warp
 
     warp.config.optimization_level = 0  # compiles in half the time
-LONGEST = "test_shared_runs", "test_vectorized"
+LONGEST = "test_graphics_cards", "test_shared_runs", "test_vectorized"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -9,18 +9,21 @@ from typing import Any
 
 import pytest
 import torch
-from media import half_empty, make_scene, render_tangent, tensor
+from media import half_empty, make_scene, tensor
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon import load_scene
 from ddrecon.cameras import Camera, cast_rays, look_at
+from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
-from ddrecon.lighting import fluence
-from ddrecon.picture import render
+from ddrecon.light_field import fluence_of
+from ddrecon.lighting import fluence, solve_light
+from ddrecon.picture import render, view_image
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
 from ddrecon.variables.values import value_of, with_values
@@ -39,9 +42,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def repeated(
-    density: Tensor, shift: tuple[int, int] = (0, 0), is_perspective: bool = True, **kind: Any
-) -> Scene:
+def repeated(density: Tensor, shift: tuple[int, int] = (0, 0), **kind: Any) -> Scene:
     """A scene of cubes, periodic along z and x, seen aslant; cells and camera may be shifted."""
     shape = tuple(density.shape)
     grid = Grid(shape, (0.0, 0.0, 0.0), tuple(CELL * n for n in shape), periodic=(0, 2))
@@ -49,7 +50,7 @@ def repeated(
     middle = torch.tensor([0.7 + x, 0.5, 0.6 + z], dtype=torch.float64)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     pose = look_at(middle + torch.tensor([0.3, 1.8, 0.5]), middle, up)
-    camera = Camera(pose, (6, 7), 0.5 if is_perspective else 0.7, is_perspective)
+    camera = Camera(pose, (6, 7), 0.5, True)
     has_ground, is_map = kind.pop("has_ground", False), kind.pop("is_map", False)
     kind = {"sigma_a": (0.5,), "sigma_s": (8.0,)} | kind
     scene = make_scene(density.roll(shift, (0, 2)), grid=grid, camera=camera, **kind)
@@ -65,6 +66,14 @@ def assert_near(found: Tensor, known: Tensor, close: float) -> None:
     assert float((found - known).norm()) <= close * float(known.norm())
 
 
+def see(scene: Scene) -> list[Tensor]:
+    """What the camera shows, and one of parallel rays; and the fluence."""
+    light, (view,) = solve_light(scene, SolveMemory()), scene.views
+    cameras = view.camera, Camera(view.camera.pose, (6, 7), 0.7, False)
+    pictures = [view_image(light, scene, camera) for camera in cameras]
+    return [*pictures, fluence_of(light, scene.diffusion)]
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
@@ -74,13 +83,11 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
     close = 0.05 if kind in ("ground", "map") else 1e-10
     shift = (2, 3) if kind != "low sun" else (2, 0)
     twice = torch.cat([density, density])
-    for is_perspective in (True, False):
-        one = repeated(density, is_perspective=is_perspective, **settings)
-        two = repeated(twice, shift, is_perspective, **settings)
-        assert_near(render(two), render(one), close)
-    known = fluence(one)
+    *pictures, known = see(repeated(density, **settings))
     twofold = torch.cat([known, known], 1).roll(shift, (1, 3))
-    assert_near(fluence(two), twofold, close)
+    found = see(repeated(twice, shift, **settings))
+    for one, other in zip(found, [*pictures, twofold], strict=True):
+        assert_near(one, other, close)
 
 
 @pytest.mark.parametrize("cells", [4, 8])
@@ -98,23 +105,29 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_engines_tangents_and_adjoints_agree(kind: str):
+def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
+    """The tangent is along both variables; light is followed through few periods."""
+    for room in ("numerics.periods", "march.box"):
+        monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
     density, settings = half_empty(*SHAPE), KINDS[kind]
-    scene, found = repeated(density, **settings), dict[tuple[str, str], Tensor]()
+    scene, outcomes = repeated(density, **settings), list[list[Tensor]]()
     names = ["density", *(["g"] if settings.get("g") else [])]
     for engine in ENGINES:
         use_engine(engine)
-        for name in names:
-            value = value_of(scene, name).detach().clone().requires_grad_()
-            image = render(with_values(scene, {name: value}))
-            weights = half_empty(*image.shape, seed=1) + 0.1
-            (bar,) = torch.autograd.grad((weights * image).sum(), value)
-            images = render_tangent(scene, name, lambda world: {"": render(world)})
-            along = (weights * images[""][1]).sum()
-            torch.testing.assert_close(along, bar.sum(), rtol=1e-10, atol=1e-10)
-            found[engine, name], found[engine, "image"] = bar, image.detach()
-    for name in (*names, "image"):
-        one, other = (found[engine, name] for engine in ENGINES)
+        values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
+        image = render(with_values(scene, values))
+        weights = half_empty(*image.shape, seed=1) + 0.1
+        bars = torch.autograd.grad((weights * image).sum(), [*values.values()])
+        with forward_ad.dual_level():
+            duals = {
+                name: forward_ad.make_dual(value.detach(), torch.ones_like(value))
+                for name, value in values.items()
+            }
+            tangent = forward_ad.unpack_dual(render(with_values(scene, duals))).tangent
+        known = torch.stack([bar.sum() for bar in bars]).sum()
+        torch.testing.assert_close((weights * tangent).sum(), known, rtol=1e-10, atol=1e-10)
+        outcomes.append([image.detach(), *bars])
+    for one, other in zip(*outcomes, strict=True):
         assert_near(one, other, 1e-11)
 
 
@@ -146,25 +159,27 @@ def even(*shape: int) -> Tensor:
 
 
 @pytest.mark.parametrize(("travel", "ground"), [(STEEP, 0), (SLANTED, 0), (SLANTED, 1)])
-@pytest.mark.parametrize("shape", [(1, 8, 1), (4, 8, 3)])
-def test_an_even_layer_has_one_dimension(shape: tuple[int, ...], travel: Any, ground: int):
+def test_an_even_layer_has_one_dimension(travel: Any, ground: int):
     """Of whatever period; and a beam falls off by Beer's law, averaged over each cell."""
-    kind = {"travel": travel, "g": 0.5, "transport_rounds": 2, "has_ground": ground}
-    light, column = (fluence(repeated(even(*size), **kind)) for size in (shape, (2, 8, 5)))
+    kind = {"travel": travel, "g": 0.5, "transport_rounds": 1, "has_ground": ground}
+    shapes = (2, 8, 5), (1, 8, 1), (4, 8, 3)
+    column, *others = (fluence(repeated(even(*shape), **kind)) for shape in shapes)
     close = 0.01 if ground else 1e-8  # to a ground, light is followed a number of sides far
-    torch.testing.assert_close(light, column[:, :1, :, :1].expand_as(light), rtol=close, atol=0)
-    settings = {"travel": travel, "model": "none"}
-    beam = fluence(repeated(even(*shape), **settings))[0, 0, :, 0]
+    for light in (column, *others):
+        torch.testing.assert_close(light, column[:, :1, :, :1].expand_as(light), rtol=close, atol=0)
     step = 0.3 * 8.5 * CELL * math.hypot(*travel) / abs(travel[1])
     passed = torch.exp(-step * torch.arange(8, dtype=torch.float64)).flip(0)
-    torch.testing.assert_close(beam, 3 * passed * (1 - math.exp(-step)) / step, rtol=1e-9, atol=0)
+    expected = 3 * passed * (1 - math.exp(-step)) / step
+    for shape in shapes:
+        beam = fluence(repeated(even(*shape), travel=travel, model="none"))[0, 0, :, 0]
+        torch.testing.assert_close(beam, expected, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_an_even_layer_glows_by_the_length_of_rays(is_perspective: bool):
     """Wherever they enter a period: (1 - exp(-kappa L)) j / kappa."""
     kind = {"sigma_s": (0.0,), "directional": None, "emission": torch.ones(1, dtype=torch.float64)}
-    scene = repeated(even(4, 5, 3), is_perspective=is_perspective, **kind)
+    scene = repeated(even(4, 5, 3), **kind)
     up, middle = (tensor(*each) for each in ((0, 1, 0), (0.7, 0.5, 0.6)))
     pose = look_at(middle + tensor(0.2, 0.9, 1.8), middle, up)
     camera = Camera(pose, (16, 16), 0.3, is_perspective)

@@ -301,6 +301,7 @@ def optimize(
     film_options = {"--frames": frames, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in film_options.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
+    from ddrecon.diffusion.solve import name_kernels
     from ddrecon.io.files.folders import RUN, claim_folder
     from ddrecon.progress import tell
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
@@ -310,6 +311,8 @@ def optimize(
         return
     with claim_folder(output, RUN, overwrite=overwrite, resume=resume) as claimed:
         with tell("reading pictures and building the scene", session.is_quiet):
+            if scene_file.tree.diffusion.is_conservative_p1:
+                name_kernels(session.empty())
             built, environment = session.build(scene_file), session.environment()
         with tell("looking at what the pictures show", session.is_quiet):
             run, folder = open_run(built, scene_file, claimed, environment, resume=resume)

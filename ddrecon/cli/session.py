@@ -135,6 +135,13 @@ class Session:
             warnings.warn(doubt, DataWarning, 2)
         return scene
 
+    def empty(self) -> torch.Tensor:
+        """A tensor without numbers, of the type and on the device of a scene's."""
+        place = self.start()
+        import torch
+
+        return torch.empty(0, dtype=getattr(torch, self.dtype), device=place)
+
     def load(self, path: Path) -> Scene:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))

@@ -113,12 +113,12 @@ class Operator:
 
 def difference(u: Tensor, axis: int) -> Tensor:
     """G u along `axis`: the cell above minus the cell below each face."""
-    return u.roll(-1, axis) - u
+    return u.roll(-1, axis).sub_(u)
 
 
 def accumulate(faces: Tensor, axis: int) -> Tensor:
     """G^T f along `axis`: in cells, what the lower face holds minus what the upper one does."""
-    return faces.roll(1, axis) - faces
+    return faces.roll(1, axis).sub_(faces)
 
 
 def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:

@@ -133,8 +133,8 @@ def _iterate(
         # A guess that is worse than zero is not used.
         helps = square <= source_square
         square = torch.where(helps, square, own_square)
-        steps.solution.copy_(torch.where(helps, steps.solution, 0))
-        steps.residual.copy_(torch.where(helps, steps.residual, source))
+        steps.solution.masked_fill_(~helps, 0)
+        torch.where(helps, steps.residual, source, out=steps.residual)
         steps.direction.zero_()
     while True:
         relative = (square / source_square).double()

@@ -43,7 +43,7 @@ class RowFunction:
 
     `find_values` and its like have the row, then the C++ expressions in `place`, made of `more`,
     which is `declared`. The last fields, as many as are `added`, are but added to the outputs, one
-    after another.
+    after another: cotangents are those of the function `without` them, if it has another name.
     """
 
     header: str
@@ -54,6 +54,7 @@ class RowFunction:
     declared: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
+    without: str = ""
 
     def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
         """The outputs for `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives.
@@ -94,7 +95,8 @@ class RowFunction:
     def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
         """The kernel of "values", "tangents" or "cotangents", for so many fields."""
         outs = sum(math.prod(shape[:-4]) for shape in self.shapes)
-        return _kernel(kind, self.header, self.name, self.place, self.declared, ins, outs, bits)
+        name = self.without if kind == "cotangents" and self.without else self.name
+        return _kernel(kind, self.header, name, self.place, self.declared, ins, outs, bits)
 
 
 class _Applied(torch.autograd.Function):

@@ -9,6 +9,7 @@ import functools
 import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from threading import Timer
 from typing import Any
 
@@ -24,24 +25,46 @@ _loaded: set[tuple[Any, str]] = set()
 """Kernels that this process has, by their devices."""
 _named: dict[tuple[Any, str], Future[None]] = {}
 """Kernels that other threads were asked for."""
+_waiting: list[tuple[Any, str]] = []
+"""Those of them that none has begun. The last is needed first: the way back is the other way."""
 
 
 def name_kernel(kernel: Any, device: str) -> None:
     """Has another thread load a `kernel` that is needed later, where there may be several."""
     key, threads = (kernel, device), torch.get_num_threads() - 1
     if threads > 0 and key not in _loaded and key not in _named:
-        _named[key] = _pool(threads).submit(_load, kernel, device)
+        _named[key] = Future()
+        _waiting.append(key)
+        _pool(threads).submit(_load_last)
 
 
 def load(kernel: Any, device: str) -> None:
-    """Has `kernel` compiled where Warp's cache has it not; waits where that has begun."""
-    if (kernel, device) in _loaded:
+    """Has `kernel` compiled where Warp's cache has it not.
+
+    Where that has begun, it compiles meanwhile what else is waiting.
+    """
+    key = kernel, device
+    if key in _loaded:
         return
-    named = _named.get((kernel, device))
-    if named is None or named.cancel():
-        _load(kernel, device)
+    with suppress(ValueError):  # of one that is not waiting
+        _waiting.remove(key)
+        del _named[key]
+    if key in _named:
+        while _waiting and not _named[key].done():
+            _load_last()
+        _named[key].result()
     else:
-        named.result()
+        _load(kernel, device)
+
+
+def _load_last() -> None:
+    with suppress(IndexError):  # of none: others were quicker
+        key = _waiting.pop()
+        try:
+            _load(*key)
+            _named[key].set_result(None)
+        except Exception as error:
+            _named[key].set_exception(error)
 
 
 def _load(kernel: Any, device: str) -> None:
@@ -69,3 +92,4 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 # Threads do not live on in a process forked from this one, and what they had begun never ends.
 os.register_at_fork(after_in_child=_pool.cache_clear)
 os.register_at_fork(after_in_child=_named.clear)
+os.register_at_fork(after_in_child=_waiting.clear)

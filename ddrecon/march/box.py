@@ -44,13 +44,13 @@ def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
     doi:10.1145/15922.15916.
     """
     low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    tiny, origin, way = torch.finfo(rays.direction.dtype).tiny, rays.origin, rays.direction
+    number, origin, way = torch.finfo(rays.direction.dtype), rays.origin, rays.direction
     if grid.periodic:
         faced = [axis for axis in range(3) if axis not in grid.periodic]
         low, high, origin, way = low[faced], high[faced], origin[:, faced], way[:, faced]
-    # Along a slab a ray stays within it for ever, or never enters it.
-    is_along = way.abs() < tiny
-    direction = torch.where(is_along, torch.full_like(way, tiny), way)
+    # Along a slab, but for rounding, a ray stays within it for ever, or never enters it.
+    is_along = way.abs() < number.eps
+    direction = torch.where(is_along, torch.full_like(way, number.tiny), way)
     at_low, at_high = (low - origin) / direction, (high - origin) / direction
     near = torch.minimum(at_low, at_high).amax(-1).clamp(min=0)
     far = torch.maximum(at_low, at_high).amin(-1)

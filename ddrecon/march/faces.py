@@ -7,6 +7,7 @@ optical depth at most; but it is zero on faces through which the light shines.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from itertools import product
@@ -62,7 +63,7 @@ class _Shell(NamedTuple):
     axis; 6 for none. `inner` [M, cells] and `around` [places of an extended field, M]: what stands
     beyond faces, less what `inner` makes of cells, is `around` times light on faces; `places` [M]
     says where. `lacking` [places of an extended field, S]: what that changes by where light lacks
-    on faces. `outermost` [S]: the cells there, with their `width` and normals `outward` [3, S].
+    on faces. The cells there have this `width`, and normals `outward` [3, S].
     """
 
     nearest: Tensor
@@ -71,7 +72,6 @@ class _Shell(NamedTuple):
     inner: _Table
     around: _Table
     lacking: _Table
-    outermost: Tensor
     width: Tensor
     outward: Tensor
 
@@ -108,7 +108,7 @@ def _extend_light(outgoing: OutgoingLight, shell: _Shell, name: str, field: Tens
     beyond = shell.inner.add_to(torch.zeros_like(nearest), cells)
     values = torch.cat([on_faces.to(field), beyond], 1)
     longer = shell.around.add_to(pad(field, [1] * 6).flatten(1), values)
-    if name == "diffuse" and outgoing.inflow is not None and len(shell.outermost):
+    if name == "diffuse" and outgoing.inflow is not None and len(shell.width):
         lacks = _find_lacks(outgoing, outgoing.inflow, shell)
         longer = shell.lacking.add_to(longer, lacks.expand(len(field), -1))
     return longer.view(-1, *(count + 2 for count in grid.shape))
@@ -117,23 +117,18 @@ def _extend_light(outgoing: OutgoingLight, shell: _Shell, name: str, field: Tens
 def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
     """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
     extinction, diffusing, emitted = outgoing.extinction, outgoing.diffusing, outgoing.emitted
-
-    def outermost(field: Tensor) -> Tensor:
-        return field.flatten(1).index_select(1, shell.outermost)
-
-    # Moments beside colors: along a third axis torch takes entries one by one.
-    moments = outermost(inflow.received.flatten(0, 1))
-    received, *first = moments.unflatten(0, inflow.received.shape[:2]).unbind()
+    beside = functools.partial(cells_at_faces, outgoing.grid)
+    received, *first = inflow.received.unbind()
     if first:
         flux = torch.stack(flux_along_axes(first))
         received = received - 0.5 * (shell.outward[:, None] * flux).sum(0)
     unpeaked, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
-    light = outermost(outgoing.diffuse) + unpeaked * received
-    lost = extinction.scale.view(-1, 1) * outermost(extinction.field)
-    scattered = scale * outermost(diffusing.field)
+    light = beside(outgoing.diffuse) + unpeaked * received
+    lost = extinction.scale.view(-1, 1) * beside(extinction.field)
+    scattered = scale * beside(diffusing.field)
     sent = scattered * light - lost * inflow.outside.view(-1, 1)
     if emitted is not None:
-        sent = sent + outermost(emitted)
+        sent = sent + beside(emitted)
     backward = [
         faces.expand(-1, *_layer_of(outgoing.grid, axis)).flatten(1)
         for faces, (axis, _) in zip(inflow.backward, FACES, strict=True)
@@ -142,6 +137,25 @@ def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tenso
     weight = shell.width * unpeaked * torch.cat(backward, 1)
     lack = weight * sent / (UNEVEN + shell.width * lost + weight * scattered)
     return lack if emitted is None else scale * lack
+
+
+def cells_at_faces(grid: Grid, field: Tensor) -> Tensor:
+    """`field` [..., z, y, x] in the S cells at each of `FACES`, one after another, [..., S].
+
+    Faces across an axis of a single cell are left out.
+    """
+    # Moments beside colors: along a third axis torch takes entries one by one.
+    cells = field.reshape(-1, grid.cells).index_select(1, _cells_at_faces(grid, field.device))
+    return cells.view(*field.shape[:-3], -1)
+
+
+@remember
+def _cells_at_faces(grid: Grid, device: torch.device) -> Tensor:
+    """The numbers of those cells."""
+    number, none = torch.arange(grid.cells).view(grid.shape), torch.zeros(0, dtype=torch.long)
+    faces = ((axis, side) for axis, side in FACES if grid.shape[axis] > 1)
+    layers = (number.select(axis, -side).flatten() for axis, side in faces)
+    return torch.cat([none, *layers]).to(device)
 
 
 def _layer_of(grid: Grid, axis: int) -> tuple[int, ...]:
@@ -206,7 +220,7 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         torch.cat([weights, torch.ones(len(places), dtype=torch.float64)]),
     )
     by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)[:, places]
-    lacking, outermost, width, outward = _find_layers(grid, axis, nearest)
+    lacking, width, outward = _find_layers(grid, axis, nearest)
 
     def on_device(entries: _Entries) -> _Table:
         rows, columns, weights = (column.to(device) for column in entries)
@@ -219,7 +233,6 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         on_device(inner),
         on_device(around),
         on_device(lacking),
-        outermost.to(device),
         width.to(device, dtype),
         outward.to(device, dtype),
     )
@@ -241,17 +254,15 @@ def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _E
     return torch.cat(rows), torch.cat(columns), torch.cat(weights)
 
 
-def _find_layers(
-    grid: Grid, axis: int | None, nearest: Tensor
-) -> tuple[_Entries, Tensor, Tensor, Tensor]:
-    """`lacking`, `outermost`, `width` and `outward` of a `_Shell`.
+def _find_layers(grid: Grid, axis: int | None, nearest: Tensor) -> tuple[_Entries, Tensor, Tensor]:
+    """`lacking`, `width` and `outward` of a `_Shell`.
 
     `nearest` [z + 2, y + 2, x + 2]: the cell nearest to each place.
     """
     place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
     number = torch.zeros(grid.cells, dtype=torch.long)
     none = torch.zeros(0, dtype=torch.long)
-    layers = [(none, none, none.double(), none, none.double(), none.double().view(3, 0))]
+    layers = [(none, none, none.double(), none.double(), none.double().view(3, 0))]
     for along, side in FACES:
         if grid.shape[along] == 1:
             continue
@@ -266,8 +277,8 @@ def _find_layers(
         width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
         outward = torch.zeros(3, len(cells), dtype=torch.float64)
         outward[along] = 2 * side - 1
-        layers.append((rows, number[nearest.flatten()[rows]], weights, cells, width, outward))
-    rows, columns, weights, cells, width, outward = (
+        layers.append((rows, number[nearest.flatten()[rows]], weights, width, outward))
+    rows, columns, weights, width, outward = (
         torch.cat(many, -1) for many in zip(*layers, strict=True)
     )
-    return (rows, columns, weights), cells, width, outward
+    return (rows, columns, weights), width, outward

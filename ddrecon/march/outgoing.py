@@ -22,7 +22,7 @@ from ddrecon.numerics.third_order import ThirdOrder
 class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
-    `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, z, y, x] of what cells
+    `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, S] of what `cells_at_faces`
     receive of beams, of which the share `unpeaked` counts as `diffuse` light does. `backward` are,
     by face, the parts [C, rows, columns] of light from there that are scattered into the camera's
     rays.

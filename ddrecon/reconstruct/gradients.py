@@ -114,24 +114,41 @@ def differentiate_view(
 
 def follow_back(
     tensors: list[Tensor],
-    bars: Sequence[Tensor | None],
+    bars: list[Tensor | None],
     values: Sequence[Tensor],
     is_last: bool = True,
 ) -> Sequence[Tensor | None]:
     """The derivatives by `values` of what reached `tensors` of the light, through the solve (E3.2).
 
-    Where it `is_last`, the graph of the light goes, and `tensors` are forgotten.
+    Where it `is_last`, the graph of the light goes, and `tensors` and `bars` are forgotten.
     """
     pairs = zip(tensors, bars, strict=True)
     reached = [(tensor, bar) for tensor, bar in pairs if bar is not None]
-    if is_last:
-        tensors.clear()
     if not reached:
         return [None] * len(values)
-    # As cotangents of their own, bars would have torch import a system for algebra.
-    product = torch.stack([(bar * tensor).sum() for tensor, bar in reached]).sum()
+    end = _Reached.apply([bar for _, bar in reached], *(tensor for tensor, _ in reached))
     reached.clear()
-    return torch.autograd.grad(product, values, allow_unused=True, retain_graph=not is_last)
+    if is_last:
+        tensors.clear()
+        bars.clear()
+    return torch.autograd.grad(end, values, allow_unused=True, retain_graph=not is_last)
+
+
+class _Reached(torch.autograd.Function):
+    """Zero, by which the cotangents of tensors are `bars`.
+
+    Handed to torch as such, they would have it import a system for algebra.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, bars: list[Tensor], *tensors: Tensor) -> Tensor:
+        ctx.bars = bars
+        return tensors[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
+        bars, ctx.bars = ctx.bars, None
+        return None, *bars
 
 
 def _accumulate(sums: list[Tensor | None], bars: Sequence[Tensor | None], added: set[int]) -> None:

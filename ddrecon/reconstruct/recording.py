@@ -145,7 +145,7 @@ class Recording:
         # Each run begins where the last iteration ended, also the second while it is recorded.
         self.memory.last |= {key: u for key, u in self.guesses.items() if key[0] == "adjoint"}
         count, values = len(self.values), list(self.values.values())
-        through = follow_back(self.cut.tensors, self.sums[count:], values, is_last=False)
+        through = follow_back(self.cut.tensors, [*self.sums[count:]], values, is_last=False)
         self.back_records = self.memory.records
         return {
             name: direct.clone() if bar is None else direct + bar

@@ -130,14 +130,14 @@ def _text(path: Path) -> str:
         raise SceneError(str(error)) from error
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(data) > MAX_BYTES:
-        raise SceneError(f"{path}: is larger than {MAX_BYTES // 2**20} MiB; it is not a scene file")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        column = error.start - data.rfind(b"\n", 0, error.start)
-        raise SceneError(f"{path}:{line}:{column}: is not UTF-8 text") from error
+    end, fault = MAX_BYTES, f"is larger than {MAX_BYTES // 2**20} MiB; it is not a scene file"
+    if len(data) <= MAX_BYTES:
+        try:
+            return data.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            end, fault = error.start, "is not UTF-8 text"
+    line, column = data.count(b"\n", 0, end) + 1, end - data.rfind(b"\n", 0, end)
+    raise SceneError(f"{path}:{line}:{column}: {fault}")
 
 
 def override(root: Node, text: str, problems: Problems, where: str) -> None:

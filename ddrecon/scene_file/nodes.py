@@ -157,7 +157,9 @@ class _Composer:
             where = self.where(event)
             if not isinstance(event, yaml.ScalarEvent):
                 raise SceneError(f"{where}: {parent.child_key('?')}: a key must be plain text")
-            name = event.value if event.value.isprintable() else repr(event.value)
+            name = event.value
+            if not name or not name.isprintable():
+                name = repr(name)
             child = self.compose(next(self.events), parent.child_key(name), where, depth + 1)
             if name in entries:
                 place = entries[name].key_where

@@ -257,8 +257,8 @@ class MixtureSection(BoxSection):
         if len(self.media) != 2:
             yield "media", f"expected two media, found {len(self.media)}"
         for name in self.media:
-            if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-                yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
+            if not re.fullmatch(r"[A-Za-z0-9_-]{1,200}", name):
+                yield "media", f"{name!r} is no name; use up to 200 letters, digits, '_' and '-'"
 
 
 @dataclass(frozen=True)

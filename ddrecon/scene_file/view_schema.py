@@ -162,8 +162,8 @@ class ViewSection:
     noise: NoiseSettings | None = None
 
     def violations(self) -> Iterator[Violation]:
-        if self.name and not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
-            legal = "use letters, digits, '_', '-' and '.', the last not at its start"
+        if self.name and not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{,199}", self.name):
+            legal = "use letters, digits, '_', '-' and '.', up to 200, not '.' first"
             yield "name", f"{self.name!r} is not a file name; {legal}"
         if match := TAKEN.fullmatch(self.name):
             yield "name", f"{self.name!r} ends in .{match[1]}, as files of other views do"

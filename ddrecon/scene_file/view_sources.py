@@ -125,8 +125,11 @@ def name_by_images(views: Sequence[ViewSection]) -> tuple[ViewSection, ...]:
     paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
     # A frame's number is no part of a name: the view of frames/{frame:04d}.png is that of a folder.
     unnumbered = [FRAME.sub("", path.stem).strip("._-") or path.parent.name for path in paths]
-    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", stem) for stem in unnumbered]
-    folders = [re.sub(r"[^A-Za-z0-9_-]", "_", path.parent.name) for path in paths]
+    # Of long ones the ends, as file names have room for.
+    stems, folders = (
+        [re.sub(r"[^A-Za-z0-9_-]", "_", word)[-99:] for word in words]
+        for words in (unnumbered, [path.parent.name for path in paths])
+    )
     longer = [f"{folder}_{stem}" for folder, stem in zip(folders, stems, strict=True)]
     numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]
     names = next(names for names in (stems, longer, numbered) if len(set(names)) == len(names))

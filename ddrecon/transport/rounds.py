@@ -78,9 +78,8 @@ def run_rounds(
 @torch.no_grad()
 def _residual(new: Tensor, old: Tensor) -> Tensor:
     """|L0' - L0| / |L0'|, of the color that changes most (E7.3)."""
-    squares = torch.stack([new - old, new]).square().sum((2, 3, 4), dtype=torch.float64)
-    change, size = squares
-    return (change / size.clamp(min=1e-300)).amax().sqrt()
+    change, size = (torch.linalg.vector_norm(u, dim=(1, 2, 3)) for u in (new - old, new))
+    return (change / size.clamp(min=torch.finfo(size.dtype).tiny)).amax()
 
 
 def face_mirror(medium: Medium, directions: int, besides: Mirror | None = None) -> Mirror | None:

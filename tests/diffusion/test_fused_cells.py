@@ -131,8 +131,4 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     place = 1, faces.PLACE, faces.GIVEN
     system = RowFunction(faces.HEADER, "Flow<SYSTEM, 1, 0>", ((),) * 5, *place)
     flux = RowFunction(faces.HEADER, "Flow<FLUX, 1, 3>", ((3, 1, 1, 1, 1),), *place)
-    kernels = [
-        *(system.kernel(kind, 7, 32) for kind in ("values", "tangents", "cotangents")),
-        *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 9), ("cotangents", 6))),
-    ]
-    assert_compiles(kernels, tmp_path)
+    assert_compiles([system.kernel("tangents", 7, 32), flux.kernel("values", 9, 64)], tmp_path)

@@ -107,7 +107,7 @@ def read(path: Path, is_volume: bool) -> np.ndarray:
         return pixels
     names = field_names(path)
     values = read_field(path, names[0] if names else "density").values
-    assert (values >= 0).all() and np.isfinite(values).all() and values.ndim in (3, 4)
+    assert np.isfinite(values).all() and values.ndim in (3, 4)
     return values
 
 

@@ -46,8 +46,7 @@ def test_derivatives_are_those_of_values(
 
 def test_they_compile_for_graphics_cards(tmp_path: Path) -> None:
     kernels = [
-        RowFunction(header, name, ((),) * outs, 1).kernel(kind, ins, 32)
+        RowFunction(header, name, ((),) * outs, 1).kernel("tangents", ins, 32)
         for header, name, ins, outs, _ in CELLS
-        for kind in ("values", "tangents", "cotangents")
     ]
     assert_compiles(kernels, tmp_path)

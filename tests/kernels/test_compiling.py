@@ -30,6 +30,7 @@ def nothing_loaded(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     torch.set_num_threads(2)
     monkeypatch.setattr(compiling, "_loaded", set())
     monkeypatch.setattr(compiling, "_named", {})
+    monkeypatch.setattr(compiling, "_waiting", [])
     yield
     torch.set_num_threads(threads)
 
@@ -60,7 +61,7 @@ def test_an_iteration_names_the_adjoints_that_it_launches(
 
 
 def fill_kernels() -> list[TextKernel]:
-    return [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(3)]
+    return [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(5)]
 
 
 Load = Callable[[Any], None]
@@ -73,8 +74,11 @@ def replace_compiler(monkeypatch: pytest.MonkeyPatch, load: Load) -> None:
 def test_who_needs_a_kernel_first_compiles_it(
     nothing_loaded: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What nobody has begun, whoever was asked for it; for what was begun it waits."""
-    first, second, third = (kernel.kernel for kernel in fill_kernels())
+    """What nobody has begun, whoever was asked for it; for what was begun it waits.
+
+    Those who were asked begin with what was named last.
+    """
+    first, second, third, fourth, fifth = (kernel.kernel for kernel in fill_kernels())
     may_end, threads = threading.Event(), dict[Any, list[str]]()
 
     def compile(module: Any) -> None:
@@ -85,17 +89,20 @@ def test_who_needs_a_kernel_first_compiles_it(
 
     has_begun = threading.Event()
     replace_compiler(monkeypatch, compile)
-    for kernel in (first, second, first):
-        compiling.name_kernel(kernel, "cpu")
+    compiling.name_kernel(first, "cpu")
     has_begun.wait(60)
+    for kernel in (second, first, fourth, fifth):
+        compiling.name_kernel(kernel, "cpu")
     own = threading.current_thread().name
     for kernel in (second, third):
         compiling.load(kernel, "cpu")
         assert threads[kernel.module] == [own]
     may_end.set()
-    for kernel in (first, second, third):
+    compiling._pool(1).submit(int).result(60)
+    assert [*threads] == [kernel.module for kernel in (first, second, third, fifth, fourth)]
+    for kernel in (first, second, third, fourth, fifth):
         compiling.load(kernel, "cpu")
-    assert threads[first.module] != [own] and [len(each) for each in threads.values()] == [1] * 3
+    assert threads[first.module] != [own] and [len(each) for each in threads.values()] == [1] * 5
 
 
 def test_what_another_thread_cannot_compile_is_an_error_here(

@@ -17,7 +17,6 @@ OF_EACH_HEADER = (
     "diffusion/test_fused_passes.py::test_a_million_to_one[torch.float32-1]",
     "transport/test_fused_sweep.py::test_single_precision",
     "kernels/test_cell_function.py::test_derivatives_are_those_of_values[Gain<1, 0, 1>]",
-    "kernels/test_cell_function.py::test_derivatives_are_those_of_values[Steep]",
 )
 
 

@@ -105,5 +105,4 @@ def test_light_of_any_degree(degree: int, has_more: bool):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     function = RowFunction(HEADER, "Outgoing<3, 1, 1>", ((3, 1, 1, 1),), 1, VIEW, GIVEN)
-    kinds = "values", "tangents", "cotangents"
-    assert_compiles([function.kernel(kind, 17, 32) for kind in kinds], tmp_path)
+    assert_compiles([function.kernel("tangents", 17, 32)], tmp_path)

@@ -13,7 +13,7 @@ from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
-from ddrecon.march.faces import extend_fields, shine_through
+from ddrecon.march.faces import cells_at_faces, extend_fields, shine_through
 from ddrecon.march.outgoing import Inflow, OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.settings import RenderSettings
@@ -105,7 +105,8 @@ def test_extended_fields_have_both_derivatives(axis: int | None):
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
         outgoing = emission_of(diffuse, *masses)
-        coming = Inflow(0.2 * depth, rest[5].expand(4, -1, -1, -1, -1), 0.9 * depth, backward)
+        received = cells_at_faces(GRID, rest[5].expand(4, -1, -1, -1, -1))
+        coming = Inflow(0.2 * depth, received, 0.9 * depth, backward)
         matter = replace(outgoing.extinction, scale=depth)
         outgoing = replace(outgoing, extinction=matter, scattering=matter, inflow=coming)
         beam, point = outgoing.beams

@@ -29,7 +29,7 @@ from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused import kernels
-from ddrecon.march.fused.cells import Cells, mark_kernel
+from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.kernels import Case, Layout
 
 pytestmark = pytest.mark.slow
@@ -196,8 +196,8 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     layout = Layout(1, 1, 1, 0, 0, 0, 0, 0, 1, 1, False, (False, True), 32)
     several = Layout(3, 3, 3, 3, 3, 3, 1, 3, 3, 4, False, (False, True), 64)
     by_g = Layout(1, 1, 1, 0, 0, 1, 1, 1, 1, 12, True, (True,), 32)
-    packets = [mark_kernel(32), kernels.integral_kernel(by_g, False)]
-    packets += [
+    packets = [
+        kernels.integral_kernel(by_g, False),
         kernels.tangent_kernel(layout, Case(False, True)),
         kernels.adjoint_kernel(several, Case(False)),
     ]

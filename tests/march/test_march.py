@@ -14,6 +14,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import follow_lights
 from ddrecon.march import integral as march_module
+from ddrecon.march.box import cross_box
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.picture import render
@@ -84,6 +85,13 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
     assert bool((scattered[:, ~is_miss] > 0).all()) and bool((transmittance[:, ~is_miss] < 1).all())
+
+
+def test_a_ray_that_rounding_tilts_runs_beside_a_volume_that_repeats():
+    """Else it would come in so far away that no engine knows where."""
+    grid = replace(box_grid((3, 5, 4)), periodic=(0, 2))
+    above, along = torch.tensor([[[0, 1, 0]], [[0.6, -4e-17, 0.8]]], dtype=torch.float64)
+    assert not len(cross_box(grid, Rays(above, along, None)).hit)
 
 
 def test_a_box_behind_the_camera_is_not_seen():

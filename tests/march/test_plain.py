@@ -38,7 +38,7 @@ from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
-STEPS = (1, 8, 64)
+STEPS = (1, 6, 36)
 
 
 BEAM, OTHER = (tensor(-2, -2, -1), tensor(3, 2, 1)), (tensor(1, 0.3, -0.5), tensor(1))

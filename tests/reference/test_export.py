@@ -1,11 +1,9 @@
 """Exported scenes are those that Mitsuba is given directly."""
 
-import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -33,22 +31,25 @@ NEAR: list[Light] = [
 
 
 OPEN = """
-import json, sys
+import sys
 import numpy as np
 from ddrecon.reference.trace import load_mitsuba
 mitsuba = load_mitsuba(threads=2)
-path, options = sys.argv[1:]
-image = mitsuba.render(mitsuba.load_file(path), **json.loads(options))
-np.save(path + ".npy", np.array(image, np.float64))
+path, paths, *seeds = sys.argv[1:]
+scene = mitsuba.load_file(path)
+images = [mitsuba.render(scene, spp=int(paths), seed=int(seed)) for seed in seeds]
+np.save(path + ".npy", np.array([np.array(image, np.float64) for image in images]))
 """
 
 
-def opened(path: Path, **options: Any) -> np.ndarray:
-    """The scene as a user's Mitsuba shows it: after other scenes its EXR reader has hung.
+def opened(path: Path, paths: int, *seeds: int) -> np.ndarray:
+    """The scene as a user's Mitsuba shows it by so many paths a pixel, a picture for each seed.
+
+    In a process of its own, since after other scenes Mitsuba's EXR reader has hung.
 
     On two threads, as the tracer: random numbers of `scalar_rgb` depend on how many there are.
     """
-    command = [sys.executable, "-c", OPEN, str(path), json.dumps(options)]
+    command = [sys.executable, "-c", OPEN, *map(str, (path, paths, *seeds))]
     subprocess.run(command, check=True, timeout=120)
     return np.load(f"{path}.npy")
 
@@ -87,7 +88,7 @@ def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool)
     scene = replace(scene, lights=lights, views=[View("other", camera)], ground=ground)
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     np.testing.assert_allclose(
-        opened(tmp_path / "scene.xml", seed=5, spp=16),
+        opened(tmp_path / "scene.xml", 16, 5)[0],
         open_tracer(scene, scene.views, threads=2).trace(0, 5, 16),
         rtol=1e-4,
     )
@@ -98,7 +99,7 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) ->
     scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = open_tracer(scene, scene.views, threads=2)
-    theirs = Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=256) for seed in range(3)])
+    theirs = Traced.of([*opened(tmp_path / "scene.xml", 256, *range(3))])
     ours = Traced.of([tracer.trace(0, seed, 256) for seed in range(3)])
     assert max(theirs.noise, ours.noise) < 0.15
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)

@@ -90,10 +90,11 @@ def test_deep_nesting_is_refused_not_a_crash(refusal: Refusal):
     assert "nested more than 32 deep" in line
 
 
-def test_repeated_keys_are_found_at_every_level(refusal: Refusal):
-    lines = refusal("volume: {g: 0, g: 1}\nlights: []\nlights: []\n")
+def test_repeated_and_empty_keys_are_found_at_every_level(refusal: Refusal):
+    lines = refusal("volume: {g: 0, g: 1, '': 1}\nlights: []\nlights: []\n")
     assert lines[0] == "scene.yaml:1:16: volume.g: repeated key; it is already at scene.yaml:1:10"
     assert lines[1] == "scene.yaml:3:1: lights: repeated key; it is already at scene.yaml:2:1"
+    assert any(line.startswith("scene.yaml:1:22: volume.'': unknown key") for line in lines)
 
 
 def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
@@ -108,6 +109,7 @@ def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
     for size in (MAX_BYTES + 1, 2**40):  # of which no more is read than tells
         with (tmp_path / "b.yaml").open("wb") as stream:
             stream.truncate(size)
-        assert "larger than 1 MiB" in problem(tmp_path / "b.yaml")
+        told = f"b.yaml:1:{MAX_BYTES + 1}: is larger than 1 MiB"
+        assert told in problem(tmp_path / "b.yaml")
     (tmp_path / "c.yaml").write_bytes(b"a: 1\nb: \xff\n")
     assert problem(tmp_path / "c.yaml").endswith("c.yaml:2:4: is not UTF-8 text")

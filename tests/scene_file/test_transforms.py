@@ -222,6 +222,7 @@ def test_which_views_are_held_out(
         (["a/0.png", "b c/0.png"], ["a_0", "b_c_0"]),
         (["x/a/0.png", "y/a/0.png"], ["000_0", "001_0"]),
         (["a.single.png", None], ["a_single", "view_01"]),
+        ([f"{'n' * 240}{index}.png" for index in (0, 1)], ["n" * 98 + "0", "n" * 98 + "1"]),
     ],
 )
 def test_names_are_legal_and_differ(

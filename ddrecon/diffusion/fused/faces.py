@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -23,7 +24,7 @@ def assemble_system(
     fields, numbers = [mean, absorption.field, *flux], [outside, absorption.scale]
     cells = len(diffusion), *medium.grid.shape
     right, *matrix = _find(
-        f"SYSTEM, {len(flux)}, 0", medium, diffusion, fields, numbers, (), [cells] * 4
+        f"SYSTEM, {len(flux)}", medium, diffusion, fields, numbers, (), [cells] * 4
     )
     return *matrix, right
 
@@ -41,7 +42,7 @@ def find_flux(
     All but L0 are moments of degree 1, [3, C, z, y, x].
     """
     flux, added = ([] if moments is None else [moments] for moments in (first, before))
-    fields, kind = [mean, *flux, *added], f"FLUX, {len(flux)}, {3 * len(added)}"
+    fields, kind = [mean, *flux, *added], f"FLUX, {len(flux)}"
     return _find(kind, medium, diffusion, fields, [outside], (3,), added=len(added))[0]
 
 
@@ -52,7 +53,7 @@ def spread_flux(
 
     `flux` [3, C, z, y, x]: its moments of degree 1.
     """
-    return _find("GAIN, 1, 2", medium, diffusion, [flux, *sources], [], added=2)[0]
+    return _find("GAIN, 1", medium, diffusion, [flux, *sources], [], added=2)[0]
 
 
 def _find(
@@ -76,6 +77,7 @@ def _find(
     z, y, x = grid.shape
     place = {"nz": z, "ny": y, "nx": x, **dict(zip(("hz", "hy", "hx"), grid.spacing, strict=True))}
     place |= {"periodic": sum(1 << axis for axis in grid.periodic), "matrix_colors": len(diffusion)}
-    function = RowFunction(HEADER, f"Flow<{flow}>", shapes, x, PLACE, GIVEN, place, added)
+    name, without = f"Flow<{flow}, {added * math.prod(moments)}>", f"Flow<{flow}, 0>"
+    function = RowFunction(HEADER, name, shapes, x, PLACE, GIVEN, place, added, without)
     stacked = torch.stack([number.reshape(-1).expand(colors) for number in numbers])
     return function.apply(stacked, *fields)

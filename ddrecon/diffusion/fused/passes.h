@@ -66,27 +66,28 @@ template <class F> struct Cells {
              x < nx - 1 ? 1 : 1 - nx}};
     }
     // Calls `act` for each cell of a slice. Faces on the box are zero: it makes no difference which
-    // cell lies beyond them, so a slice is one loop. Its first or last row is by itself where the
-    // grid ends there, and every row where rows or columns are periodic.
+    // cell lies beyond them, so rows are one loop. The first or last row is by itself where the
+    // grid ends there, and so is every row where rows or columns are periodic.
     template <class Act> INLINE void visit(const Act& act) const {
         if (IS_GPU) return act(0, around(y, x));
         const int from = is_periodic ? ny : z == 0, to = is_periodic ? 0 : ny - (z == nz - 1);
-        Offsets offsets = around(0, 0);
-        offsets.below[1] = -nx, offsets.above[1] = nx, offsets.below[2] = -1, offsets.above[2] = 1;
-        INDEPENDENT
-        for (int i = from * nx; i < to * nx; ++i) act(i, offsets);
-        for (int row = 0; row < ny; ++row)
-            if (row < from || row >= to) visit_row(row, row * nx, act);
+        for (int row = 0, next; row < ny; row = next) {
+            const bool is_alone = row < from || row >= to;
+            next = is_alone ? row + 1 : to;
+            visit_rows(row, row * nx, next * nx, is_alone, act);
+        }
     }
-    // The same of the row at y, whose first cell is number `begin` of the item.
-    template <class Act> INLINE void visit_row(int y, int begin, const Act& act) const {
+    // The same of rows from y on, which are cells `begin` to `end` of the item, or of one `alone`.
+    // Here alone calls are inlined: what is compiled is short.
+    template <class Act>
+    INLINE void visit_rows(int y, int begin, int end, bool alone, const Act& act) const {
         if (IS_GPU) return act(0, around(y, x));
         Offsets offsets = around(y, 0);
-        act(begin, offsets);
-        if (nx > 1) act(begin + nx - 1, around(y, nx - 1));
+        if (!alone) offsets.below[1] = -nx, offsets.above[1] = nx;
         offsets.below[2] = -1, offsets.above[2] = 1;
         INDEPENDENT
-        for (int i = begin + 1; i < begin + nx - 1; ++i) act(i, offsets);
+        for (int i = begin + alone; i < end - alone; ++i) act(i, offsets);
+        for (int x = 0; alone && x < nx; x += nx > 1 ? nx - 1 : 1) act(begin + x, around(y, x));
     }
     // Calls `act(c, k)` for the six faces of cell i: what a face conducts, and the cell beyond it.
     template <class Act> INLINE void at_faces(int i, const Offsets& to, const Act& act) const {
@@ -287,7 +288,7 @@ template <int AXIS, class F> INLINE void stiffen(const Pass<F>& p, Size item) {
     F* const along = p.results[0] + cells.at(cells.color);
     // The first cell of the line of fine cells through the item.
     const Size line = cells.at(cells.color) / (count * step) * p.cells * step + cells.start % step;
-    cells.visit_row(cells.y, 0, [&](int i, const Offsets& to) HERE {
+    cells.visit_rows(cells.y, 0, cells.nx, true, [&](int i, const Offsets& to) HERE {
         const Size k = cells.start / step % count + (AXIS == 2 ? i : 0);
         const Size second = 2 * k + 1 < p.cells ? 2 * k + 1 : 2 * k, next = (k + 1) % count * 2;
         F energy = 0;

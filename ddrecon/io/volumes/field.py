@@ -20,15 +20,13 @@ Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
 VECTORS = ("velocity",)
 """Names of fields whose three numbers are along x, y and z, not colors."""
-SIGNED = ("g", *VECTORS)
-"""Names of fields that may be negative."""
 EMPTY = 1e-4
 """Cells below this part of the largest value count as empty: an optimization leaves none at 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0, in a box.
+    """`values` float32 [z, y, x] or [z, y, x, 3], finite, in a box.
 
     `bounds` float64 [2, 3] are the corners (x, y, z) of the box [u], where the file says them, and
     so is how many `meters` a u has; `unit` is that of the values, as it spells it, "" where it
@@ -77,15 +75,12 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
         legal = "expected [z, y, x] or [z, y, x, 3], at least one cell"
         raise FormatError(path, f"{name} has shape {list(values.shape)}; {legal}")
     values = as_float32(values)
-    for is_legal, flaw in (
-        (np.isfinite(values), "NaN or infinite"),
-        ((values >= 0) | (name in SIGNED), "negative"),
-    ):
-        if not is_legal.all():
-            z, y, x = np.argwhere(~is_legal)[0, :3]
-            count = np.count_nonzero(~is_legal)
-            where = f"cell (x, y, z) = ({x}, {y}, {z}) ({count} such values)"
-            raise FormatError(path, f"{name} is {flaw} at {where}; clean it first")
+    is_legal = np.isfinite(values)
+    if not is_legal.all():
+        z, y, x = np.argwhere(~is_legal)[0, :3]
+        count = np.count_nonzero(~is_legal)
+        where = f"cell (x, y, z) = ({x}, {y}, {z}) ({count} such values)"
+        raise FormatError(path, f"{name} is NaN or infinite at {where}; clean it first")
     if bounds is not None and not (
         bounds.shape == (2, 3) and np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()
     ):

@@ -109,6 +109,8 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
     // By cells a third output is the cotangent of extinction.
     enum { EMITTED, CHANGE, MEAN_BAR = 1, MEAN = 0, SUM_BAR = 0, RISE_BAR, EXTINCTION_BAR };
     static constexpr int CELL = ROWS + 2;
+    // Numbers in a line of a cache.
+    static constexpr int LINE = 64 / sizeof(F);
     // Where a row of cells, or a cell, begins: among cells, and among numbers in rings, in its
     // plane and in that upwind, or downwind.
     struct Row {
@@ -291,15 +293,29 @@ template <class N, class F, bool BY_CELLS> struct Ordinates {
                     const bool goes_up = t < of.height, is_back = PASS == BACK;
                     const int begin = goes_up ? team.begin : team.middle;
                     const int end = goes_up ? team.middle : team.end, y = t % of.height;
-                    if (begin < end)
-                        run_row<PASS>(
-                            row(is_back ? of.end - 1 - (s - of.begin) : s,
-                                goes_up != is_back ? y : of.height - 1 - y),
-                            begin, end);
+                    const int at = goes_up != is_back ? y : of.height - 1 - y;
+                    const int plane = is_back ? of.end - 1 - (s - of.begin) : s;
+                    if (begin < end) run_row<PASS>(row(plane, at), goes_up != is_back, begin, end);
                 }
     }
-    template <Pass PASS> INLINE void run_row(const Row& row, int begin, int end) const {
+    // Rows of `count` numbers of each cell, asked for before they are needed. Not long before: so
+    // far apart, they take each other's places in a cache.
+    INLINE void prefetch(const F* numbers, int count) const {
+        for (int k = 0; k < count; ++k)
+            for (int c = 0; c < width; c += LINE) __builtin_prefetch(numbers + k * all + c);
+    }
+    template <Pass PASS> INLINE void run_row(const Row& row, bool is_up, int begin, int end) const {
+        const long long at = color * cells + row.at, next = at + (is_up ? width : -width);
+        prefetch(of.extinction + at, 1);
+        prefetch(of.gradient + at, 3);
         sum_sources<PASS>(row, begin, end);
+        prefetch(of.source + next, of.count);
+        if (PASS != LIGHT) prefetch(sum_of(of.sums, of.count, row), of.count);
+        if (PASS == BACK) {
+            prefetch(of.bars + next, of.count);
+            prefetch(sum_of(of.gradient_bar, 3, row), 3);
+            prefetch(sum_of(of.extinction_bar, 1, row), 1);
+        }
         F step = F(0);
         for (int j = begin; j < end; ++j) {
             if (path(j).step != step) find_decays<HAS_SLOPES<PASS>>(row, step = path(j).step);

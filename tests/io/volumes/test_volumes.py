@@ -52,7 +52,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"density": np.array([[["a"]]])}, "values of type"),
     ({"density": flawed(np.nan)}, f"density is NaN or infinite {PLACE}"),
     ({"density": flawed(1e300)}, f"density is NaN or infinite {PLACE}"),
-    ({"density": flawed(-0.5)}, f"density is negative {PLACE}"),
     *(({"density": CUBE, "bounds": bounds}, "bounds must be [[xmin") for bounds in BOXES),
 ]
 
