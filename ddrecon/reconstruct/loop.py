@@ -78,7 +78,7 @@ class Together:
         self.diagonals: Values = {}
         # The metric of fields, and what was free where it was taken.
         self.metrics: tuple[Values | None, dict[str, FieldMetric]] = (None, {})
-        self.search = Search(Space(self._project, self._free, self._precondition))
+        self.search = Search(Space(self._project, self._free, self._precondition, self._group))
         self.rival: tuple[float, Values] = (math.inf, {})
         self._enter_stage()
 
@@ -183,9 +183,9 @@ class Together:
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
         # How long the metric is hardly changes with resolution.
-        space = Space(self._project, self._free, self._precondition)
+        space = Space(self._project, self._free, self._precondition, self._group)
         old, self.diagonals = self.search, {}
-        self.search = Search(space, scale=old.scale, weight=old.weight)
+        self.search = Search(space, scales=old.scales, weight=old.weight)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
     def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
@@ -251,6 +251,10 @@ class Together:
             else p.free(values[key], gradients[key])
             for key, p in self.blocks.items()
         }
+
+    def _group(self, key: str) -> str:
+        """The group of a parameter in the metric: that of all numbers is one."""
+        return "numbers" if self.blocks[key] in self.numbers.places else key
 
     def _precondition(self, values: Values, residual: Values, free: Values) -> Values:
         if self.metrics[0] is not free:

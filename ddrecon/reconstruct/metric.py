@@ -58,8 +58,8 @@ def _smooth(squares: Tensor, count: int) -> Tensor:
     pool = avg_pool3d if count == 3 else avg_pool2d
     colors = squares.reshape(1, -1, *squares.shape[-count:])
     mean = pool(colors, 3, 1, 1, count_include_pad=False).view_as(squares)
-    least = tuning.FLOOR * mean.double().square().mean().sqrt()
-    return mean.clamp(min=float(least) + torch.finfo(mean.dtype).tiny)
+    unit = mean.double().square().mean().sqrt().to(mean) + torch.finfo(mean.dtype).tiny
+    return unit * (mean / unit).clamp(min=tuning.FLOOR) ** tuning.POWER
 
 
 class FieldMetric:

@@ -147,7 +147,7 @@ class Numbers:
         for place in self.places.values():
             diagonal = self.matrix.diagonal()[place]
             least[place] = tuning.LEAST * diagonal.max() + torch.finfo(torch.float32).tiny
-        matrix = matrix + least[at].diag()
+        matrix = matrix + least[at].diag() + tuning.DAMPING * matrix.diagonal().diag()
         # In units of their own curvature, numbers are of one size.
         unit = matrix.diagonal().rsqrt()
         basis = torch.eye(len(at)).double()

@@ -58,7 +58,7 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
     lit = [p for p in shown if not (scene.lights and p.key == "emission" and len(shown) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
-    if is_empty:
+    if is_empty and any(p.key == "density" for p in lit):
         # The stage after the trial begins with the better of two volumes.
         again = stages[:1] if len(stages) == 1 else []
         stages = [stages[0], Stage(stages[0].level, is_trial=True), *stages[1:], *again]
@@ -92,10 +92,14 @@ class Schedule:
         share = (self.most - progress.began) // 2
         is_short = not is_last and iteration - progress.began >= max(share, 1)
         is_vain = self.stage.is_trial and search.objective.loss > tuning.UNLIKE
-        if not (search.gain < tuning.REST or is_short or is_vain):
+        is_at_rest = search.gain < tuning.REST
+        if not (is_at_rest or is_short or is_vain):
             return
         if not is_last:
-            self.progress = Progress(progress.stage + 1, iteration)
+            # What has not come to rest has no trial: the two could not be compared.
+            following = progress.stage + 1
+            is_passed = self.stages[following].is_trial and not is_at_rest
+            self.progress = Progress(following + is_passed, iteration)
             return
         loss = search.objective.loss
         has_fallen = loss < 2**-tuning.ELASTICITY * progress.rested

@@ -30,12 +30,14 @@ class Space:
     """Where the search goes: what it asks about values by name.
 
     `project` brings values back within bounds, `free` is 1 where an entry may move at values and
-    their derivative, and `precondition` is the inverse metric there, of what is free.
+    their derivative, and `precondition` is the inverse metric there, of what is free. It mixes
+    no values of one `group` with those of another.
     """
 
     project: Callable[[Values], Values]
     free: Callable[[Values, Values], Values]
     precondition: Callable[[Values, Values, Values], Values]
+    group: Callable[[str], str] = str
 
 
 @dataclass(frozen=True)
@@ -62,10 +64,10 @@ class Search:
 
     `values` are the last candidate accepted, none at first, and `objective` what was found there.
     The prior counts by `weight`. `pairs` are the last accepted moves and the changes of both
-    derivatives. The next candidate is `step`
-    times `direction` away, along which the loss falls by `slope`; `is_stuck` where no step helps.
-    `scale` is how long the metric is, as the last pair had it; 0 is not known. `gains` are what the
-    loss could still fall by, as part of it, at the last values.
+    derivatives. The next candidate is `step` times `direction` away, along which the loss falls by
+    `slope`; `is_stuck` where no step helps. `scales` are how long the metric is, by group of
+    values, as the last pair had it. `gains` are what the loss could still fall by, as part of it,
+    at the last values.
     """
 
     space: Space
@@ -76,7 +78,7 @@ class Search:
     direction: Values = field(default_factory=dict)
     slope: float = 0.0
     step: float = 1.0
-    scale: float = 0.0
+    scales: dict[str, float] = field(default_factory=dict)
     gains: list[float] = field(default_factory=list)
     is_stuck: bool = False
 
@@ -137,7 +139,7 @@ class Search:
         self.slope = min(_read(_dot(self.direction, gradients)), 0.0)
         self.is_stuck = self.slope == 0
         # A loss of squares is never below 0, so the first step need not promise more than that.
-        self.step = 1.0 if self.scale or self.is_stuck else min(1.0, self.loss / -self.slope)
+        self.step = 1.0 if self.scales or self.is_stuck else min(1.0, self.loss / -self.slope)
         if self.pairs and self.loss > 0:
             self.gains = [*self.gains, -self.slope / 2 / self.loss][-tuning.GAINS :]
 
@@ -167,16 +169,27 @@ class Search:
             residual = _add(residual, change, -weights[-1], free)
         result = self.space.precondition(self.values, residual, free)
         if pairs:
-            # The metric knows directions; how long it is, the last move tells.
-            move, change, _ = pairs[-1]
-            length = _dot(change, self.space.precondition(self.values, change, free))
-            ratio = _read(_dot(move, change) / length)
-            self.scale = ratio if 0 < ratio < math.inf else self.scale
-        if self.scale:
-            result = {name: value * self.scale for name, value in result.items()}
+            self._measure_metric(*pairs[-1][:2], free)
+        groups = {name: self.space.group(name) for name in result}
+        result = {name: value * self.scales.get(groups[name], 1) for name, value in result.items()}
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
             result = _add(result, move, weight - inverse * _dot(change, result), free)
         return {name: -value for name, value in result.items()}
+
+    def _measure_metric(self, move: Values, change: Values, free: Values) -> None:
+        """Takes from a `move` and the `change` of the derivative how long the metric is.
+
+        The metric knows directions; of fields and of numbers it errs by different factors.
+        """
+        base = self.space.precondition(self.values, change, free)
+        names: dict[str, list[str]] = {}
+        for name in move:
+            names.setdefault(self.space.group(name), []).append(name)
+        for group, members in names.items():
+            of_group = {name: change[name] for name in members}
+            ratio = _read(_dot(of_group, move) / _dot(of_group, base))
+            if 0 < ratio < math.inf:
+                self.scales[group] = ratio
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""

@@ -18,9 +18,10 @@ SHORTEST = 1e-3
 """A step is not shortened below this part of itself: then the metric is at fault."""
 PROBES = 1
 """Random pictures by which the metric of fields is taken; neighbors share what they tell."""
-FLOOR = 0.01
+FLOOR, POWER = 0.01, 0.5
 """The least entry of that metric, as a part of the root mean square of all: what no picture shows
-does not move far."""
+does not move far. And its power: what is seen well moves further than its curvature says, so that
+crusts do not grow at once. Powers of 1 are as good on solids and worse on clouds and flames."""
 CYCLES, HELD = 3, 1e3
 """Cycles of multigrid by which the metric's inverse is taken, and how much more strongly than by
 its neighbors an entry is held that does not move."""
@@ -40,8 +41,10 @@ APART, CLOSE = 0.5, 1e-5
 """Parts of a kind's change by which differences of pictures are taken, and the largest tolerance
 of the light in them. Of smaller parts, such as a tenth, what solves leave undone is seen: a sun's
 direction then takes twice as many steps."""
-LEAST = 1e-4
-"""Least curvature, as a part of the parameter's largest: what no picture shows stays."""
+LEAST, DAMPING = 1e-4, 0.1
+"""Least curvature, as a part of the parameter's largest: what no picture shows stays. And the part
+of their own curvature by which numbers move less (Levenberg 1944, doi:10.1090/qam/10666): pictures
+bend, and combinations that they hardly show would go too far."""
 TURN, SHIFT = math.radians(1.0), 0.005
 """How far a calibration's direction of a camera may be off [rad], and its place, as a part of its
 distance from the volume: what films from ordinary calibrations err by (E10.3)."""

@@ -5,14 +5,15 @@ from itertools import product
 
 import pytest
 import torch
-from media import data_product, make_camera, make_scene, random_values
+from media import box_grid, data_product, make_camera, make_scene, random_values
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.reconstruct import tuning
-from ddrecon.reconstruct.metric import find_diagonals
+from ddrecon.reconstruct.metric import FieldMetric, find_diagonals
 from ddrecon.reconstruct.numbers import Point, find_matrix, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.roughness import total_variation
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
 from ddrecon.uncertainty.curvature import Curvature
@@ -69,6 +70,7 @@ def test_it_is_the_part_of_the_matrix_between_numbers(
 
 def diagonal_by(curvature: Curvature, probes: int, monkeypatch: pytest.MonkeyPatch) -> torch.Tensor:
     monkeypatch.setattr(tuning, "PROBES", probes)
+    monkeypatch.setattr(tuning, "POWER", 1.0)
     arguments = [curvature.parameters[1]], curvature.values, curvature.weights, SolveMemory()
     return find_diagonals(curvature.scene, *arguments)["density"]
 
@@ -98,3 +100,26 @@ def test_what_no_picture_shows_is_held_by_a_part_of_what_they_show(
     monkeypatch.setattr(tuning, "FLOOR", 0.9)
     torch.testing.assert_close(diagonal_by(curvature, 1, monkeypatch), bare.clamp(min=least))
     assert bool((bare < least).any())
+
+
+def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Against the dense matrix: H plus the curvature of smoothing, of free rows and columns."""
+    monkeypatch.setattr(tuning, "CYCLES", 30)
+    monkeypatch.setattr(tuning, "HELD", 1e9)
+    shape, weight, grid = (4, 5, 6), 0.5, box_grid((4, 5, 6))
+    value = torch.full(shape, 0.2, dtype=torch.float64)
+    parameter = Parameter("density", ParameterSettings(tv=0.1), value, grid, unit=0.7)
+    diagonal, residual = 1e-3 + random_values(*shape), random_values(*shape, seed=2)
+    free = (random_values(*shape, seed=3) > 0.3).double()
+
+    def smoothing(x: torch.Tensor) -> torch.Tensor:
+        return 0.1 * total_variation(x.view(shape) / 0.7, grid, parameter.knee)
+
+    curvature = torch.autograd.functional.hessian(smoothing, value.flatten())
+    matrix, at = diagonal.flatten().diag() + weight * curvature, free.flatten().nonzero()[:, 0]
+    wanted = torch.zeros(value.numel()).double()
+    wanted[at] = torch.linalg.solve(matrix[at[:, None], at], residual.flatten()[at])
+    metric = FieldMetric(parameter, value, diagonal, weight, free)
+    torch.testing.assert_close(metric.solve(residual).flatten(), wanted, rtol=1e-5, atol=1e-7)

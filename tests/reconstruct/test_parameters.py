@@ -5,30 +5,12 @@ import math
 import pytest
 import torch
 from media import box_grid, random_values
-from torch import Tensor
 
 from ddrecon.reconstruct.levels import resample
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.roughness import total_variation
 from ddrecon.settings import ParameterSettings
 
 GRID = box_grid((4, 6, 5))
-
-
-def test_stiffness_is_the_curvature_of_smoothing_where_a_field_is_even() -> None:
-    value = torch.full(GRID.shape, 0.2, dtype=torch.float64)
-    parameter = Parameter("density", ParameterSettings(tv=0.1), value, GRID, unit=0.7)
-
-    def penalty(field: Tensor) -> Tensor:
-        tv = total_variation(field.view(GRID.shape) / 0.7, GRID, parameter.knee)
-        return 0.1 * tv
-
-    hessian = torch.autograd.functional.hessian(penalty, value.flatten())
-    torch.testing.assert_close(
-        parameter.stiffness(value), hessian.diagonal().view(GRID.shape), rtol=1e-6, atol=0
-    )
-    loss, slope = parameter.penalty()
-    assert float(loss) == float(penalty(value)) and not bool(slope.any())
 
 
 def test_values_stay_within_bounds_and_support_and_what_would_leave_them_is_not_free() -> None:

@@ -12,7 +12,7 @@ from media import box_grid
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, Stage, find_stages
-from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST
+from ddrecon.reconstruct.tuning import ELASTICITY, MOST_ITERATIONS, REST, UNLIKE
 from ddrecon.scene import Scene
 from ddrecon.settings import AUTO, ParameterSettings
 
@@ -102,7 +102,9 @@ def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
     values = dict.fromkeys([*others, "emission"], empty) | {"g": torch.tensor(0.1)}
     parameters = [Parameter(n, ParameterSettings(), v, grid) for n, v in values.items()]
     stages = find_stages(3, scene, parameters)
-    assert [stage.level for stage in stages] == [0, 0, 1, 2]
+    trials = [0] if others else []
+    assert [stage.level for stage in stages] == [0, 0, *trials, 1, 2]
+    assert [at for at, stage in enumerate(stages) if stage.is_trial] == [2] * len(trials)
     assert stages[0].waiting == waiting and not any(stage.waiting for stage in stages[1:])
     for parameter in parameters:
         parameter.start = torch.rand(grid.shape) if parameter.is_field else parameter.start
@@ -116,3 +118,10 @@ def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
         run.step()
     ending = run.ending()
     assert ending["kind"] == "rest" and ending["residual"] < 3 * ending["noise"]
+
+
+def test_a_trial_ends_at_once_where_pictures_tell_densities_apart() -> None:
+    stages = [Stage(0), Stage(0, is_trial=True), Stage(1)]
+    assert drive(Schedule(AUTO, stages), 0.9 * REST, 2 * UNLIKE) == [0, 0, 1, 1]
+    # What is cut short has no trial.
+    assert drive(Schedule(8, stages), 1.1 * REST, 0.5 * UNLIKE) == [0] * 4 + [1] * 4

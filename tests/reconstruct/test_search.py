@@ -101,7 +101,7 @@ def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope()
     search = begin(rosenbrock, random_values(COUNT, seed=3), space_of(metric, -10.0))
     advance(search, rosenbrock, 6)
     assert 3 <= len(search.pairs) < tuning.PAIRS
-    inverse = search.scale * metric.reciprocal().diag()
+    inverse = search.scales["x"] * metric.reciprocal().diag()
     for move, change, _ in search.pairs:
         s, y = move["x"], change["x"]
         rest = torch.eye(COUNT).double() - torch.outer(y, s) / (s @ y)
