@@ -169,15 +169,17 @@ def cumuli(part: int) -> Case:
 
 
 def stratocumulus(part: int) -> Case:
-    """A layer of 32 x 32 x 12 cells that repeats along x and y, of optical depth 8 on average."""
+    """A patch of a layer on 32 x 32 x 12 cells, of optical depth 8 where it is."""
     bounds, times = box([0, 0, 0.5], [1.6, 1.6, 0.86]), 3 // part
     points = centers(bounds, [n // part * times for n in (32, 32, 12)])
-    top = 0.68 + 0.06 * turbulence(points, 5).mean(0, keepdims=True) * np.sqrt(len(points) / 3)
-    reach = np.clip((top - points[..., 2]) / 0.06, -1, 1) + 0.3
+    waves = turbulence(points, 5).mean(0, keepdims=True)
+    top = 0.7 + 0.04 * waves / waves.std()
+    inland = 0.7 - np.linalg.norm(points[..., :2] - 0.8, axis=-1)
+    reach = np.clip(np.minimum((top - points[..., 2]) / 0.06, inland / 0.1), -2, 0.7)
     density = droplets(points, reach, 0.56, 0.2, seed=6)
-    column = density.sum(0).mean() * 0.36 / len(density)
-    medium = bounds | cloud_optics(round(8 / column, 1)) | {"periodic": ["x", "y"]}
-    views = along_track([0.8, 0.8, 0.68], 1.6, 40 // part)
+    columns = density.sum(0) * 0.36 / len(density)
+    medium = bounds | cloud_optics(round(float(8 / columns[columns > 0].mean()), 1))
+    views = along_track([0.8, 0.8, 0.68], 1.7, 40 // part)
     return Case({"density": density}, times, medium, sun(0.4, 0.3, -0.87), views)
 
 
