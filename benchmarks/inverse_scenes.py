@@ -61,14 +61,11 @@ class Case:
         known = {name: {"file": "fine.npz"} for name in self.fields}
         scene = {"volume": self.volume | known, "lights": self.lights, "views": self.views}
         (folder / "fine.yaml").write_text(json.dumps(scene | EXACT))  # JSON is YAML
-        words = [sys.executable, "-m", "ddrecon", "render", "fine.yaml", "-o", "images", "-q"]
-        subprocess.run([*words, "--overwrite"], cwd=folder, check=True)
         chance = np.random.default_rng(1)
-        for view in self.views:
-            picture = np.load(folder / "images" / f"{view['name']}.npy")
+        for view, picture in zip(self.views, render_views(folder / "fine.yaml"), strict=True):
             noise = np.hypot(NOISE * picture, LEAST_NOISE * picture.max())
             # Gray pictures have one noise in all colors.
-            picture += noise * chance.normal(size=(*picture.shape[:2], 1))
+            picture = picture + noise * chance.normal(size=(*picture.shape[:2], 1))
             np.save(folder / f"{view['name']}.npy", picture.astype(np.float32))
         views = [view | {"image": f"{view['name']}.npy"} for view in self.views]
         volume = self.volume | {"resolution": cells[::-1], "density": 0}
@@ -76,6 +73,18 @@ class Case:
         scene |= {"volume": volume, "views": views, "render": {"background": False}}
         scene["optimize"] = {"iterations": "auto", "parameters": sought}
         (folder / "scene.yaml").write_text(json.dumps(scene, indent=1))
+
+
+def render_views(scene: Path) -> list[Array]:
+    """The pictures [h, w, 3] of all views of the JSON `scene`.
+
+    They are those of a process of its own: what this one takes would count as memory of its runs.
+    """
+    words = [sys.executable, "-m", "ddrecon", "render", scene.name, "-o", "images", "-q"]
+    words.append("--overwrite")
+    subprocess.run(words, cwd=scene.parent, check=True, stdout=subprocess.DEVNULL)
+    names = [view["name"] for view in json.loads(scene.read_text())["views"]]
+    return [np.load(scene.parent / "images" / f"{name}.npy") for name in names]
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
