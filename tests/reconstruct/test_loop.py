@@ -11,7 +11,6 @@ from ddrecon.errors import DivergenceError, FormatError, SceneError, SolveError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.frame import Evaluation, Frame
 from ddrecon.reconstruct.gradients import Differentiated
-from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint
