@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 # How the search goes on (E10.1).
-PAIRS = 12
+PAIRS = 6
 """Moves and changes of the derivative that stand for the second derivative, at most."""
 SUFFICIENT = 1e-4
 """The least part of what the derivative promises that a step must bring (Armijo)."""

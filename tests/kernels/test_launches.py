@@ -13,7 +13,7 @@ from as_on_a_gpu import as_on_a_gpu
 from ddrecon.engine import use_engine
 from ddrecon.reconstruct.levels import scene_at_level
 
-MOST_LAUNCHES, MOST_READS, MOST_WRITES = 2_500, 20, 10
+MOST_LAUNCHES, MOST_READS, MOST_WRITES = 2_700, 20, 10
 
 
 @pytest.fixture(scope="module")
