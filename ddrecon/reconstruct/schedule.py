@@ -35,12 +35,14 @@ class Stage:
 class Progress:
     """What a schedule remembers: its `stage`, the iteration that it `began` with, if it is over.
 
-    `rested` is the loss of images where the search came to rest last, with a heavier prior.
+    `rested` is the loss of images where the search came to rest last, with a heavier prior;
+    `is_at_noise` where that was before the search could gain no more.
     """
 
     stage: int = 0
     began: int = 0
     is_at_rest: bool = False
+    is_at_noise: bool = False
     rested: float = math.inf
 
 
@@ -93,6 +95,11 @@ class Schedule:
         is_short = not is_last and iteration - progress.began >= max(share, 1)
         is_vain = self.stage.is_trial and search.objective.loss > tuning.UNLIKE
         is_at_rest = search.gain < tuning.REST
+        # A finer level begins with the bulk: from there a light prior lets it fit noise alone.
+        is_light = search.weight * search.objective.prior < tuning.LIGHT * search.objective.loss
+        is_refined = self.stage.level > self.stages[0].level
+        if is_refined and is_light and search.objective.loss <= noise_loss:
+            progress.is_at_noise = is_at_rest = True
         if not (is_at_rest or is_short or is_vain):
             return
         if not is_last:
@@ -111,6 +118,8 @@ class Schedule:
 
     def ending(self, count: int) -> dict[str, str]:
         """Why a run of `count` iterations ended: the kind, and in words."""
+        if self.progress.is_at_noise and self.progress.is_at_rest:
+            return {"kind": "noise", "text": "ended: images are explained within noise"}
         if self.progress.is_at_rest:
             text = f"the loss can fall by less than {tuning.REST:.1%} of itself"
             return {"kind": "rest", "text": f"ended: {text}"}

@@ -32,6 +32,8 @@ MODEL_ERROR, ELASTICITY = 0.01, 0.3
 """The part of its value by which a perfect image errs, and the power of the prior's weight with
 which the loss of images falls at least, or else it is not the prior that keeps it."""
 
+LIGHT = 0.5
+"""A prior that weighs less than this part of the loss does not keep noise out of a volume."""
 DENSER, UNLIKE, BETTER = 4.0, 0.1, 0.9
 """How much denser a trial begins; the loss, as a part of that of black pictures, above which
 pictures tell such a density apart; and the part of the last stage's loss that makes it better."""

@@ -22,8 +22,8 @@ STAGES = [Stage(0), Stage(1), Stage(2)]
 class FakeSearch(SimpleNamespace):
     """A search whose loss of images is `loss`, with a prior, and that can still gain `gain`."""
 
-    def __init__(self, loss: float, gain: float):
-        super().__init__(gain=gain, weight=1.0, objective=SimpleNamespace(loss=loss, prior=1.0))
+    def __init__(self, loss: float, gain: float, prior: float = 1.0):
+        super().__init__(gain=gain, weight=1.0, objective=SimpleNamespace(loss=loss, prior=prior))
 
     def reweigh(self, weight: float) -> None:
         self.weight = weight
@@ -125,3 +125,17 @@ def test_a_trial_ends_at_once_where_pictures_tell_densities_apart() -> None:
     assert drive(Schedule(AUTO, stages), 0.9 * REST, 2 * UNLIKE) == [0, 0, 1, 1]
     # What is cut short has no trial.
     assert drive(Schedule(8, stages), 1.1 * REST, 0.5 * UNLIKE) == [0] * 4 + [1] * 4
+
+
+@pytest.mark.parametrize(("prior", "levels"), [(0.4, [0, 1, 2]), (0.6, [0, 1, 1, 2, 2])])
+def test_noise_is_not_fitted_on_refined_grids_where_the_prior_is_light(
+    prior: float, levels: list[int]
+) -> None:
+    """A loss of 1 is that of noise; the search itself could gain more."""
+    schedule, made = Schedule(6, STAGES), list[int]()
+    while not schedule.is_over(len(made)) and len(made) < len(levels):
+        made.append(schedule.stage.level)
+        gain = 0.0 if len(made) == 1 else 1.0
+        schedule.note(len(made), FakeSearch(1.0, gain, prior), 1.0)
+    assert made == levels
+    assert schedule.ending(len(made))["kind"] == ("noise" if prior < 0.5 else "iterations")

@@ -100,7 +100,7 @@ def test_a_direction_is_minus_the_inverse_hessian_of_its_pairs_times_the_slope()
     metric = 1 + random_values(COUNT, seed=2)
     search = begin(rosenbrock, random_values(COUNT, seed=3), space_of(metric, -10.0))
     advance(search, rosenbrock, 6)
-    assert 3 <= len(search.pairs) < tuning.PAIRS
+    assert 3 <= len(search.pairs) <= tuning.PAIRS
     inverse = search.scales["x"] * metric.reciprocal().diag()
     for move, change, _ in search.pairs:
         s, y = move["x"], change["x"]
