@@ -98,7 +98,9 @@ class Schedule:
         # A finer level begins with the bulk: from there a light prior lets it fit noise alone.
         is_light = search.weight * search.objective.prior < tuning.LIGHT * search.objective.loss
         is_refined = self.stage.level > self.stages[0].level
-        if is_refined and is_light and search.objective.loss <= noise_loss:
+        # Noise of which images are short by far was estimated too high.
+        is_noise = noise_loss / 2 <= search.objective.loss <= noise_loss
+        if is_refined and is_light and is_noise:
             progress.is_at_noise = is_at_rest = True
         if not (is_at_rest or is_short or is_vain):
             return
