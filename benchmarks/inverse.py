@@ -119,14 +119,14 @@ def write_pyshdom(copy: Path, folder: Path) -> None:
     (folder / "scene.yaml").write_text(json.dumps(scene, indent=1))
 
 
-def prepare(name: str, folder: Path, references: Path | None, parts: int) -> Task | None:
+def prepare(name: str, folder: Path, references: Path | None, fewer: int) -> Task | None:
     """The task `name`, its scene in `folder` unless it is there already; None without its files."""
     if name in CONFIGS:
         return CONFIGS[name]
     scene, source = folder / "scene.yaml", references and references / name.partition("_masked")[0]
     if name in BUILDERS:
         if not scene.exists():
-            BUILDERS[name](parts).write(folder)
+            BUILDERS[name](fewer).write(folder)
         return Task(scene, folder / "truth.npz")
     if source is None or not source.exists():
         return None

@@ -26,7 +26,7 @@ from ddrecon.reconstruct.metric import FieldMetric
 from ddrecon.reconstruct.numbers import Numbers
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.schedule import Progress, Schedule, find_stages
-from ddrecon.reconstruct.search import Objective, Search, Space, Values
+from ddrecon.reconstruct.search import Inverse, Objective, Search, Space, Values
 from ddrecon.reconstruct.setup import Level
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations
@@ -76,9 +76,8 @@ class Together:
         stages = find_stages(len(problem.factors), problem.train, every)
         self.schedule = Schedule(problem.settings.iterations, stages)
         self.diagonals: Values = {}
-        # The metric of fields, and what was free where it was taken.
-        self.metrics: tuple[Values | None, dict[str, FieldMetric]] = (None, {})
-        self.search = Search(Space(self._project, self._free, self._precondition, self._group))
+        self.space = Space(self._project, self._free, self._metric, self._group)
+        self.search = Search(self.space)
         self.rival: tuple[float, Values] = (math.inf, {})
         self._enter_stage()
 
@@ -136,7 +135,9 @@ class Together:
         evaluations = [frame.evaluate() for frame in self.frames]
         pairs = zip(self.frames, evaluations, strict=True)
         self.numbers.prepare([frame.point(evaluation.compared) for frame, evaluation in pairs])
-        return self.numbers.deviations([each.objective.gradients for each in evaluations])
+        return self.numbers.deviations(
+            [evaluation.objective.gradients for evaluation in evaluations]
+        )
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
@@ -183,9 +184,8 @@ class Together:
         for frame in self.frames:
             frame.enter(self.schedule.stage.level)
         # How long the metric is hardly changes with resolution.
-        space = Space(self._project, self._free, self._precondition, self._group)
-        old, self.diagonals = self.search, {}
-        self.search = Search(space, scales=old.scales, weight=old.weight)
+        self.diagonals = {}
+        self.search = Search(self.space, scales=self.search.scales, weight=self.search.weight)
         self.noise_loss = sum(frame.noise_loss() for frame in self.frames)
 
     def _evaluate_candidate(self) -> tuple[Values, list[Evaluation]]:
@@ -231,9 +231,10 @@ class Together:
         pairs = list(zip(self.frames, compared, strict=True))
         for frame, comparison in pairs:
             blocks = [p for p in frame.parameters if p not in self.numbers.places]
-            for name, diagonal in frame.find_diagonals(blocks, comparison).items():
-                key = next(self._key(frame, p) for p in blocks if p.name == name)
-                # Maps are shared: what all frames tell of one adds up.
+            diagonals = frame.find_diagonals(blocks, comparison)
+            for p in blocks:
+                # Maps are shared: what all frames tell of a map adds up.
+                key, diagonal = self._key(frame, p), diagonals[p.name]
                 known = self.diagonals.get(key)
                 self.diagonals[key] = diagonal if known is None else known + diagonal
         if not self.schedule.stage.waiting:
@@ -256,19 +257,21 @@ class Together:
         """The group of a parameter in the metric: that of all numbers is one."""
         return "numbers" if self.blocks[key] in self.numbers.places else key
 
-    def _precondition(self, values: Values, residual: Values, free: Values) -> Values:
-        if self.metrics[0] is not free:
-            weight, metrics = self.search.weight, dict[str, FieldMetric]()
-            for key, p in self.blocks.items():
-                if p.tv and p.name not in self.schedule.stage.waiting:
-                    diagonal = self.diagonals[key]
-                    metrics[key] = FieldMetric(p, values[key], diagonal, weight, free[key])
-            self.metrics = free, metrics
-        result, metrics = dict[str, Tensor](), self.metrics[1]
-        for key, diagonal in self.diagonals.items():
-            bar = residual[key] * free[key]
-            result[key] = metrics[key].solve(bar) if key in metrics else bar / diagonal
-        return result | self.numbers.precondition(residual, free)
+    def _metric(self, values: Values, free: Values) -> Inverse:
+        """The inverse metric at `values`, of what is `free`."""
+        waiting, weight, metrics = self.schedule.stage.waiting, self.search.weight, {}
+        for key, p in self.blocks.items():
+            if p.tv and p.name not in waiting:
+                metrics[key] = FieldMetric(p, values[key], self.diagonals[key], weight, free[key])
+
+        def precondition(residual: Values) -> Values:
+            result = dict[str, Tensor]()
+            for key, diagonal in self.diagonals.items():
+                bar = residual[key] * free[key]
+                result[key] = metrics[key].solve(bar) if key in metrics else bar / diagonal
+            return result | self.numbers.precondition(residual, free)
+
+        return precondition
 
     def _values(self) -> Values:
         return {key: p.value.detach() for key, p in self.blocks.items()}

@@ -193,14 +193,14 @@ def find_matrix(point: Point, numbers: Sequence[Parameter]) -> Tensor:
         light = solve_light(world, memory)
         pictures = {name: view_picture(light, world, world.view(name)) for name in names}
         for p in numbers:
-            shown = [name for name in names if p.view in (None, name)]
-            changes: dict[str, list[Tensor]] = {name: [] for name in shown}
+            affected = [name for name in names if p.view in (None, name)]
+            changes: dict[str, list[Tensor]] = {name: [] for name in affected}
             steps, lengths = _small_changes(point, p)
-            for step in steps if shown else ():
+            for step in steps if affected else ():
                 world, lit = with_values(scene, {**values, p.name: values[p.name] + step}), light
                 if p.view is None:
                     lit = solve_light(world, SolveMemory(last=dict(memory.last)))
-                for name in shown:
+                for name in affected:
                     image = view_picture(lit, world, world.view(name))
                     changes[name].append(image - pictures[name])
             for name, differences in changes.items():

@@ -33,16 +33,15 @@ class Stage:
 
 @dataclass
 class Progress:
-    """What a schedule remembers: its `stage`, the iteration that it `began` with, if it is over.
+    """What a schedule remembers: its `stage`, and the iteration that it `began` with.
 
-    `rested` is the loss of images where the search came to rest last, with a heavier prior;
-    `is_at_noise` where that was before the search could gain no more.
+    `ended` says what ended the run, "rest" or "noise"; empty while it goes on. `rested` is the loss
+    of images where the search came to rest last, with a heavier prior.
     """
 
     stage: int = 0
     began: int = 0
-    is_at_rest: bool = False
-    is_at_noise: bool = False
+    ended: str = ""
     rested: float = math.inf
 
 
@@ -56,8 +55,8 @@ def find_stages(levels: int, scene: Scene, parameters: Sequence[Parameter]) -> l
     fields = [p for p in parameters if p.is_field]
     has_structure = any(bool((p.start != p.start.flatten()[0]).any()) for p in fields)
     stages = [Stage(level) for level in range(levels - 1 if has_structure else 0, levels)]
-    shown = [p for p in fields if p.key in ("density", "emission")]
-    lit = [p for p in shown if not (scene.lights and p.key == "emission" and len(shown) > 1)]
+    visible = [p for p in fields if p.key in ("density", "emission")]
+    lit = [p for p in visible if not (scene.lights and p.key == "emission" and len(visible) > 1)]
     waiting = frozenset(p.name for p in parameters if p not in lit)
     is_empty = bool(lit) and not any(bool(p.start.any()) for p in lit)
     if is_empty and any(p.key == "density" for p in lit):
@@ -82,7 +81,7 @@ class Schedule:
 
     def is_over(self, iteration: int) -> bool:
         """Whether a run ends that has made `iteration` iterations."""
-        return self.progress.is_at_rest or iteration >= self.most
+        return bool(self.progress.ended) or iteration >= self.most
 
     def note(self, iteration: int, search: Search, noise_loss: float) -> None:
         """Takes in how `search` stands after `iteration` iterations; may end its stage.
@@ -100,9 +99,8 @@ class Schedule:
         is_refined = self.stage.level > self.stages[0].level
         # Noise of which images are short by far was estimated too high.
         is_noise = noise_loss / 2 <= search.objective.loss <= noise_loss
-        if is_refined and is_light and is_noise:
-            progress.is_at_noise = is_at_rest = True
-        if not (is_at_rest or is_short or is_vain):
+        is_explained = is_refined and is_light and is_noise
+        if not (is_at_rest or is_explained or is_short or is_vain):
             return
         if not is_last:
             # What has not come to rest has no trial: the two could not be compared.
@@ -116,13 +114,13 @@ class Schedule:
             progress.rested = loss
             search.reweigh(search.weight / 2)
         else:
-            progress.is_at_rest = True
+            progress.ended = "noise" if is_explained else "rest"
 
     def ending(self, count: int) -> dict[str, str]:
         """Why a run of `count` iterations ended: the kind, and in words."""
-        if self.progress.is_at_noise and self.progress.is_at_rest:
+        if self.progress.ended == "noise":
             return {"kind": "noise", "text": "ended: images are explained within noise"}
-        if self.progress.is_at_rest:
+        if self.progress.ended:
             text = f"the loss can fall by less than {tuning.REST:.1%} of itself"
             return {"kind": "rest", "text": f"ended: {text}"}
         if self.is_auto:

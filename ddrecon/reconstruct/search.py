@@ -23,6 +23,8 @@ from ddrecon.reconstruct import tuning
 
 Values = dict[str, Tensor]
 """Tensors by the name of their parameter."""
+Inverse = Callable[[Values], Values]
+"""The inverse of a metric, as a function."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,13 @@ class Space:
     """Where the search goes: what it asks about values by name.
 
     `project` brings values back within bounds, `free` is 1 where an entry may move at values and
-    their derivative, and `precondition` is the inverse metric there, of what is free. It mixes
-    no values of one `group` with those of another.
+    their derivative, and `metric` is taken at values and what is free there: its inverse, of that,
+    is a function of a derivative. It mixes no values of one `group` with those of another.
     """
 
     project: Callable[[Values], Values]
     free: Callable[[Values, Values], Values]
-    precondition: Callable[[Values, Values, Values], Values]
+    metric: Callable[[Values, Values], Inverse]
     group: Callable[[str], str] = str
 
 
@@ -167,27 +169,28 @@ class Search:
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))
             residual = _add(residual, change, -weights[-1], free)
-        result = self.space.precondition(self.values, residual, free)
+        precondition = self.space.metric(self.values, free)
+        result = precondition(residual)
         if pairs:
-            self._measure_metric(*pairs[-1][:2], free)
+            move, change, _ = pairs[-1]
+            self._measure(move, change, precondition(change))
         groups = {name: self.space.group(name) for name in result}
         result = {name: value * self.scales.get(groups[name], 1) for name, value in result.items()}
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
             result = _add(result, move, weight - inverse * _dot(change, result), free)
         return {name: -value for name, value in result.items()}
 
-    def _measure_metric(self, move: Values, change: Values, free: Values) -> None:
-        """Takes from a `move` and the `change` of the derivative how long the metric is.
+    def _measure(self, move: Values, change: Values, promised: Values) -> None:
+        """Takes from a `move`, and from the one `promised` for its `change`, the metric's length.
 
         The metric knows directions; of fields and of numbers it errs by different factors.
         """
-        base = self.space.precondition(self.values, change, free)
         names: dict[str, list[str]] = {}
         for name in move:
             names.setdefault(self.space.group(name), []).append(name)
         for group, members in names.items():
             of_group = {name: change[name] for name in members}
-            ratio = _read(_dot(of_group, move) / _dot(of_group, base))
+            ratio = _read(_dot(of_group, move) / _dot(of_group, promised))
             if 0 < ratio < math.inf:
                 self.scales[group] = ratio
 
@@ -203,7 +206,7 @@ class Search:
             if isinstance(entry, dict):
                 return {name: put(value) for name, value in entry.items()}
             if isinstance(entry, list | tuple):
-                return type(entry)(put(part) for part in entry)
+                return type(entry)(put(item) for item in entry)
             return entry.to(first) if isinstance(entry, Tensor) else entry
 
         first = next(iter(like.values()))

@@ -42,7 +42,7 @@ def space_of(metric: Tensor, low: float) -> Space:
     return Space(
         lambda values: {n: v.clamp(min=low) for n, v in values.items()},
         free,
-        lambda values, residual, free: {"x": residual["x"] * free["x"] / metric},
+        lambda values, free: lambda residual: {"x": residual["x"] * free["x"] / metric},
     )
 
 
@@ -125,8 +125,8 @@ def test_units_of_unknowns_change_nothing() -> None:
 
     other = begin(scaled, start / unit, space_of(metric * unit**2, -1e9))
     for _ in range(12):
-        one, two = advance(plain, rosenbrock, 1), advance(other, scaled, 1)
-        torch.testing.assert_close(two * unit, one, rtol=1e-6, atol=1e-9)
+        x, scaled_x = advance(plain, rosenbrock, 1), advance(other, scaled, 1)
+        torch.testing.assert_close(scaled_x * unit, x, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("loss", [float("nan"), float("inf"), 1e9])
