@@ -66,7 +66,7 @@ def deviation(run: Reconstruction) -> float:
     found = Uncertainty(run, seed=0)
     while found.count < EXPERIMENTS:
         found.step()
-    return Deviations(found).numbers()["g"]["deviation"] or 0.0
+    return Deviations(found).numbers()["g"]["deviation"]
 
 
 def main() -> None:

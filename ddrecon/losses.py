@@ -115,7 +115,7 @@ class Target:
         return self._mean(LOSSES[self.loss](image - self.image, self))
 
     def weights_at(self, image: Tensor) -> Tensor:
-        """The second derivative of `loss_of` by each entry of `image` [3, h, w].
+        """The second derivative of `loss_of` by each entry of `image` [3, h, w]: W of E11.1.
 
         Of what is no square it is that of the parabola around 0 that touches the loss from above
         (Huber 1981, doi:10.1002/0471725250): its slope over the error, which counts as at least

@@ -13,21 +13,16 @@ import matplotlib.pyplot as plt
 from ddrecon.io.volumes.table import read_field
 
 ROOT = Path(__file__).parents[1]
-KINDS = {
-    "mean": "what was found",
-    "std": "deviation",
-    "explained": "explained by pictures\n(white: all)",
-}
+KINDS = {"mean": "what was found", "std": "deviation"}
 
 
 def main() -> None:
     """The middle slices across z, y upwards."""
     folder = Path(sys.argv[1])
-    figure, axes = plt.subplots(1, len(KINDS), figsize=(8.5, 2.8))
+    figure, axes = plt.subplots(1, len(KINDS), figsize=(6, 2.8))
     for axis, (kind, title) in zip(axes, KINDS.items(), strict=True):
         values = read_field(folder / "volumes" / f"density_{kind}.npz", f"density_{kind}").values
-        white = 1 if kind == "explained" else values.max()
-        shown = axis.imshow(values[len(values) // 2, ::-1], cmap="gray", vmin=0, vmax=white)
+        shown = axis.imshow(values[len(values) // 2, ::-1], cmap="gray", vmin=0)
         axis.set_title(title, fontsize=10)
         axis.set_axis_off()
         figure.colorbar(shown, ax=axis, shrink=0.7)

@@ -1,7 +1,7 @@
 """Small random media, operators, cameras and scenes."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,17 +12,15 @@ from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight
-from ddrecon.lighting import solve_light
 from ddrecon.march.integral import march
 from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
 from ddrecon.numerics.legendre import legendre
-from ddrecon.picture import render, view_picture
+from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.tangents import varied
 from ddrecon.variables.values import value_of, with_values
 
@@ -213,18 +211,19 @@ def image_gradients(scene: Scene, names: Sequence[str]) -> tuple[Tensor, list[Te
     return images.detach(), list(torch.autograd.grad(loss, list(leaves.values())))
 
 
-def data_product(curvature: Curvature, vector: Tensor) -> Tensor:
-    """J^T W J times `vector` (E11.1): by a tangent and an adjoint."""
-    changes, weighted = curvature.split(vector), {}
-    with torch.no_grad(), forward_ad.dual_level():
-        pairs = {n: (value, changes[n]) for n, value in curvature.values.items()}
-        duals = {name: forward_ad.make_dual(*pair) for name, pair in pairs.items()}
-        world = with_values(curvature.scene, duals)
-        light_field = solve_light(world, curvature.new_memory())
-        for view in world.views:
-            change = forward_ad.unpack_dual(view_picture(light_field, world, view)).tangent
-            weighted[view.name] = curvature.weights[view.name] * change
-    return curvature.adjoint(weighted)
+def data_matrix(
+    scene: Scene, values: Mapping[str, Tensor], weights: Mapping[str, Tensor]
+) -> Tensor:
+    """J^T W J of all pictures (E11.1), column by column; `values` lie one after another."""
+    sizes, columns = [value.numel() for value in values.values()], list[Tensor]()
+    weight = torch.cat([weights[view.name].flatten() for view in scene.views])
+    for way in torch.eye(sum(sizes), dtype=weight.dtype):
+        ways = zip(values.items(), way.split(sizes), strict=True)
+        with torch.no_grad(), forward_ad.dual_level():
+            duals = {n: forward_ad.make_dual(v, d.view(v.shape)) for (n, v), d in ways}
+            columns.append(forward_ad.unpack_dual(render(with_values(scene, duals))).tangent)
+    jacobian = torch.stack([column.flatten() for column in columns], 1)
+    return jacobian.T @ (weight[:, None] * jacobian)
 
 
 def summed_series(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from media import random_values
 
 from ddrecon.losses import HUBER, LOSSES, Target
 from ddrecon.pictures import srgb
@@ -123,3 +124,17 @@ def test_what_counts_is_averaged() -> None:
     kept = mask.bool()
     expected = float(((image - target)[:, kept] ** 2).mean())
     assert float(image_loss("l2", image, target, mask)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(loss: str) -> None:
+    target = Target.of(0.8 * random_values(3, 4, 5), random_values(4, 5, seed=1).round(), loss)
+    image = target.image + 0.4 * (random_values(3, 4, 5, seed=3) - 0.5)
+    weights = target.weights_at(image)
+    image = image.requires_grad_()
+    (slope,) = torch.autograd.grad(target.loss_of(image), image)
+    torch.testing.assert_close(slope, weights * (image.detach() - target.image))
+    for part in (0.0, 0.5, 1.5, -2.0):
+        other = target.image + part * (image.detach() - target.image)
+        parabola = (weights * ((other - target.image) ** 2 - (image - target.image) ** 2)).sum() / 2
+        assert target.loss_of(other) <= target.loss_of(image) + parabola + 1e-12

@@ -349,21 +349,12 @@ def _optimize_film(
 @click.option(
     "--calibrate",
     "experiments",
-    type=click.IntRange(min=0),
+    type=click.IntRange(min=1),
     default=2,
     show_default=True,
     metavar="N",
     help="Experiments, each as long as RUN was: what it found is photographed and reconstructed, "
-    "and how far off that is are the deviations. 0: what noise alone leaves, which is far too "
-    "little. In all, also after --resume.",
-)
-@click.option(
-    "--samples",
-    type=click.IntRange(min=2),
-    default=16,
-    show_default=True,
-    metavar="N",
-    help="Samples of what the experiments leave open, for --keep-samples.",
+    "and how far off that is are the deviations. In all, also after --resume.",
 )
 @click.option(
     "--noise",
@@ -372,12 +363,6 @@ def _optimize_film(
     metavar="X",
     help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
     "reconstruction leaves.",
-)
-@click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
-@click.option(
-    "--next-view",
-    type=click.Choice(["ring"]),
-    help="Rank 12 candidate cameras on a ring by their angle to the nearest existing camera.",
 )
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
@@ -388,15 +373,10 @@ def uncertainty(
     output: Path,
     overwrite: bool,
     experiments: int,
-    samples: int,
     read: float | None,
-    has_samples: bool,
-    next_view: str | None,
     resume: bool,
 ) -> None:
-    """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
-    they do not.
-    """
+    """Say by experiments how sure RUN, the folder of a finished run, is of each cell and number."""
     from ddrecon.io.files.folders import UNCERTAINTY, claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
@@ -413,8 +393,7 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    kept = samples if has_samples else 0
-    request = Request(session.seed, experiments, kept, noise, bool(next_view))
+    request = Request(session.seed, experiments, noise)
     if not is_first():
         follow_uncertainty(taken, request)
         return

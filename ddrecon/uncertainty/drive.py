@@ -21,22 +21,15 @@ from ddrecon.run.run_folder import CHECKPOINT_SECONDS, CHECKPOINTS
 from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 from ddrecon.uncertainty.folder import write_deviations
-from ddrecon.uncertainty.next_view import rank_views
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: so many `experiments`, and `samples` written of what is left open.
-
-    `noise` is that of all pictures, if their scene is not to say. With `has_next_view` those that
-    may be taken next are ranked.
-    """
+    """So many `experiments`; `noise` is that of all pictures, if their scene is not to say."""
 
     seed: int
     experiments: int
-    samples: int
     noise: Noise | None = None
-    has_next_view: bool = False
 
 
 def drive_uncertainty(
@@ -46,7 +39,6 @@ def drive_uncertainty(
 
     An interrupt takes effect after an iteration of an experiment; `resume` goes on from there.
     """
-    views = rank_views(run.level.train) if request.has_next_view else []
     path = claimed.path
     described, checkpoints = _describe(run, request), path / CHECKPOINTS
     state, began = None, perf_counter()
@@ -72,7 +64,7 @@ def drive_uncertainty(
     # What is left the first rank does by itself.
     leave_ranks()
     seconds = perf_counter() - began
-    return write_deviations(Deviations(experiments), views, request.samples, path, seconds)
+    return write_deviations(Deviations(experiments), path, seconds)
 
 
 def follow_uncertainty(run: Reconstruction, request: Request) -> None:

@@ -23,16 +23,11 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.setup import given_noise
 from ddrecon.reconstruct.shares import share_pictures
 from ddrecon.scene import Scene
-from ddrecon.uncertainty.curvature import Curvature
 from ddrecon.variables.values import with_values
 
 MORE_ROUNDS = 3
 """Transport rounds by which an experiment's pictures are closer to truth than the run's model."""
 MOST_ROUNDS = 16
-PROBES = 3
-"""Random pictures by which it is found what pictures tell of each cell."""
-STATE = ("count", "errors", "truth", "information")
-"""The state that a checkpoint keeps besides the current experiment."""
 
 
 class Uncertainty:
@@ -40,40 +35,39 @@ class Uncertainty:
 
     `values` are what was found, by name, and `errors` of each experiment so far how far it was from
     its own `truth`. `residuals` [3, h, w] are what is left of each training view's target, by name,
-    and `noise`, of all pictures, replaces what the scene says. `information` is the diagonal of
-    J^T W J, W being 1 over the variance of pixels: from random pictures, drawn by `seed`.
+    and `noise`, of all pictures, replaces what the scene says; `deviation` is that of all pixels.
     """
 
     def __init__(self, run: Reconstruction, seed: int, noise: Noise | None = None):
         self.run, self.parameters, self.seed = run, run.parameters, seed
-        level, settings = run.level, run.problem.settings
-        self.curvature = Curvature(level.train, run.parameters, level.targets, run.memory.last)
-        self.values = self.curvature.values
-        images = self.curvature.images
-        self.residuals = {v.name: target_of(v) - images[v.name] for v in level.train.views}
-        noises = {v.name: noise or given_noise(v, settings) for v in level.train.views}
+        views, settings = run.level.train.views, run.problem.settings
+        self.values = {p.name: p.value.detach() for p in run.parameters}
+        images = photograph(run.level.train, self.values)
+        self.residuals = {v.name: target_of(v) - images[v.name] for v in views}
+        noises = {v.name: noise or given_noise(v, settings) for v in views}
         self.is_noise_known = None not in noises.values()
         # Nothing is known better than a part of all pictures.
-        powers = [target_of(view).square().mean() for view in level.train.views]
-        least = float(torch.stack(powers).mean()) * LEAST**2 + torch.finfo(torch.float32).tiny
-        squares = dict[str, Tensor]()
-        for view in level.train.views:
-            name, view_noise = view.name, noises[view.name]
-            seen = torch.ones(view.camera.size) if view.mask is None else view.mask
-            residual = (self.residuals[name] * seen.to(images[name])).square().mean()
-            square = residual
+        powers = torch.stack([target_of(view).square().mean() for view in views])
+        least = float(powers.mean()) * LEAST**2 + torch.finfo(torch.float32).tiny
+        squares = list[Tensor]()
+        for view in views:
+            residual, view_noise = self.residuals[view.name], noises[view.name]
+            left = residual if view.mask is None else residual * view.mask
+            square = left.square().mean().clamp(min=least)
             if view_noise is not None:
                 # Pictures err as they are known to; the fit has taken up some of their noise.
-                square = view_noise.deviation(images[name]).square().mean()
-                self.residuals[name] *= (square / residual.clamp(min=least)).sqrt().clamp(min=1)
-            squares[name] = square.clamp(min=least)
-            weight = seen.to(images[name]) / squares[name]
-            self.curvature.weights[name] = weight.expand_as(images[name])
-        self.deviation = float(torch.stack(list(squares.values())).mean().sqrt())
-        self.information = self._find_information(torch.Generator().manual_seed(seed % 2**31))
-        self.count, self.errors = 0, list[dict[str, Tensor]]()
-        self.truth = dict(self.values)
+                known = view_noise.deviation(images[view.name]).square().mean()
+                self.residuals[view.name] = residual * (known / square).sqrt().clamp(min=1)
+                square = known.clamp(min=least)
+            squares.append(square)
+        self.deviation = float(torch.stack(squares).mean().sqrt())
+        self.errors, self.truth = list[dict[str, Tensor]](), dict(self.values)
         self.trial: Reconstruction | None = None
+
+    @property
+    def count(self) -> int:
+        """How many experiments are done."""
+        return len(self.errors)
 
     @property
     def iteration(self) -> int:
@@ -88,7 +82,7 @@ class Uncertainty:
             return
         values = {p.name: p.value.detach() for p in trial.parameters}
         self.errors.append({name: values[name] - self.truth[name] for name in values})
-        self.count, self.trial = self.count + 1, None
+        self.trial = None
         for p in self.parameters:
             if not is_tabled(p):
                 # What the reconstruction lacks of its truth is what the run lacks of it, too.
@@ -99,15 +93,13 @@ class Uncertainty:
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         trial = None if self.trial is None else self.trial.state()
-        return {name: getattr(self, name) for name in STATE} | {"trial": trial}
+        return {"errors": self.errors, "truth": self.truth, "trial": trial}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where `state` was."""
         like = next(iter(self.values.values()))
-        self.count = state["count"]
         self.errors = [{n: e.to(like) for n, e in entries.items()} for entries in state["errors"]]
-        for name in ("truth", "information"):
-            setattr(self, name, {n: value.to(like) for n, value in state[name].items()})
+        self.truth = {name: value.to(like) for name, value in state["truth"].items()}
         if state["trial"] is not None:
             self.trial = self._begin()
             self.trial.restore(state["trial"])
@@ -117,8 +109,8 @@ class Uncertainty:
 
         They err as those of the run do, the other way around; of later ones, either way by view.
         """
-        problem, level = self.run.problem, self.run.level
-        pictures = self._photograph(level.train)
+        problem = self.run.problem
+        pictures = photograph(bring_closer(self.run.level.train), self.truth)
         generator = torch.Generator().manual_seed(self.seed % 2**31 + self.count)
         signs = torch.randint(0, 2, (len(pictures),), generator=generator) * 2 - 1
         views = list(problem.train.views)
@@ -129,31 +121,24 @@ class Uncertainty:
             views[at] = replace(view, image=image.clamp(min=float(target_of(view).min())))
         return Reconstruction(replace(problem.scene, views=views, optimize=problem.settings))
 
-    def _photograph(self, scene: Scene) -> dict[str, Tensor]:
-        """The pictures [3, h, w] of the `truth`, by more transport rounds than those of `scene`."""
-        diffusion = scene.diffusion
-        if (diffusion.model, diffusion.scheme) == ("p1", "conservative"):
-            rounds = min(diffusion.rounds + MORE_ROUNDS, MOST_ROUNDS)
-            scene = replace(scene, diffusion=replace(diffusion, transport_rounds=rounds))
-        with torch.no_grad():
-            world = with_values(scene, self.truth)
-            light_field = solve_light(world, SolveMemory())
-            return share_pictures(
-                scene, lambda view: view_picture(light_field, world, world.view(view.name))
-            )
 
-    def _find_information(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """The mean square of J^T W^(1/2) times random pictures, by name."""
-        total, curvature = torch.zeros(self.curvature.size), self.curvature
-        for _ in range(PROBES):
-            random = {
-                name: weight.sqrt().cpu() * torch.randn(weight.shape, generator=generator)
-                for name, weight in curvature.weights.items()
-            }
-            random = {name: noise.to(curvature.images[name]) for name, noise in random.items()}
-            probe = curvature.adjoint(random)
-            total = total.to(probe) + probe.square() / PROBES
-        return curvature.split(total)
+def photograph(scene: Scene, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The pictures [3, h, w] of `scene` with `values`, by name."""
+    with torch.no_grad():
+        world = with_values(scene, values)
+        light_field = solve_light(world, SolveMemory())
+        return share_pictures(
+            scene, lambda view: view_picture(light_field, world, world.view(view.name))
+        )
+
+
+def bring_closer(scene: Scene) -> Scene:
+    """`scene` by more transport rounds, as far as its model has any."""
+    diffusion = scene.diffusion
+    if (diffusion.model, diffusion.scheme) != ("p1", "conservative"):
+        return scene
+    rounds = min(diffusion.rounds + MORE_ROUNDS, MOST_ROUNDS)
+    return replace(scene, diffusion=replace(diffusion, transport_rounds=rounds))
 
 
 def is_tabled(parameter: Parameter) -> bool:

@@ -16,7 +16,6 @@ from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene, View
 from ddrecon.settings import MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
-from ddrecon.uncertainty.deviations import Deviations
 from ddrecon.uncertainty.experiments import Uncertainty
 
 pytestmark = pytest.mark.slow
@@ -123,7 +122,7 @@ def in_units(scene: Scene, density: float, length: float) -> Scene:
 
 
 def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
-    """What a run finds, how far a sample is from it, in units of `scene_of`, and its iterations."""
+    """What a run finds, and how far an experiment errs, in units of `scene_of`; its iterations."""
     torch.manual_seed(0)
     run = Reconstruction(in_units(scene_of(kind), density, length))
     while not run.is_done:
@@ -131,8 +130,10 @@ def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Ten
     uncertainty = Uncertainty(run, seed=0)
     while uncertainty.count < 1:
         uncertainty.step()
-    samples = uncertainty.curvature.split(Deviations(uncertainty).draw(0))
-    both = {"run": {p.name: p.value.detach() for p in run.parameters}, "sample": samples}
+    both = {
+        "run": {p.name: p.value.detach() for p in run.parameters},
+        "error": uncertainty.errors[0],
+    }
     return {"iterations": torch.tensor(float(run.iteration))} | {
         f"{name} of the {what}": value / factor_of(name, density, length)
         for what, values in both.items()
