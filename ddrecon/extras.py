@@ -9,7 +9,6 @@ from ddrecon.errors import FormatError, MissingExtraError
 
 EXTRAS = {
     "OpenImageIO": "exr",
-    "tifffile": "tiff",
     "netCDF4": "netcdf",
     "matplotlib": "plot",
     "mitsuba": "reference",

@@ -59,25 +59,9 @@ def shapes_by_python() -> Iterator[None]:
     ask_python(everything=False)
 
 
-BOTH = [suffix for suffix in WRITTEN if suffix != ".vti"]
-"""Formats that are written and read."""
-
-
-def _is_written(suffix: str) -> bool:
-    return not suffix.startswith(".tif") or find_spec("tifffile") is not None
-
-
-@pytest.fixture(scope="session")
-def readable_formats() -> list[str]:
-    """The suffixes of all volume files that can be written and read here."""
-    return [suffix for suffix in BOTH if _is_written(suffix)]
-
-
-@pytest.fixture(scope="session", params=BOTH)
+@pytest.fixture(scope="session", params=WRITTEN)
 def suffix(request: pytest.FixtureRequest) -> str:
-    """The suffix of each kind of volume file that can be written and read here."""
-    if not _is_written(request.param):
-        pytest.skip(f"{request.param} needs tifffile, not installed here")
+    """The suffix of each kind of volume file that is written and read."""
     return request.param
 
 

@@ -65,7 +65,7 @@ def write_png(
 
 def write_tiff(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w], [h, w, 3] or, multiplied by alpha, [h, w, 4] through tifffile."""
-    tifffile = pytest.importorskip("tifffile", reason="TIFF stacks are an extra")
+    tifffile = pytest.importorskip("tifffile", reason="writes TIFF")
     kind = "minisblack" if pixels.ndim == 2 else "rgb"
     alpha = {"extrasamples": ["assocalpha"]} if pixels.shape[2:] == (4,) else {}
     tifffile.imwrite(path, pixels, photometric=kind, **alpha)

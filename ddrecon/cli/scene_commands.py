@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ddrecon.scene_file.load import SceneFile
 
 
-EXPORTED = click.Choice(["vdb", "vti", "npz"])
+EXPORTED = click.Choice(["vdb", "npz"])
 
 
 @click.command()

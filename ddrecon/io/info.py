@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.images.oiio import is_stack
-from ddrecon.io.images.table import READERS, read_image
+from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.field import EMPTY, Fields, prune
 from ddrecon.io.volumes.table import FORMATS, read_fields
 
@@ -21,13 +19,9 @@ FILLED = f"more than {EMPTY:g} of the largest"
 def describe(path: Path) -> dict[str, Any]:
     """The contents of the volume or image at `path`, for `lines` or JSON.
 
-    Raises FormatError when it is neither, or holds nothing that can be read. A .tif of several
-    pages is a volume.
+    Raises FormatError when it is neither, or holds nothing that can be read.
     """
-    with guard_reading(path):
-        suffix = path.suffix.lower()
-        is_image = suffix not in FORMATS or (suffix in READERS and not is_stack(path))
-    if not is_image:
+    if path.suffix.lower() in FORMATS:
         fields, reasons = read_fields(path)
         bounds = next((field.bounds for field in fields.values()), None)
         values = {name: field.values for name, field in fields.items()}

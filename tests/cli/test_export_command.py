@@ -10,7 +10,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.volumes.table import field_names, read_field, write_field
+from ddrecon.io.volumes.table import WRITTEN, field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -38,15 +38,13 @@ def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
     assert succeed(*again).stdout == before
 
 
-def test_volumes_through_every_format_keep_a_corner_in_its_place(
-    succeed: Run, readable_formats: list[str]
-) -> None:
+def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run) -> None:
     values = np.zeros((2, 3, 4), np.float32)
     values[0, 0, 3] = 7
     bounds = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
     write_field(Path("start.npz"), "density", values, bounds)
     last = "start.npz"
-    for suffix in [*readable_formats, ".npz"]:
+    for suffix in [*WRITTEN, ".npz"]:
         name = f"{last.partition('.')[0]}x.density{suffix}"
         assert succeed("export", last, "-o", name).stdout == f"written: {name}\n"
         last = name
@@ -81,9 +79,9 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
         "two.npz -o two.vol": "a .vol holds one field, not density, albedo",
     }.items():
         assert words in refuse(3, "export", *command.split())[-1]
-    succeed("export", "two.npz", "-o", "two.vti")
-    assert "two.vti: already there" in refuse(2, "export", "density.npz", "-o", "two.vti")[-1]
-    succeed("export", "density.npz", "-o", "two.vti", "--overwrite")
+    succeed("export", "two.npz", "-o", "two.vdb")
+    assert "two.vdb: already there" in refuse(2, "export", "density.npz", "-o", "two.vdb")[-1]
+    succeed("export", "density.npz", "-o", "two.vdb", "--overwrite")
 
 
 def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:

@@ -91,7 +91,7 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert "no .exr" in line and "pip install" in line
 
 
-@pytest.mark.parametrize("kind", ["npz", "vti", "vdb"])
+@pytest.mark.parametrize("kind", ["npz", "vdb"])
 def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
     said = succeed(*RENDER, "--fluence", "--export", kind).stdout
     assert (

@@ -34,8 +34,7 @@ from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_fie
 BOUNDS = np.array([[-1.0, -2.0, 8.0], [1.5, 2.5, 11.0]])
 VALUES = np.random.default_rng(0).random((4, 5, 6), np.float32)
 PICTURE = np.random.default_rng(1).random((6, 8, 3), np.float32)
-PACKAGES = {".tif": "OpenImageIO", ".tiff": "OpenImageIO", ".nc": "netCDF4"}
-FORMS = [(one, True) for one in FORMATS if one != ".vti"] + [(one, False) for one in READERS]
+FORMS = [(one, True) for one in FORMATS] + [(one, False) for one in READERS]
 """Suffix, and whether it is read as a volume: some are read as either."""
 IDS = [f"{kind}{' volume' * is_volume}" for kind, is_volume in FORMS]
 EVERY = pytest.mark.parametrize(("suffix", "is_volume"), FORMS, ids=IDS)
@@ -136,7 +135,7 @@ def test_fields_come_back_in_their_place(
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     (name,) = field_names(path)
     field = read_field(path, name)
-    assert name == "albedo" or suffix in (".vol", ".tif", ".tiff")
+    assert name == "albedo" or suffix == ".vol"
     assert field.values.dtype == np.float32 and np.array_equal(field.values, values)
     assert field.bounds is not None and np.allclose(field.bounds, BOUNDS, rtol=1e-14, atol=0)
     assert field.resolution == shape[::-1]
@@ -171,14 +170,14 @@ def test_what_is_absent_or_cut_short_is_refused(
             assert part > 0.5 and np.array_equal(read(path, is_volume), values)
 
 
-@pytest.mark.parametrize("suffix", [*PACKAGES, ".exr", ".hdr"])
+@pytest.mark.parametrize("suffix", [".tif", ".tiff", ".nc", ".exr", ".hdr"])
 def test_a_missing_package_is_named(
     tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, package = tmp_path / f"density{suffix}", PACKAGES.get(suffix, "OpenImageIO")
+    path, package = tmp_path / f"density{suffix}", "netCDF4" if suffix == ".nc" else "OpenImageIO"
     path.write_bytes(b"hello")
     monkeypatch.setitem(sys.modules, package, None)
-    assert (refusal if suffix in PACKAGES else image_refusal)(path) == advice(package)
+    assert (refusal if suffix in FORMATS else image_refusal)(path) == advice(package)
 
 
 @st.composite
@@ -227,7 +226,7 @@ def test_a_damaged_file(
 def test_the_contents_of_another_format(tmp_path: Path, suffix: str, is_volume: bool) -> None:
     path = tmp_path / f"density{suffix}"
     for other in FORMS:
-        if other[0] not in PACKAGES:
+        if other[0] not in (".tif", ".tiff", ".nc"):
             path.write_bytes(sample(*other))
             is_refused(path, is_volume)
     script = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"

@@ -38,8 +38,6 @@ GRAY = ("Y", "gray", "grey", "luminance")
 BLACK_IS_ZERO, RGB = 1, 2
 HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
 """Its lines, then the size, then how the first row of pixels begins."""
-STACK_MARK = "bounds="
-"""The mark in the description of a volume that we wrote as TIFF, if it has a single page."""
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -90,23 +88,12 @@ def read_hdr(path: Path) -> np.ndarray:
     return as_float32(pixels / factor)
 
 
-def is_stack(path: Path) -> bool:
-    """Whether the TIFF file at `path` is a volume: of several pages, or written as one by us."""
-    with opened(path, "TIFF") as (file, spec):
-        marked = STACK_MARK in spec.get_string_attribute("ImageDescription")
-        is_paged = file.seek_subimage(1, 0)
-        file.geterror()  # that there is no other page is none
-        return marked or is_paged
-
-
 def read_tiff(path: Path) -> np.ndarray:
     """The pixels of the file at `path`, float32 [h, w] or [h, w, samples].
 
-    Raises FormatError for a volume (several pages), and where pixels are not floats, or are laid
-    out otherwise than from the top left.
+    Raises FormatError where it has several pages, or pixels that are not floats, or are laid out
+    otherwise than from the top left.
     """
-    if is_stack(path):
-        raise FormatError(path, "is a volume (several pages); an image is a single page")
     with opened(path, "TIFF") as (file, spec):
         kind = spec.getattribute("tiff:PhotometricInterpretation")
         channels, profile = _channels_of_picture(spec), spec.getattribute("ICCProfile")
@@ -128,6 +115,9 @@ def read_tiff(path: Path) -> np.ndarray:
         if profile_encoding and not profile_encoding.has_srgb_primaries:
             doubt_primaries(path, profile_encoding.source)
         pixels = read_pixels(path, file, "float")[..., [*map(spec.channelindex, channels)]]
+        if file.seek_subimage(1, 0):
+            raise FormatError(path, "has several pages, not one (docs/formats.md, other volumes)")
+        file.geterror()  # that there is no other page is none
     return pixels[..., 0] if len(channels) == 1 else pixels
 
 

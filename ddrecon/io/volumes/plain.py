@@ -1,13 +1,10 @@
-"""Volumes whose bytes lie plainly: NumPy archives, Mitsuba's .vol and VTK's .vti.
+"""Volumes whose bytes lie plainly: NumPy archives and Mitsuba's .vol.
 
 An archive (.npz) has each field under its own name, and its box as `bounds`.
 
 Mitsuba's grid volumes (.vol) have a header of 48 bytes, then float32 values, little-endian, of one
 field without a name. The header: `VOL`, version 3, then int32 type (1: float32), cells along x, y,
 z and colors, then the box as six float32. Of values, colors run fastest, then x.
-
-VTK image data (.vti), which ParaView opens, is written, not read. Each field is a cell array of its
-own name, of float32, with three components for colors; appended raw.
 """
 
 from __future__ import annotations
@@ -15,7 +12,6 @@ from __future__ import annotations
 import struct
 import zipfile
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -91,39 +87,3 @@ def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *bounds.ravel())
     with replace_file(path) as temporary:
         temporary.write_bytes(header + values.astype("<f4", copy=False).tobytes())
-
-
-FILE = """<?xml version="1.0"?>
-<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
-<ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">
-<Piece Extent="{extent}">
-<CellData>
-{arrays}</CellData>
-</Piece>
-</ImageData>
-<AppendedData encoding="raw">
-_"""
-ARRAY = """<DataArray type="Float32" Name={name} NumberOfComponents="{count}" format="appended" \
-offset="{offset}"/>
-"""
-
-
-def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and their box.
-
-    `bounds` [2, 3], its corners (x, y, z) [u], are written as origin and spacing.
-    """
-    cells = next(iter(fields.values())).shape[2::-1]
-    origin, spacing = (
-        " ".join(map(repr, line.tolist())) for line in (bounds[0], (bounds[1] - bounds[0]) / cells)
-    )
-    arrays, data = "", b""
-    for name, values in fields.items():
-        count = values.shape[3] if values.ndim == 4 else 1
-        arrays += ARRAY.format(name=quoteattr(name), count=count, offset=len(data))
-        block = as_float32(values).astype("<f4", copy=False).tobytes()
-        data += len(block).to_bytes(8, "little") + block
-    extent = " ".join(f"0 {count}" for count in cells)
-    head = FILE.format(extent=extent, origin=origin, spacing=spacing, arrays=arrays)
-    with replace_file(path) as temporary:
-        temporary.write_bytes(head.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")

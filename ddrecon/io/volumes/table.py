@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -14,8 +13,7 @@ from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
-from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol, write_vti
-from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
+from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol
 from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 
 
@@ -31,18 +29,11 @@ class VolumeFormat:
     names: Callable[[Path], list[str]] | None = None
 
 
-def refuse_reading(path: Path, *_: str) -> NoReturn:
-    """Raises FormatError, which says what is read instead."""
-    raise FormatError(path, ".vti is written, not read: save it as .npz (docs/formats.md)")
-
-
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
     ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
-    ".vti": VolumeFormat(write_vti, refuse_reading, refuse_reading),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
-    **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
 """The suffixes of formats that are written."""

@@ -83,7 +83,7 @@ def test_primaries_of_a_profile_are_said(tmp_path: Path):
         (np.ones((2, 2), np.float32), {"extratags": [(274, 3, 1, 3, True)]}, "turned rows; only"),
         (np.ones((2, 2), np.float32), {"photometric": "miniswhite"}, "interpretation 0; only"),
         (np.ones((2, 2, 4), np.float32), {"photometric": "separated"}, "interpretation 5; only"),
-        (np.ones((2, 2, 2), np.float32), {}, "is a volume"),
+        (np.ones((2, 2, 2), np.float32), {}, "has several pages"),
     ],
 )
 def test_other_kinds_are_refused_by_name(

@@ -1,16 +1,15 @@
-"""Archives of numpy, .vol and .vti, and what every volume must be."""
+"""Archives of numpy and .vol, and what every volume must be."""
 
 import struct
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from refusals import refusal
 
 from ddrecon.errors import FormatError
-from ddrecon.io.volumes.table import read_field, write_field, write_fields
+from ddrecon.io.volumes.table import read_field, write_field
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
 CUBE = np.ones((2, 2, 2))
@@ -66,32 +65,6 @@ def test_what_is_no_field_is_refused_with_advice(
 
 def test_unknown_suffixes_list_the_known(tmp_path: Path) -> None:
     assert ".npz" in refusal(tmp_path / "f.txt")
-
-
-def test_cells_lie_where_vtk_has_them(tmp_path: Path) -> None:
-    """x fastest, behind a count of bytes; origin and spacing say where the box is."""
-    path, rng = tmp_path / "f.vti", np.random.default_rng(0)
-    fields = {"density": rng.random((4, 3, 2), "f4"), "albedo": rng.random((4, 3, 2, 3), "f4")}
-    write_fields(path, fields, BOUNDS)
-    head, _, data = path.read_bytes().partition(b"\n_")
-    image = ElementTree.fromstring(head + b"</AppendedData></VTKFile>")[0]
-    assert image.attrib["WholeExtent"] == "0 2 0 3 0 4"
-    assert (image.attrib["Origin"], image.attrib["Spacing"]) == ("-1.0 -2.0 -3.0", "1.0 1.5 1.5")
-    arrays = image.findall("Piece/CellData/DataArray")
-    assert [array.get("Name") for array in arrays] == list(fields)
-    for array, values in zip(arrays, fields.values(), strict=True):
-        assert int(array.attrib["NumberOfComponents"]) == (values.size // 24)
-        block = data[int(array.attrib["offset"]) :]
-        size = int(np.frombuffer(block, "<u8", 1)[0])
-        stored = np.frombuffer(block[8 : 8 + size], "<f4")
-        for (z, y, x), value in np.ndenumerate(values[..., 0] if values.ndim == 4 else values):
-            assert stored[(x + 2 * (y + 3 * z)) * (values.size // 24)] == value
-        assert size == values.nbytes
-
-
-def test_reading_one_says_what_is_read(tmp_path: Path) -> None:
-    (tmp_path / "f.vti").write_text('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaa">]><x/>')
-    assert "written, not read: save it as .npz" in refusal(tmp_path / "f.vti")
 
 
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
