@@ -2,13 +2,12 @@
 
 `load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene,
 ...) -> Result`, of films `optimize_sequence(path, ...) -> Iterator[Result]`, and `VolumeRenderer`,
-the renderer as a layer. Names are imported when first used, so that `import ddrecon` costs nothing.
+the renderer as a layer; `show(scene)` draws it in a notebook. Names are imported when first used,
+so that `import ddrecon` costs nothing.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from ddrecon.display import Displayed
 
 __version__ = "0.1.0"
 _HOMES = {
@@ -17,6 +16,7 @@ _HOMES = {
     "fluence": "layer",
     "VolumeRenderer": "layer",
     "optimize": "reconstruct.loop",
+    "show": "report.notebook",
     "optimize_sequence": "film.drive",
     "Result": "reconstruct.log",
     "Scene": "scene",
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ddrecon.layer import render as render
     from ddrecon.reconstruct.log import Result as Result
     from ddrecon.reconstruct.loop import optimize as optimize
+    from ddrecon.report.notebook import show as show
     from ddrecon.scene import Scene as Scene
     from ddrecon.scene_file.build import load_scene as load_scene
 else:  # where names are unknown to a type checker, they are wrong
@@ -54,13 +55,3 @@ else:  # where names are unknown to a type checker, they are wrong
 
 def __dir__() -> list[str]:
     return __all__
-
-
-def _draw(record: Any) -> str:
-    """A scene or a volume in a notebook."""
-    from ddrecon.report.notebook import html_of
-
-    return html_of(record)
-
-
-Displayed._repr_html_ = _draw

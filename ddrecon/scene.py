@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.defaults import choose_diffusion
-from ddrecon.display import Displayed
 from ddrecon.errors import UsageError
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import Light
@@ -57,7 +56,7 @@ class View:
 
 
 @dataclass(eq=False, repr=False)
-class Scene(Displayed):
+class Scene:
     """A scene, of a file or made in Python.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each

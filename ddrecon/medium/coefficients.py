@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.display import Displayed
 from ddrecon.grid import Grid
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, remember_of_phase
 from ddrecon.medium.phase_peak import SeenPhase
@@ -28,7 +27,7 @@ P1_DEGREE = 1
 
 
 @dataclass(eq=False, repr=False)
-class Volume(Displayed):
+class Volume:
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ddrecon.display import Displayed
 from ddrecon.scene import Scene
 
 
@@ -37,16 +36,8 @@ NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 
 
 @dataclass(frozen=True, repr=False)
-class Result(Displayed):
+class Result:
     """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
 
     scene: Scene
     rows: list[Row]
-
-    def _repr_html_(self) -> str:
-        """The reconstructed scene, in a notebook, and how well it fits."""
-        last = self.rows[-1]
-        test = [row.test_psnr for row in self.rows if row.test_psnr is not None][-1:]
-        tested = f", {test[0]:.2f} dB of views held out" if test else ""
-        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of views trained on{tested}"
-        return f"<p>{fit}</p>{self.scene._repr_html_()}"

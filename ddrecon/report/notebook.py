@@ -19,8 +19,15 @@ SIDEWAYS = (0.5, 0.4, 1.0)
 FIELDS = ("density", "sigma_a", "sigma_s")
 
 
-def html_of(shown: Scene | Volume) -> str:
-    """A frame with the fields of a volume, or of a scene's, to turn and to cut.
+class Drawn(str):
+    """HTML that a notebook shows."""
+
+    def _repr_html_(self) -> str:
+        return self
+
+
+def show(shown: Scene | Volume) -> Drawn:
+    """The fields of a volume, or of a scene's, to turn and to cut in a notebook.
 
     A scene is seen from its first camera. The frame's scripts reach nothing of the notebook.
     """
@@ -45,7 +52,7 @@ def html_of(shown: Scene | Volume) -> str:
     still = "".join(picture(png_of(slices(value)), name) for name, value in fields.items())
     viewer = volume_viewer(viewed, still, up, (x, y, z))
     page = page_text("ddrecon", words, [viewer], is_alive=True, state='class="small"')
-    return (
+    return Drawn(
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '
         f'style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'
     )
