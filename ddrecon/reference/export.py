@@ -1,13 +1,12 @@
-"""A scene as files that Mitsuba opens, for which Mitsuba is not needed.
+"""A scene as files that Mitsuba opens: XML, which Mitsuba itself writes, and what that names.
 
-They are XML, and beside it its volumes (.vol) and its environment map (.exr).
+Beside it are its volumes (.vol) and pictures (.exr).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -16,41 +15,21 @@ from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
+from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
 
-PLUGINS = {
-    "integrator": ("volpath", "volpathmis"),
-    "sensor": ("perspective", "orthographic"),
-    "film": ("hdrfilm",),
-    "rfilter": ("box",),
-    "sampler": ("independent",),
-    "medium": ("heterogeneous",),
-    "volume": ("gridvolume",),
-    "phase": ("hg", "blendphase", "rayleigh", "tabphase"),
-    "shape": ("cube", "rectangle"),
-    "bsdf": ("null", "diffuse"),
-    "texture": ("bitmap",),
-    "emitter": ("directional", "point", "constant", "envmap"),
-}
-"""Mitsuba's plugins by what they are, which XML says and a dictionary does not."""
-KINDS = {plugin: kind for kind, plugins in PLUGINS.items() for plugin in plugins}
-VECTORS = {"position": "point", "direction": "vector"}
-NUMBERS: dict[type, str] = {bool: "boolean", int: "integer", float: "float", str: "string"}
 Arrays = dict[Path, np.ndarray]
-"""Kinds that are written to files beside the XML."""
+"""What is written to files beside the XML."""
 
 
 def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
     """Writes `scene` to `path` (.xml) and files named like it beside it; returns their paths.
 
     Raises UsageError where one exists and `may_exist` is False or the folder does not exist,
-    SceneError for what Mitsuba cannot show.
+    SceneError for what Mitsuba cannot show, MissingExtraError without Mitsuba.
     """
-    arrays: Arrays = {}
-    root = ElementTree.Element("scene", version="3.0.0")
-    for key, value in mitsuba_scene(scene, scene.views).items():
-        if key != "type":
-            root.append(_element(key, value, "id", path, arrays))
+    module, arrays = load_mitsuba(), Arrays()
+    described = _name_arrays(mitsuba_scene(scene, scene.views), "", path, arrays)
     written = [path, *arrays]
     require_free_files(written, may_exist=may_exist)
     bounds = np.array(scene.volume.grid.bounds_xyz)
@@ -59,37 +38,24 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
             write_field(file, file.stem, array, bounds)
         else:
             write_exr(file, array)
-    ElementTree.indent(root, "    ")
+    config = module.parser.ParserConfig(module.variant())
+    state = module.parser.parse_dict(config, make_mitsuba_objects(module, described))
     with replace_file(path) as temporary:
-        ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
+        module.parser.write_file(state, str(temporary))
     return written
 
 
-def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> ElementTree.Element:
-    """`value` as XML, its `name` in the attribute `naming`; what needs a file goes to `arrays`."""
-    make = ElementTree.Element
-    if isinstance(value, np.ndarray):
-        transform = make("transform", name=name)
-        transform.append(make("matrix", value=_numbers(value.ravel())))
-        return transform
-    if isinstance(value, tuple | list):
-        kind = "rgb" if isinstance(value, tuple) else VECTORS[name]
-        return make(kind, name=name, value=_numbers(value))
-    if not isinstance(value, dict):
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        return make(NUMBERS[type(value)], name=name, value=text)
-    if value["type"] == "ref":
-        return make("ref", name=name, id=value["id"])
-    element = make(KINDS[value["type"]], {"type": value["type"], naming: name})
-    for key, entry in value.items():
-        if isinstance(entry, np.ndarray) and entry.ndim > 2:
-            file = path.with_name(f"{path.stem}.{name}{'.vol' if entry.ndim == 4 else '.exr'}")
-            arrays[file] = entry
-            key, entry = "filename", file.name
-        if key != "type":
-            element.append(_element(key, entry, "name", path, arrays))
-    return element
+def _name_arrays(described: dict[str, Any], name: str, path: Path, arrays: Arrays) -> Any:
+    """`described`, the object called `name`, with names of files in place of pictures and volumes.
 
-
-def _numbers(values: Any) -> str:
-    return ", ".join(repr(float(value)) for value in values)
+    They go to `arrays`.
+    """
+    named = dict[str, Any]()
+    for key, value in described.items():
+        if isinstance(value, np.ndarray) and value.ndim > 2:
+            file = path.with_name(f"{path.stem}.{name}{'.vol' if value.ndim == 4 else '.exr'}")
+            arrays[file], named["filename"] = value, file.name
+        else:
+            is_object = isinstance(value, dict)
+            named[key] = _name_arrays(value, key, path, arrays) if is_object else value
+    return named

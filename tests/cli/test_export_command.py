@@ -22,7 +22,7 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert set(contents(Path())) - before == {"smoke.xml", "smoke.sigma_t.vol"}
     assert result.stdout == "written: smoke.xml, smoke.sigma_t.vol\n"
     root = ElementTree.parse("smoke.xml").getroot()
-    assert [sensor.attrib["id"] for sensor in root.iter("sensor")] == ["sensor_0", "sensor_1"]
+    assert [sensor.attrib["name"] for sensor in root.iter("sensor")] == ["sensor_0", "sensor_1"]
     kinds = {emitter.attrib["type"] for emitter in root.iter("emitter")}
     assert kinds == {"directional", "constant"}
 
