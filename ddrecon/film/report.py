@@ -16,17 +16,8 @@ from ddrecon.film.shared import SHARED
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import read_image, webp_of, write_animation
 from ddrecon.pictures import srgb
-from ddrecon.report.curve import draw_curve
-from ddrecon.report.page import (
-    captioned,
-    embed,
-    paragraph,
-    scrub,
-    section,
-    side_by_side,
-    table,
-    write_page,
-)
+from ddrecon.report.curve import Plot, draw_curve
+from ddrecon.report.page import write_page
 from ddrecon.report.pictures import pixels, shrink
 from ddrecon.run.report import registered_text
 from ddrecon.run.run_folder import REPORT, SUMMARY
@@ -53,14 +44,15 @@ def write_film_report(film: Film) -> dict[str, Any]:
     record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | calibration
     write_json(film.path / RECORD, record)
     if rows:
-        sections = [section("Quality", side_by_side(*_curves(rows)))]
-        sections += [section("Frames", *_figures(film, summaries))]
-        if calibration.get("values"):
-            sections += [section("Calibration", *_calibration(film.shared))]
-        title = f"ddrecon: {film.path.absolute().name}"
-        goes_on = len(rows) < record["asked"]
-        path, lead = film.path / REPORT, _lead(record)
-        write_page(path, title, lead, sections, is_alive=True, goes_on=goes_on)
+        write_page(
+            film.path / REPORT,
+            title=f"ddrecon: {film.path.absolute().name}",
+            lead=_lead(record),
+            goes_on=len(rows) < record["asked"],
+            plots={"heading": "Quality", "drawn": _curves(rows)},
+            frames=_figures(film, summaries),
+            numbers=_calibration(film.shared) if calibration.get("values") else None,
+        )
     return record
 
 
@@ -81,7 +73,7 @@ def _lead(record: Mapping[str, Any]) -> str:
     return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {text}"
 
 
-def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _curves(rows: Sequence[Mapping[str, Any]]) -> list[Plot]:
     drawn, kinds = [], {"trained on": "", "held out": "test_", "registered": "registered_"}
     for title, key in (("PSNR [dB]", "psnr"), ("SSIM", "ssim")):
         series = {
@@ -92,25 +84,25 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return drawn
 
 
-def _figures(of: Film, summaries: Mapping[int, Mapping[str, Any]]) -> list[str]:
+def _figures(
+    film: Film, summaries: Mapping[int, Mapping[str, Any]]
+) -> list[list[tuple[bytes, str]]]:
     """Pictures of the views held out, or of the first one, frame after frame; writes the movie."""
     views = next(iter(summaries.values()))["views"]
     shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
-    numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
-    blocks = [paragraph("Target, render and what differs in them, four times enlarged.")]
+    numbers, figures = [*summaries][:: -(-len(summaries) // SHOWN)], []
     for index, name in enumerate(shown):
-        strips = [_strip(of.of(number) / "previews" / f"{name}.png") for number in numbers]
-        figures = [
-            captioned(
-                embed(webp_of(srgb.encode_bytes(strip)), f"{name}, frame {number}"),
-                f"{name}, frame {number}: {summaries[number]['views'][name]['psnr']:.2f} dB",
-            )
-            for number, strip in zip(numbers, strips, strict=True)
-        ]
-        blocks.append(scrub(figures))
+        strips = [_strip(film.of(number) / "previews" / f"{name}.png") for number in numbers]
+        psnrs = [summaries[number]["views"][name]["psnr"] for number in numbers]
+        figures.append(
+            [
+                (webp_of(srgb.encode_bytes(strip)), f"{name}, frame {number}: {psnr:.2f} dB")
+                for number, strip, psnr in zip(numbers, strips, psnrs, strict=True)
+            ]
+        )
         if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
-            write_animation(of.path / MOVIE, strips, 1.0)
-    return blocks
+            write_animation(film.path / MOVIE, strips, 1.0)
+    return figures
 
 
 def _strip(path: Path) -> np.ndarray:
@@ -118,7 +110,7 @@ def _strip(path: Path) -> np.ndarray:
     return pixels(shrink(image, WIDEST))
 
 
-def _calibration(shared: Mapping[str, Any]) -> list[str]:
+def _calibration(shared: Mapping[str, Any]) -> dict[str, Any]:
     """What all frames share, and by how much those that found it disagree."""
 
     def text_of(numbers: Any) -> str:
@@ -133,10 +125,9 @@ def _calibration(shared: Mapping[str, Any]) -> list[str]:
             spread = text_of(spread)
         rows.append((name, texts.get(name, f"in {SHARED}"), spread))
     frames = ", ".join(map(str, shared.get("frames", [])))
-    return [
-        paragraph(
-            f"Found from frames {frames} together. The last column is the standard deviation, from "
-            "frame to frame, of what each alone would change with its volume as it is."
-        ),
-        table(["number", "value", "spread"], rows),
-    ]
+    text = (
+        f"Found from frames {frames} together. The last column is the standard deviation, from "
+        "frame to frame, of what each alone would change with its volume as it is."
+    )
+    head = ["number", "value", "spread"]
+    return {"heading": "Calibration", "head": head, "rows": rows, "text": text}

@@ -1,4 +1,4 @@
-"""Curves as SVG within a page.
+"""Curves of a page, as lines and texts that its template draws as SVG.
 
 matplotlib is an extra and takes seconds to start; a report is written after every run.
 """
@@ -7,18 +7,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
+from dataclasses import dataclass, field
 
 Point = tuple[float, float]
+INK = "currentColor"
 COLORS = ("#3b82c4", "#d1603d", "#3f9a5f")
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 520, 280, 62, 12, 26, 40
 """The picture and the margins of its plot, in units of SVG."""
 LEGEND = 70
 """Room for a name in the legend."""
-ROW = 20
-"""Height of a row of bars."""
 MOST_POINTS = 500
 """Points of a curve that are drawn."""
+
+
+@dataclass
+class Plot:
+    """A picture under `title`, in units of SVG.
+
+    `lines` are (x1, y1, x2, y2, class), `curves` a color and points, `texts` (x, y, anchor, color,
+    text).
+    """
+
+    title: str
+    width: int = WIDTH
+    height: int = HEIGHT
+    lines: list[tuple[float, float, float, float, str]] = field(default_factory=list)
+    curves: list[tuple[str, list[Point]]] = field(default_factory=list)
+    texts: list[tuple[float, float, str, str, str]] = field(default_factory=list)
+
+    def write(
+        self, x: float, y: float, text: str, anchor: str, color: str = "currentColor"
+    ) -> None:
+        """Adds a text."""
+        self.texts.append((round(x, 1), round(y, 1), anchor, color, text))
+
+    def draw(self, x1: float, y1: float, x2: float, y2: float, kind: str) -> None:
+        """Adds a line of this `kind`, a class of the page's style."""
+        self.lines.append((round(x1, 1), round(y1, 1), round(x2, 1), round(y2, 1), kind))
 
 
 def draw_curve(
@@ -27,12 +52,11 @@ def draw_curve(
     across: str,
     is_logarithmic: bool = False,
     steps: Sequence[float] = (),
-) -> str:
-    """The `series` of points (x, y) as lines of an SVG with a legend; `across` says what x is.
+) -> Plot:
+    """The `series` of points (x, y) as lines with a legend; `across` says what x is.
 
-    Lines from top to bottom mark what changes at the `steps` of x.
-    With `is_logarithmic`, y > 0 is drawn by its logarithm. There must be at least one point; those
-    that are not finite are left out.
+    Lines from top to bottom mark what changes at the `steps` of x. With `is_logarithmic`, y > 0 is
+    drawn by its logarithm. Points that are not finite are left out.
     """
     # What is drawn: thinned, and by its logarithm where asked for.
     drawn = dict[str, list[Point]]()
@@ -42,57 +66,30 @@ def draw_curve(
             kept = [(x, math.log10(y)) for x, y in kept if y > 0]
         if kept:
             drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST_POINTS)], kept[-1]]
-    xs = [x for points in drawn.values() for x, _ in points] or [0.0]
-    ys = [y for points in drawn.values() for _, y in points] or [0.0]
-    left, right, across_at = _axis(xs, LEFT, WIDTH - RIGHT)
-    low, high, up_at = _axis(ys, HEIGHT - BOTTOM, TOP)
-    elements = [_text(LEFT, 16, title, "start")]
+    left, right, across_at = _axis([x for p in drawn.values() for x, _ in p], LEFT, WIDTH - RIGHT)
+    low, high, up_at = _axis([y for p in drawn.values() for _, y in p], HEIGHT - BOTTOM, TOP)
+    plot = Plot(title)
+    plot.write(LEFT, 16, title, "start")
     # A line across for every round value of y, a number below for every one of x.
     for value in (logarithmic_ticks if is_logarithmic else ticks)(low, high):
         y, label = up_at(value), f"{10**value if is_logarithmic else value:.4g}"
-        elements.append(_line(y, 0.2))
-        elements.append(_text(LEFT - 6, y + 4, label, "end"))
+        plot.draw(LEFT, y, WIDTH - RIGHT, y, "grid")
+        plot.write(LEFT - 6, y + 4, label, "end")
     for value in ticks(left, right):
-        elements.append(_text(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
+        plot.write(across_at(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle")
     for x in map(across_at, steps):
-        ends = f'x1="{x:.1f}" y1="{TOP}" x2="{x:.1f}" y2="{HEIGHT - BOTTOM}"'
-        elements.append(f'<line {ends} stroke="currentColor" stroke-dasharray="4 4"/>')
-    elements.append(_line(HEIGHT - BOTTOM, 0.7))
-    elements.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
+        plot.draw(x, TOP, x, HEIGHT - BOTTOM, "step")
+    plot.draw(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, "axis")
+    plot.write(WIDTH - RIGHT, HEIGHT - 6, across, "end")
     # The curves, and their names in the legend.
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
-        places = [(across_at(x), up_at(y)) for x, y in points]
+        places = [(round(across_at(x), 1), round(up_at(y), 1)) for x, y in points]
         # A line of one point goes from there to there.
-        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in (places if places[1:] else 2 * places))
-        style = f'fill="none" stroke="{color}" stroke-width="1.8" stroke-linecap="round"'
-        elements.append(f'<polyline points="{line}" {style}/>')
+        plot.curves.append((color, places if places[1:] else 2 * places))
         end = WIDTH - RIGHT - LEGEND * (len(drawn) - 1 - index)
-        elements.append(_text(end, 16, name, "end", color=color))
-    label = f'role="img" aria-label="{escape(title)}"'
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(elements)}</svg>'
-
-
-def draw_bars(rows: Sequence[tuple[str, float, float]]) -> str:
-    """An SVG of the `rows` of a name, a value and its deviation: a bar of one and a line of two.
-
-    All have one axis, so that values can be compared.
-    """
-    ends = [value + times * deviation for _, value, deviation in rows for times in (-2, 2)]
-    low, high, at = _axis(ends, WIDTH / 2, WIDTH - RIGHT)
-    bottom, elements = ROW * len(rows), list[str]()
-    for index, (name, value, deviation) in enumerate(rows):
-        y = ROW * (index + 0.5)
-        elements.append(_text(WIDTH / 2 - 10, y + 4, name, "end"))
-        for times, width in ((2, 1.2), (1, 6)):
-            x1, x2 = at(value - times * deviation), at(value + times * deviation)
-            place = f'x1="{x1:.1f}" y1="{y}" x2="{x2:.1f}" y2="{y}"'
-            elements.append(f'<line {place} stroke="{COLORS[0]}" stroke-width="{width}"/>')
-        elements.append(f'<circle cx="{at(value):.1f}" cy="{y}" r="3.5" fill="{COLORS[1]}"/>')
-    for tick in ticks(low, high):
-        elements.append(_text(at(tick), bottom + 14, f"{tick:.6g}", "middle"))
-    label = f'role="img" aria-label="{escape(", ".join(name for name, _, _ in rows))}"'
-    return f'<svg viewBox="0 0 {WIDTH} {bottom + 20}" {label}>{"".join(elements)}</svg>'
+        plot.write(end, 16, name, "end", color)
+    return plot
 
 
 def _axis(
@@ -100,9 +97,9 @@ def _axis(
 ) -> tuple[float, float, Callable[[float], float]]:
     """The least and the greatest of `values`, and where on an axis from `first` to `last` each is.
 
-    A range of one value is widened, so that it has a middle and ticks.
+    A range of one value is widened, so that it has a middle and ticks; that of none is 0.
     """
-    low, high = min(values), max(values)
+    low, high = min(values, default=0.0), max(values, default=0.0)
     more = max(0.0, 1e-9 * max(abs(low), abs(high), 1e-3) - (high - low) / 2)
     low, high = low - more, high + more
     return low, high, lambda value: first + (value - low) / (high - low) * (last - first)
@@ -129,14 +126,3 @@ def logarithmic_ticks(low: float, high: float) -> list[float]:
     values = [decade + math.log10(factor) for decade in decades[::every] for factor in factors]
     inside = [value for value in values if low - 1e-9 <= value <= high + 1e-9]
     return inside or ticks(low, high)
-
-
-def _line(y: float, opacity: float) -> str:
-    """A line across the plot."""
-    ends = f'x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"'
-    return f'<line {ends} stroke="currentColor" stroke-opacity="{opacity}"/>'
-
-
-def _text(x: float, y: float, text: str, anchor: str, color: str = "currentColor") -> str:
-    style = f'font-size="12.5" text-anchor="{anchor}" fill="{color}"'
-    return f'<text x="{x:.1f}" y="{y:.1f}" {style}>{escape(text)}</text>'

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from html import escape
 
-from ddrecon.io.images.table import png_of
 from ddrecon.medium.coefficients import Volume
-from ddrecon.report.page import page_text, picture
-from ddrecon.report.pictures import slices
-from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
+from ddrecon.report.page import page_text
+from ddrecon.report.volumes import Shown, describe_volume, find_white_value
 from ddrecon.scene import Scene
 from ddrecon.turntable import upright_axis
 
@@ -49,9 +47,8 @@ def show(shown: Scene | Volume) -> Drawn:
         Shown(name, "result", value, (width, height, depth), find_white_value(value))
         for name, value in fields.items()
     ]
-    still = "".join(picture(png_of(slices(value)), name) for name, value in fields.items())
-    viewer = volume_viewer(viewed, still, up, (x, y, z))
-    page = page_text("ddrecon", words, [viewer], is_alive=True, state='class="small"')
+    volume_section = describe_volume(viewed, up, (x, y, z))
+    page = page_text(title="ddrecon", lead=words, volume=volume_section, is_small=True)
     return Drawn(
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '
         f'style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'

@@ -17,8 +17,6 @@ BLUE, RED = (0.13, 0.30, 0.70), (0.70, 0.09, 0.13)
 """Ends of the diverging scale, as sRGB values."""
 GAP = 4
 """Pixels between pictures."""
-OPAQUE, BEHIND = 4.0, 0.03
-"""Optical depth of the densest line through a volume that is seen through, and what is behind."""
 
 
 def pixels(image: Tensor) -> np.ndarray:
@@ -71,25 +69,6 @@ def projections(field: Tensor) -> np.ndarray:
     means = [array.mean(axis) for axis in (0, 2, 1)]
     white = max(*(float(np.abs(side).max()) for side in means), 1e-6)
     return _three_sides([_show(side, white) for side in means])
-
-
-def see_through(density: Tensor, shares: Tensor) -> np.ndarray:
-    """A volume seen along z, x and y, placed as `slices` are: opaque by `density` [z, y, x] >= 0.
-
-    Its color is blue where `shares` [z, y, x] are 0, white at a half, and red from 1 on.
-    """
-    depth, share = (volume.detach().double().cpu().numpy() for volume in (density, shares))
-    colors, sides = diverge(2 * share - 1), list[np.ndarray]()
-    for axis in (0, 2, 1):
-        through = np.moveaxis(depth, axis, 0)
-        # Along z, the nearest cell comes last.
-        order = slice(None, None, -1 if axis == 0 else 1)
-        through, color = through[order], np.moveaxis(colors, axis, 0)[order]
-        through = through * (OPAQUE / max(float(through.sum(0).max()), 1e-30))
-        light = np.exp(-np.cumsum(through, 0))
-        seen = (np.concatenate([np.ones_like(light[:1]), light[:-1]]) - light)[..., None]
-        sides.append((seen * color).sum(0) + light[-1][..., None] * BEHIND)
-    return _three_sides(sides)
 
 
 def _show(values: np.ndarray, white: float) -> np.ndarray:

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import base64
 import gzip
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
+from ddrecon.io.images.table import png_of
 from ddrecon.pictures import srgb
-from ddrecon.report.pictures import diverge, find_high
+from ddrecon.report.pictures import diverge, find_high, projections, slices
 
 MOST_CELLS = 1_000_000
 """A field of more is made coarser, by whole factors."""
-CONTROLS = (
-    ("opacity", "opacity", -2, 10, 0.1),
-    ("low", "from", 0, 0.9, 0.01),
-    ("high", "to", 0.05, 1, 0.01),
-)
-"""Sliders of the transfer function: names, labels, ends and steps."""
-CHOICES = (
-    '<label>field <select id="field"></select></label><label>shown as <select id="palette">'
-    '<option value="0">lit smoke</option><option value="1">values</option></select></label>'
-)
-HINT = "<small>Drag or arrow keys turn; wheel, two fingers, + and - zoom.</small>"
 
 
 @dataclass(frozen=True)
@@ -52,41 +42,40 @@ def find_white_value(values: Tensor) -> float:
     return find_high(values.detach().abs().float().cpu().numpy())
 
 
-def volume_viewer(
-    fields: Sequence[Shown], still: str, up: int, towards_eye: tuple[float, float, float]
-) -> str:
-    """The `fields` to turn and to cut; `still` is what is shown where no scripts run.
+def describe_volume(
+    fields: Sequence[Shown],
+    up: int,
+    towards_eye: Sequence[float],
+    lines: Sequence[str] = (),
+    shown: str = "density",
+) -> dict[str, Any]:
+    """The section of a page with the `fields` to turn and to cut, and `lines` about them.
 
     `up` is the axis (0, 1, 2) that points up; `towards_eye` (x, y, z) is where the first camera
-    stands.
+    stands; `shown` is the name of the field that is shown at first. Where no scripts run, there are
+    pictures of the results.
     """
-    eye = " ".join(f"{component:.4g}" for component in towards_eye)
-    sliders = "".join(
-        f'<label>{label} <input type="range" id="{name}" min="{low}" max="{high}" step="{step}">'
-        "</label>"
-        for name, label, low, high, step in CONTROLS
-    )
-    slices = "".join(
-        f'<figure class="slice" data-axis="{axis}"><div class="both">'
-        f'<canvas data-of="result" role="img" aria-label="result, cut across {label}"></canvas>'
-        f'<canvas data-of="truth" role="img" aria-label="truth, cut across {label}"></canvas>'
-        '</div><input type="range" min="0" max="1" step="any" value="0.5"'
-        f' aria-label="place along {label}"><figcaption><output></output></figcaption></figure>'
-        for axis, label in enumerate("xyz")
-    )
-    return "\n".join(
-        [
-            f'<div class="still">{still}</div>',
-            f'<div class="lively"><div id="viewers" data-up="{up}" data-eye="{eye}"></div>',
-            f"{HINT}</div>",
-            f'<div class="controls lively">{CHOICES}{sliders}</div>',
-            f'<div class="slices lively">{slices}</div>',
-            *map(_data, fields),
-        ]
-    )
+    return {
+        "lines": lines,
+        "shown": shown,
+        "stills": [_describe_still(field) for field in fields if field.of == "result"],
+        "up": up,
+        "eye": " ".join(f"{component:.4g}" for component in towards_eye),
+        "fields": [_embed(field) for field in fields],
+    }
 
 
-def _data(field: Shown) -> str:
+def _describe_still(field: Shown) -> dict[str, Any]:
+    values = field.values.detach()
+    low, high = float(values.min()), float(values.max())
+    largest = f"(the largest value of a cell is {high:.4g})"
+    if low < 0:
+        largest = f"(values from {low:.4g} to {high:.4g})"
+    pictures = {"slices": png_of(slices(values)), "means": png_of(projections(values))}
+    return {"name": field.name, "largest": largest, **pictures}
+
+
+def _embed(field: Shown) -> dict[str, Any]:
     """`field` for the scripts: as displayed, 8 bits, x fastest; block means above `MOST_CELLS`."""
     values = field.values.detach().float()
     values = values if values.ndim == 4 else values[None]
@@ -97,7 +86,7 @@ def _data(field: Shown) -> str:
         cells = diverge(cells.mean(-1))
     packed = gzip.compress(srgb.encode_bytes(cells).tobytes(), mtime=0)
     longest = max(field.sides)
-    content = {
+    return {
         "name": field.name,
         "of": field.of,
         "size": list(values.shape[:0:-1]),
@@ -106,4 +95,3 @@ def _data(field: Shown) -> str:
         "channels": cells.shape[-1],
         "data": base64.b64encode(packed).decode("ascii"),
     }
-    return f'<script type="application/json" class="field">{json.dumps(content)}</script>'

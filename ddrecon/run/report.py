@@ -14,29 +14,15 @@ from typing import Any
 
 from torch import Tensor
 
-from ddrecon.io.images.table import png_of, webp_of
+from ddrecon.io.images.table import webp_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.report.curve import draw_curve
-from ddrecon.report.page import (
-    fold,
-    grid,
-    items,
-    pair,
-    paragraph,
-    picture,
-    section,
-    side_by_side,
-    table,
-    unfolded,
-    versions,
-    warnings,
-    write_page,
-)
-from ddrecon.report.pictures import find_white, pixels, projections, shrink, slices
-from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
+from ddrecon.report.curve import Plot, draw_curve
+from ddrecon.report.page import write_page
+from ddrecon.report.pictures import find_white, pixels, shrink
+from ddrecon.report.volumes import Shown, describe_volume, find_white_value
 from ddrecon.run.quality import Findings
 from ddrecon.run.registration import shift_between
 from ddrecon.scene import Scene, View
@@ -70,22 +56,23 @@ def write_run_report(
 
     `numbers` are those of `list_numbers`.
     """
-    scene, needs = findings.scene, "What this scene needed, and so was computed:"
-    settings = path.with_name("scene.yaml").read_text(encoding="utf-8")
-    diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
-    sections = [
-        *([warnings(diagnoses)] if diagnoses else []),
-        section("Volume", volume_section(findings, summary)),
-        section("Loss", side_by_side(*curves(rows)), *_explain_steps(rows)),
-        section("Views", *view_section(findings)),
-        *([section("Numbers found", table(["", "start", "found"], numbers))] if numbers else []),
-        section("Physics", paragraph(needs), items(needed_terms(scene))),
-        section("Settings", fold("scene.yaml, all defaults filled in", settings)),
-        section("Versions", versions(environment)),
-    ]
-    title = f"ddrecon: {path.absolute().parent.name}"
-    goes_on = summary["ended"]["kind"] == GOES_ON["kind"]
-    write_page(path, title, _lead(scene, summary), sections, is_alive=True, goes_on=goes_on)
+    scene = findings.scene
+    versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
+    found = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
+    write_page(
+        path,
+        title=f"ddrecon: {path.absolute().parent.name}",
+        lead=_lead(scene, summary),
+        goes_on=summary["ended"]["kind"] == GOES_ON["kind"],
+        doubts=[diagnosis["text"] for diagnosis in summary["diagnoses"]],
+        volume=describe_findings(findings, summary),
+        plots={"heading": "Loss", "drawn": curves(rows), "text": _explain_steps(rows)},
+        views=describe_views(findings),
+        numbers=found if numbers else None,
+        physics=needed_terms(scene),
+        settings=path.with_name("scene.yaml").read_text(encoding="utf-8"),
+        environment=[(name, " ".join(map(str, values))) for name, values in versions],
+    )
 
 
 def list_numbers(
@@ -126,50 +113,44 @@ def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
     )
 
 
-def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
+def describe_findings(findings: Findings, summary: Mapping[str, Any]) -> dict[str, Any]:
     """Every field that was found, and beside it what the scene file has in its place.
 
     And what of the volume the `summary` says was left out.
     """
-    scene = findings.scene
-    named = fields_of(scene)
-    both = (*named.items(), *findings.truths.items())
-    whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
+    left_out = list[str]()
+    if "support" in summary:
+        share = 100 * (1 - summary["support"]["cells"])
+        left_out = [f"Left out by the support: {share:.3g} % of the cells."]
+    kinds = {"result": fields_of(findings.scene), "truth": findings.truths}
+    return describe_fields(findings.scene, kinds, left_out)
+
+
+def describe_fields(
+    scene: Scene,
+    kinds: Mapping[str, Mapping[str, Tensor]],
+    lines: Sequence[str] = (),
+    shown: str = "density",
+) -> dict[str, Any]:
+    """The section of a page with fields on the grid of `scene`, by kind and name.
+
+    Those of one name have one scale.
+    """
     z, y, x = scene.volume.grid.extent
+    whites = dict[str, float]()
+    for name, value in ((n, v) for values in kinds.values() for n, v in values.items()):
+        whites[name] = max(whites.get(name, 0.0), find_white_value(value))
     fields = [
         Shown(name, of, value, (x, y, z), whites[name])
-        for of, values in (("result", named), ("truth", findings.truths))
+        for of, values in kinds.items()
         for name, value in values.items()
     ]
-    pose = scene.views[0].camera.pose
+    pose = scene.views[0].camera.pose.detach()
     towards = pose[:, 3] - pose.new_tensor(scene.volume.grid.center_xyz)
-    eye = towards.tolist()
-    still = _stills(named)
-    viewer = volume_viewer(fields, still, upright_axis(scene), (eye[0], eye[1], eye[2]))
-    if "support" not in summary:
-        return viewer
-    left_out = 100 * (1 - summary["support"]["cells"])
-    return f"{viewer}\n{paragraph(f'Left out by the support: {left_out:.3g} % of the cells.')}"
+    return describe_volume(fields, upright_axis(scene), towards.tolist(), lines, shown)
 
 
-def _stills(fields: dict[str, Tensor]) -> str:
-    blocks = [
-        paragraph(
-            "Across z, x and y from left to right; y, or z, is up. The largest value is white;"
-            " where some are below 0, these are blue, 0 is white, and above is red."
-        )
-    ]
-    for name, value in fields.items():
-        largest = f"(the largest value of a cell is {float(value.max()):.4g})"
-        if bool((value < 0).any()):
-            largest = f"(values from {float(value.min()):.4g} to {float(value.max()):.4g})"
-        cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
-        means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
-        blocks.append(side_by_side(cut, means))
-    return "\n".join(blocks)
-
-
-def curves(rows: Sequence[Row]) -> list[str]:
+def curves(rows: Sequence[Row]) -> list[Plot]:
     """Loss and PSNR by iteration."""
     losses = {
         "images": [(float(row.iteration), row.data_loss) for row in rows],
@@ -191,55 +172,45 @@ def _steps(rows: Sequence[Row]) -> list[Row]:
     return [row for previous, row in pairwise(rows) if row.cells != previous.cells]
 
 
-def _explain_steps(rows: Sequence[Row]) -> list[str]:
-    if not (steps := _steps(rows)):
-        return []
-    at = ", ".join(str(row.iteration) for row in steps)
-    return [
-        paragraph(f"A line from top to bottom: the cells are finer from there ({at}). {FINER}.")
-    ]
+def _explain_steps(rows: Sequence[Row]) -> str:
+    at = ", ".join(str(row.iteration) for row in _steps(rows))
+    return at and f"A line from top to bottom: the cells are finer from there ({at}). {FINER}."
 
 
-def view_section(findings: Findings) -> list[str]:
+def describe_views(findings: Findings) -> dict[str, Any]:
     """Target and render of the first views, those held out first, and a table of all."""
     views = [view for view in findings.scene.views if view.image is not None]
     shown = sorted(views, key=lambda view: not view.is_test)[:SHOWN]
     white = median(find_white(pixels(target_of(view))) for view in shown)
     most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
-    blocks = [
-        paragraph(
-            f"The picture on the left, its render on the right, as displayed (sRGB; radiance "
-            f"{white:.3g} is white). Move over a picture to shift the line between them; "
-            "'difference' shows what differs in them, four times enlarged around gray."
-        )
-    ]
-    for label, is_test in (("Held out", True), ("Trained on", False)):
-        group = [view for view in shown if view.is_test == is_test]
-        if group:
-            figures = [_figure(findings, view, white, most) for view in group]
-            blocks.append(unfolded(f"{label}: {len(group)}", grid(figures), is_open=True))
-    if len(views) > SHOWN:
-        blocks.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
-    return [*blocks, unfolded("All views", _view_table(findings), is_open=False)]
+    labels = {"Held out": True, "Trained on": False}
+    groups = {
+        label: [_figure(findings, v, white, most) for v in shown if v.is_test == is_test]
+        for label, is_test in labels.items()
+    }
+    return {
+        "white": f"{white:.3g}",
+        "groups": [(label, figures) for label, figures in groups.items() if figures],
+        "more": len(views) - len(shown),
+        "rows": [_describe_view(findings, view) for view in findings.scene.views],
+    }
 
 
-def _figure(findings: Findings, view: View, white: float, most: int) -> str:
+def _figure(findings: Findings, view: View, white: float, most: int) -> tuple[bytes, bytes, str]:
+    """Target, render and caption."""
     target, render = (
         webp_of(srgb.encode_bytes(pixels(shrink(image, most)) / white))
         for image in (target_of(view), findings.images[view.name])
     )
-    return pair(target, render, f"{view.name}: {_quality_text(findings.quality[view.name])}")
+    return target, render, f"{view.name}: {_quality_text(findings.quality[view.name])}"
 
 
-def _view_table(findings: Findings) -> str:
-    rows = []
-    for view in findings.scene.views:
-        height, width = view.camera.size
-        split = "test" if view.is_test else "train"
-        quality = findings.quality.get(view.name)
-        shown = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
-        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *shown))
-    return table(["view", "split", "pixels", "weight", "PSNR [dB]", "SSIM"], rows)
+def _describe_view(findings: Findings, view: View) -> tuple[str, ...]:
+    height, width = view.camera.size
+    split = "test" if view.is_test else "train"
+    quality = findings.quality.get(view.name)
+    shown = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+    return view.name, split, f"{width} x {height}", f"{view.weight:g}", *shown
 
 
 def _quality_text(quality: Mapping[str, Any]) -> str:

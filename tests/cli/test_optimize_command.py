@@ -175,7 +175,7 @@ def test_where_cells_get_finer_and_all_the_time_that_a_run_took_are_told(
         f"iteration {step}: 4,096 cells from here; PSNRs are of pictures as coarse" in told.stderr
     )
     page = Path("one/report.html").read_text()
-    assert page.count("stroke-dasharray") == 2 and f"finer from there ({step})" in page
+    assert page.count('class="step"') == 2 and f"finer from there ({step})" in page
     of_all, of_iterations = (
         float(re.search(words, told.stdout).group(1))
         for words in (r"and (\S+) s with all", r"iterations in (\S+) s")

@@ -9,6 +9,7 @@ import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,23 +20,14 @@ import ddrecon
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.report import volumes
-from ddrecon.report.curve import draw_curve
-from ddrecon.report.page import (
-    fold,
-    items,
-    paragraph,
-    picture,
-    section,
-    side_by_side,
-    table,
-    write_page,
-)
+from ddrecon.report.curve import Plot, draw_curve
+from ddrecon.report.page import page_text, write_page
 from ddrecon.report.pictures import slices
-from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
+from ddrecon.report.volumes import Shown, describe_volume, find_white_value
 from ddrecon.run.report import curves
 
 NASTY = '<script>alert("&")</script>'
-VOID = {"meta", "img"}
+VOID = {"meta", "img", "input"}
 
 
 class Balance(HTMLParser):
@@ -60,30 +52,51 @@ class Balance(HTMLParser):
         self.text.append(data)
 
 
-def test_a_page_is_whole_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    parts = [paragraph(NASTY), items([NASTY]), table([NASTY], [[NASTY]]), fold(NASTY, NASTY)]
-    parts += [picture(b"PNG", NASTY), draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
-    write_page(tmp_path / "report.html", NASTY, NASTY, [section(NASTY, side_by_side(*parts))])
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    reader = Balance()
-    reader.feed(text)
-    assert reader.open == [] and "<script>" not in text
-    assert sum(NASTY in piece for piece in reader.text) == 14
+@pytest.fixture
+def facts() -> dict[str, Any]:
+    """A page of every section, whose texts are `NASTY`."""
+    shown = Shown(NASTY, "result", torch.ones(1, 1, 1), (1.0, 1.0, 1.0), 1.0)
+    plots = [draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
+    table = {"heading": NASTY, "head": [NASTY], "rows": [[NASTY]], "text": NASTY}
+    return {
+        "title": NASTY,
+        "lead": NASTY,
+        "goes_on": True,
+        "doubts": [NASTY],
+        "volume": describe_volume([shown], 1, (0.0, 0.0, 1.0), [NASTY], NASTY),
+        "plots": {"heading": NASTY, "drawn": plots, "text": NASTY},
+        "views": {"groups": [(NASTY, [(b"target", b"render", NASTY)])], "rows": [[NASTY]]},
+        "frames": [[(b"\x89PNG...", NASTY)]],
+        "numbers": table,
+        "physics": [NASTY],
+        "settings": NASTY,
+        "environment": [(NASTY, NASTY)],
+    }
 
 
-def test_a_page_names_no_other_file(tmp_path: Path) -> None:
-    write_page(tmp_path / "report.html", "a", "b", [picture(b"\x89PNG...", "c")])
+def test_a_page_is_whole_and_escapes_what_it_is_told(facts: dict[str, Any]) -> None:
+    for name in facts.keys() - {"goes_on"}:
+        reader, text = Balance(), page_text(**{"title": "", "lead": "", name: facts[name]})
+        reader.feed(text)
+        assert reader.open == [] and NASTY not in text
+        assert any(NASTY in piece for piece in reader.text), name
+    reader.feed(page_text(**facts))
+    assert reader.open == []
+
+
+def test_a_page_names_no_other_file(tmp_path: Path, facts: dict[str, Any]) -> None:
+    write_page(tmp_path / "report.html", **facts)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    sources = re.findall(r'(?:src|href)="([^"]*)"', text)
-    (data,) = (source.removeprefix("data:image/png;base64,") for source in sources)
-    assert base64.b64decode(data) == b"\x89PNG..."
+    addresses = re.findall(r'(?:src|href|url)[=(]"([^"]*)"', text)
+    assert {address.partition(":")[0] for address in addresses} == {"data"}
+    data = [address.partition("base64,")[2] for address in addresses if "/png;" in address]
+    assert b"\x89PNG..." in map(base64.b64decode, data)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
-def places(svg: str) -> list[list[tuple[float, float]]]:
+def places(plot: Plot) -> list[list[tuple[float, float]]]:
     """The points of every line."""
-    lines = re.findall(r'<polyline points="([^"]*)"', svg)
-    return [[tuple(map(float, pair.split(","))) for pair in line.split()] for line in lines]
+    return [points for _, points in plot.curves]
 
 
 def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
@@ -100,9 +113,9 @@ def test_what_cannot_be_drawn_is_left_out() -> None:
     (line,) = places(draw_curve("a", {"": points}, "x", is_logarithmic=True))
     assert len(line) == 2
     stepped = draw_curve("a", {"": [(0.0, 1.0), (2.0, 3.0), (8.0, 1.0)]}, "x", steps=[2.0])
-    (at,) = re.findall(r'<line x1="([\d.]+)" [^>]*dasharray', stepped)
-    assert float(at) == places(stepped)[0][1][0]
-    assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
+    (at,) = (x for x, *_, kind in stepped.lines if kind == "step")
+    assert at == places(stepped)[0][1][0]
+    assert not draw_curve("a", {"": [(0.0, math.nan)]}, "x").curves
 
 
 def test_each_curve_of_a_run_is_what_its_name_says() -> None:
@@ -111,20 +124,17 @@ def test_each_curve_of_a_run_is_what_its_name_says() -> None:
         Row(i, 0.0, 9.0, 3.0 * i, 2.0 * i, 0, 0, 8, data_loss=10.0 ** (-i), penalty=10.0 ** (i / 4))
         for i in range(5)
     ]
-    for svg, (one, other), ratio in zip(
+    for plot, (one, other), ratio in zip(
         curves(rows), [("images", "penalties"), ("trained on", "held out")], (-4, 1.5), strict=True
     ):
-        colors = re.findall(r'<polyline [^>]*stroke="([^"]*)"', svg)
-        slopes = dict(zip(colors, (line[-1][1] - line[0][1] for line in places(svg)), strict=True))
-        names = {name: color for color, name in re.findall(r'fill="([^"]*)"[^>]*>([^<]*)<', svg)}
+        slopes = {color: points[-1][1] - points[0][1] for color, points in plot.curves}
+        names = {name: color for *_, color, name in plot.texts}
         assert slopes[names[one]] / slopes[names[other]] == pytest.approx(ratio, rel=0.01)
 
 
 def embedded(*fields: Shown) -> list[dict]:
     """The fields in a page, decoded as its scripts do: [z, y, x, channels]."""
-    text = volume_viewer(fields, "", 1, (0.0, 0.0, 1.0))
-    found = re.findall(r'<script type="application/json" class="field">(.*?)</script>', text)
-    contents = [json.loads(content) for content in found]
+    contents = describe_volume(fields, 1, (0.0, 0.0, 1.0))["fields"]
     for content in contents:
         data = gzip.decompress(base64.b64decode(content["data"]))
         shape = [*content["size"][::-1], content["channels"]]
@@ -168,7 +178,7 @@ def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
 
 
 def test_what_is_drawn_has_a_name_and_a_role() -> None:
-    page = volume_viewer([], "", 1, (0.0, 0.0, 1.0))
+    page = page_text(volume=describe_volume([], 1, (0.0, 0.0, 1.0)))
     canvases = re.findall("<canvas[^>]*>", page)
     assert len(canvases) == 6
     assert all('role="img"' in one and 'aria-label="' in one for one in canvases)

@@ -1,7 +1,7 @@
 // Makes the page alive: whatever is missing here, or refused by the browser, leaves its pictures.
 "use strict";
 
-let shownField = "density";
+let shownField;
 
 function fillControls() {
   const select = document.querySelector("#field");
@@ -43,6 +43,8 @@ async function makeAlive() {
   if (!room || !window.DecompressionStream || !(await readFields())) return;
   const kinds = [...new Set([...fields.values()].map((field) => field.of))];
   document.body.classList.add("alive");
+  shownField = room.dataset.shown;
+  sight.palette = shownField === "density" ? 0 : 1;
   lookFrom(room.dataset.eye, Number(room.dataset.up));
   for (const kind of kinds) {
     const figure = document.createElement("figure");
