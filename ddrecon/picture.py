@@ -35,6 +35,19 @@ class Components:
     multiple: Tensor
 
 
+@dataclass(frozen=True)
+class Matte:
+    """How an image lies over another one, `image + transmittance * other`.
+
+    `transmittance` [3, h, w] is the part of light from behind that comes through the medium, and of
+    a ground 0. `depth` [h, w] is how far [u] along the camera's axis that light is lost, in the
+    mean; infinite where none is.
+    """
+
+    transmittance: Tensor
+    depth: Tensor
+
+
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
     """Pictures `[views, 3, h, w]` (linear) of all views, or of the one named `view`.
 
@@ -111,6 +124,34 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     single = view_image(lit, _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
     return Components(reduced, single, image - reduced - single)
+
+
+def view_matte(light_field: LightField, scene: Scene, camera: Camera) -> Matte:
+    """The matte of `camera`; `light_field` must be that of `scene`.
+
+    Light scattered forward counts as coming through where the image sees the delta-Eddington scaled
+    medium.
+    """
+    medium, ground = light_field.medium, light_field.ground
+    dark = replace(_without_diffuse(_without_glow(light_field)), beams=(), at_faces=None)
+    if ground is not None:
+        unlit = torch.zeros_like(ground.even), torch.zeros_like(ground.texels)
+        dark = replace(dark, ground=replace(ground, lights=(), even=unlit[0], texels=unlit[1]))
+    white = camera.pose.new_ones(3, 1, 1)
+    transmittance = _collect(dark, scene, camera, white)
+    # A medium that emits as much as it extinguishes is seen by weights whose sum is 1 - T.
+    _, _, backward, eye = camera.pose.unbind(1)
+    centers = medium.grid.centers(eye.flip(0))
+    away = sum(-(c - e) * b for c, e, b in zip(centers, eye.flip(0), backward.flip(0), strict=True))
+    extinction = medium.extinction.value.mean(0, keepdim=True)
+    dark = replace(dark, ground=None)
+    weight, moment = (
+        _collect(replace(dark, medium=replace(medium, emission=emission)), scene, camera, 0 * white)
+        for emission in (extinction, extinction * away)
+    )
+    # Rays that touch next to nothing have a quotient of roundings.
+    depth = (moment / weight).clamp(away.min(), away.max())
+    return Matte(transmittance, torch.where(weight > 0, depth, torch.inf)[0])
 
 
 def _without_background(scene: Scene) -> Scene:

@@ -6,6 +6,7 @@ scene file, are shown at once.
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from ddrecon.scene_file.load import SceneFile
 
 
+MOST_SIDE = 2**15
+"""Pixels along a side, at most."""
 EXPORTED = click.Choice(["vdb", "npz"])
 
 
@@ -84,7 +87,8 @@ def balance(session: Session, scene: Path) -> None:
 @click.option(
     "--components",
     is_flag=True,
-    help="Also write reduced, single and multiple radiance, which sum to the image.",
+    help="Also write reduced, single and multiple radiance, transmittance and depth; the .exr has"
+    " them all, and alpha, as layers.",
 )
 @click.option(
     "--gradient",
@@ -104,7 +108,32 @@ def balance(session: Session, scene: Path) -> None:
     "count",
     type=click.IntRange(min=2),
     metavar="N",
-    help="N views around the volume instead, and ring.png of them.",
+    help="N views around the volume instead, and a movie of them, ring.png or --movie.",
+)
+@click.option(
+    "--cameras",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The cameras of a transforms.json instead; its pictures need not be there.",
+)
+@click.option(
+    "--size",
+    type=(click.IntRange(1, MOST_SIDE), click.IntRange(1, MOST_SIDE)),
+    metavar="W H",
+    help="Pixels across and down instead, of the same width of view.",
+)
+@click.option(
+    "--movie",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="And a movie of all views in their order, .mp4 or .png, at one exposure.",
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(1, 240),
+    default=24.0,
+    show_default=True,
+    help="Its pictures a second.",
 )
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
 @click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
@@ -125,6 +154,10 @@ def render(
     choice = _Choice(is_relit=bool(lights), overwrite=overwrite, **options)
     if choice.exported and not choice.has_fluence:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
+    if choice.cameras is not None:
+        typed, path = f"--cameras {choice.cameras}", json.dumps(str(choice.cameras))
+        session = session.with_override(f"views={{transforms: {path}}}", typed)
+        session = session.with_override("optimize=", typed)
     if lights:
         typed = " ".join(f"--light {light}" for light in lights)
         session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
@@ -160,6 +193,10 @@ class _Choice:
     components: bool
     parameter: str | None
     count: int | None
+    cameras: Path | None
+    size: tuple[int, int] | None
+    movie: Path | None
+    fps: float
     has_fluence: bool
     exported: str | None
 
@@ -185,17 +222,21 @@ def _choose_views(
     session: Session, scene_file: SceneFile, choice: _Choice
 ) -> tuple[Scene, list[View]]:
     """The scene that is rendered, and its views that are."""
-    from ddrecon.run.render_folder import remove_targets, require_variation
+    from ddrecon.run.render_folder import remove_targets, require_movie, require_variation
+    from ddrecon.scene_file.build_views import remove_pictures
 
-    loaded = session.build(scene_file)
+    is_moved = choice.cameras is not None or choice.size is not None
+    loaded = session.build(remove_pictures(scene_file, choice.size) if is_moved else scene_file)
     if choice.has_fluence and not _are_rounds_said(session, scene_file):
         # light in empty cells, which views do not see, takes a second one
         rounds = loaded.diffusion.rounds
         loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
     views = [loaded.view(name) for name in dict.fromkeys(choice.names)] or loaded.views
-    if choice.is_relit or choice.count is not None:
+    if choice.is_relit or is_moved or choice.count is not None:
         loaded = remove_targets(loaded, views, choice.count)
         views = list(loaded.views)
+    if choice.movie is not None:
+        require_movie(choice.movie, views)
     if choice.parameter is not None:
         require_variation(loaded, choice.parameter)
     return loaded, views
@@ -206,7 +247,7 @@ def _render_views(
 ) -> tuple[dict[str, Any], list[str]]:
     from ddrecon.io.files.atomic import write_json
     from ddrecon.ranks import is_first
-    from ddrecon.run.render_folder import render_lines, render_to_folder, write_ring
+    from ddrecon.run.render_folder import render_lines, render_to_folder, write_movie
 
     kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
     progress, parameter = session.progress, choice.parameter
@@ -215,8 +256,9 @@ def _render_views(
     )
     if not is_first():
         return {}, []
-    if choice.count is not None:
-        report["ring"] = write_ring(views, output)
+    movie = choice.movie or (output / "ring.png" if choice.count is not None else None)
+    if movie is not None:
+        report |= write_movie(views, output, movie, choice.fps)
     write_json(output / "render.json", report)
     return report, render_lines(report, output, session.quiet)
 

@@ -25,6 +25,8 @@ from ddrecon.run.run_folder import REPORT, SUMMARY
 RECORD, MOVIE = "film.json", "movie.png"
 KEYS = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
 """Entries of a run's summary that a film's record keeps of each frame."""
+SECONDS = 4.0
+"""How long its movie takes."""
 SHOWN = 48
 """Frames whose pictures are on the page; all are in their folders."""
 WIDEST = 768
@@ -101,7 +103,8 @@ def _figures(
             ]
         )
         if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
-            write_animation(film.path / MOVIE, strips, 1.0)
+            frames = [srgb.encode_bytes(strip) for strip in strips]
+            write_animation(film.path / MOVIE, frames, len(frames) / SECONDS)
     return figures
 
 

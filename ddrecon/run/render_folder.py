@@ -8,6 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
@@ -15,12 +16,22 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
-from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
+from ddrecon.io.images.films import write_film
+from ddrecon.io.images.table import (
+    NO_LAYERS,
+    PREVIEW,
+    read_image,
+    write_animation,
+    write_array,
+    write_picture,
+    write_preview,
+)
 from ddrecon.light_field import LightField, fluence_of
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.medium.levels import resample
-from ddrecon.picture import view_components, view_picture
+from ddrecon.picture import view_components, view_matte, view_picture
+from ddrecon.pictures import srgb
 from ddrecon.progress import Progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
@@ -38,6 +49,9 @@ AT_REST = 0.01
 FEW = 12
 """Where there are more views, only the first and the last are printed."""
 COMPONENTS = (".reduced", ".single", ".multiple")
+MATTE = (".transmittance", ".depth")
+MOVIES = {".mp4": write_film, ".png": write_animation}
+"""What writes movies, by their suffixes."""
 
 
 def render_to_folder(
@@ -60,19 +74,23 @@ def render_to_folder(
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
         fluence_files = _write_fluence(light_field, scene, folder, kinds) if kinds else []
-        names = ["", *(COMPONENTS if has_components else ())]
+        parts = ["", *(COMPONENTS if has_components else ())]
+        names = [*parts, *(MATTE if has_components else ())]
         if parameter is not None:
-            names = [kind + name for name in names for kind in ("", GRADIENT)]
+            names += [GRADIENT + part for part in parts]
         for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
             seconds[view.name], files[view.name] = taken, []
-            for name, image in images.items():
-                called, picture = view.name + name, None
-                if name.startswith(GRADIENT):
-                    picture, scales[called] = diverging(image)
-                written = write_picture(folder / called, pixels(image), picture)
-                files[view.name] += [path.name for path in written]
+            stem, pictures = folder / view.name, dict(images)
+            if parameter is not None:
+                slopes = {part: pictures.pop(GRADIENT + part) for part in parts}
+                stem_of_slopes = stem.with_name(stem.name + GRADIENT)
+                shown = {part: diverging(slope) for part, slope in slopes.items()}
+                scales |= {stem_of_slopes.name + part: full for part, (_, full) in shown.items()}
+                previews = {part: preview for part, (preview, _) in shown.items()}
+                files[view.name] += _write_images(stem_of_slopes, slopes, previews)
+            files[view.name][:0] = _write_images(stem, pictures)
             if view.image is not None:
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
@@ -99,6 +117,30 @@ def render_to_folder(
     return report
 
 
+def _write_images(
+    stem: Path, images: Mapping[str, Tensor], previews: Mapping[str, np.ndarray] = NO_LAYERS
+) -> list[str]:
+    """The names of files of the image called "" and of its parts, which are layers of one .exr.
+
+    By itself each part is an array and, but for the depth, a preview, where `previews` has none.
+    """
+    arrays, layers, written = {part: pixels(i) for part, i in images.items()}, {}, list[Path]()
+    picture = arrays.pop("")
+    if MATTE[0] in arrays:
+        arrays[MATTE[1]] = arrays[MATTE[1]][..., 0]
+        layers = {"A": 1 - arrays[MATTE[0]].mean(-1), "Z": arrays[MATTE[1]]}
+    layers |= {part[1:]: array for part, array in arrays.items() if array.ndim == 3}
+    for part, array in arrays.items():
+        path = stem.with_name(f"{stem.name}{part}.npy")
+        write_array(path, array)
+        written.append(path)
+        if array.ndim == 3:
+            written.append(path.with_suffix(".png"))
+            write_preview(written[-1], previews.get(part, array))
+    written = write_picture(stem, picture, previews.get(""), layers) + written
+    return [path.name for path in written]
+
+
 def _write_fluence(
     light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
 ) -> list[str]:
@@ -114,12 +156,27 @@ def _write_fluence(
     return [f"{stem.parent.name}/{name}" for name in names]
 
 
-def write_ring(views: list[View], folder: Path) -> dict[str, Any]:
-    """What the report says of the movie `ring.png` of all `views` in `folder`."""
+def require_movie(path: Path, views: Sequence[View]) -> None:
+    """Raises UsageError unless `views` can be the frames of a movie at `path`."""
+    if path.suffix.lower() not in MOVIES:
+        raise UsageError(f"--movie {path}: expected a name that ends in {' or '.join(MOVIES)}")
+    if len({view.camera.size for view in views}) > 1:
+        raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
+
+
+def write_movie(views: list[View], folder: Path, path: Path, fps: float) -> dict[str, Any]:
+    """What the report says of the movie at `path` of all `views` in `folder`.
+
+    Its exposure is that of all previews from now on: the brightest view is just white.
+    """
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
-    write_animation(folder / "ring.png", images, white)
-    return {"files": ["ring.png"], "white": white}
+    shown = [image / white for image in images]
+    MOVIES[path.suffix.lower()](path, [srgb.encode_bytes(image) for image in shown], fps)
+    for view, image in zip(views, shown, strict=True):
+        write_preview(folder / f"{view.name}.png", image)
+    preview = f"sRGB of linear radiance: {white:.6g} and more is white"
+    return {"movie": {"file": str(path), "white": white}, "preview": preview}
 
 
 def remove_targets(scene: Scene, views: list[View], count: int | None) -> Scene:
@@ -165,9 +222,8 @@ def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[s
         lines.append(rounds_text(**report["rounds"]))
     if "fluence" in report:
         lines.append(f"fluence: {', '.join(report['fluence'])}")
-    if "ring" in report:
-        files, white = ", ".join(report["ring"]["files"]), report["ring"]["white"]
-        lines.append(f"around: {files} (radiance {white:.3g} is white)")
+    if "movie" in report:
+        lines.append("movie: {file} (radiance {white:.3g} is white)".format(**report["movie"]))
     return [*lines, f"written to {folder}"]
 
 
@@ -197,8 +253,10 @@ def _images(
         gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
         single, multiple = gain * components.single, gain * components.multiple
         reduced = picture - single - multiple
-        radiances = reduced + single + multiple, reduced, single, multiple
-        images = dict(zip(("", *COMPONENTS), radiances, strict=True))
+        matte = view_matte(light_field, scene, view.camera)
+        depth = matte.depth.expand_as(picture)
+        shown = reduced + single + multiple, reduced, single, multiple, matte.transmittance, depth
+        images = dict(zip(("", *COMPONENTS, *MATTE), shown, strict=True))
     pairs = {name: forward_ad.unpack_dual(image) for name, image in images.items()}
     plain = {name: pair.primal for name, pair in pairs.items()}
     derived = {

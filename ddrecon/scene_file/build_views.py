@@ -28,7 +28,7 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.load import SceneFile, require
 from ddrecon.scene_file.maker import Maker
-from ddrecon.scene_file.view_schema import CameraSection, PerspectiveSection
+from ddrecon.scene_file.view_schema import CameraSection, PerspectiveSection, ViewSection
 
 READERS: Mapping[str, Callable[[Path, int, float], Image]] = {
     "image": read_image,
@@ -65,6 +65,22 @@ def build_views(maker: Maker, grid: Grid | None) -> list[View]:
         problems.note(maker.scene_file.refused(f"views.{index}.camera", fault))
     problems.raise_any()
     return views
+
+
+def remove_pictures(scene_file: SceneFile, size: tuple[int, int] | None) -> SceneFile:
+    """`scene_file` with views that have no pictures, of this `size` (width, height) where given.
+
+    Raises SceneError where the size of one is not known without.
+    """
+    views = list[ViewSection]()
+    for index, view in enumerate(scene_file.tree.views):
+        camera = view.camera
+        if size is None and camera.resolution is None:
+            fault = "has no resolution but that of its picture; give one by --size W H"
+            raise scene_file.refused(f"views.{index}.camera", fault)
+        camera = replace(camera, resolution=size or camera.resolution)
+        views.append(ViewSection(name=view.name, camera=camera, split=view.split))
+    return replace(scene_file, tree=replace(scene_file.tree, views=tuple(views)))
 
 
 def _build_view(maker: Maker, index: int) -> View:

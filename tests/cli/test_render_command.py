@@ -11,6 +11,7 @@ from click.testing import Result
 from small_scene import contents
 
 import ddrecon
+from ddrecon.io.images.films import frame_times, read_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 
@@ -61,6 +62,34 @@ def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
         assert all(
             Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple")
         )
+
+
+def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
+    """Image + transmittance times what is behind is the image of a view before it."""
+    module = pytest.importorskip("OpenImageIO")
+    black = ["-D", "render.background=false", "--view", "front"]
+    succeed(*RENDER, *ROUND, *black, "--components")
+    file = module.ImageInput.open("out/front.exr")
+    names, values = file.spec().channelnames, file.read_image("float")
+    layers = dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
+    file.close()
+
+    def colors(name: str) -> np.ndarray:
+        return np.stack([layers[f"{name}{color}"] for color in "RGB"], -1)
+
+    through, image = colors("transmittance."), colors("")
+    assert np.array_equal(image, sum(map(colors, ("reduced.", "single.", "multiple."))))
+    assert np.allclose(layers["A"], 1 - through.mean(-1), atol=1e-6) and layers["A"].max() > 0.1
+    depth, is_seen = layers["Z"], layers["A"] > 1e-3
+    assert np.array_equal(depth, pixels("front.depth")) and np.isfinite(depth[is_seen]).all()
+    camera = ddrecon.load_scene("scene.yaml").view("front").camera
+    away = -float(camera.pose[:, 2] @ -camera.pose[:, 3])
+    assert np.abs(depth[is_seen] - away).max() < 0.5  # half of the box's side
+    target = read_image(Path("front.npy")).pixels
+    behind = np.full_like(target, 0.5)
+    np.save("behind.npy", behind)
+    succeed(*RENDER, *ROUND, *black, "--overwrite", "-D", "views.0.background=behind.npy")
+    np.testing.assert_allclose(pixels("front"), image + through * behind, rtol=1e-5)
 
 
 def test_the_report(succeed: Run) -> None:
@@ -175,14 +204,14 @@ def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
     said = succeed(*RENDER, "--ring", "5", "--view", "front").stdout
     report = json.loads(Path("out/render.json").read_text())
     movie = iio.imread("out/ring.png", index=..., plugin="pillow")[..., :3]
-    assert "around: ring.png" in said and "ring_004: " in said
+    assert "movie: out/ring.png" in said and "ring_004: " in said
     assert "... 3 views between them, in render.json" in said and "ring_003: " not in said
-    assert report["ring"]["files"] == ["ring.png"]
+    assert report["movie"]["file"] == "out/ring.png"
     assert report["psnr"] == {}
     assert list(report["files"]) == [f"ring_{index:03d}" for index in range(5)]
     for frame, name in zip(movie, report["files"], strict=True):
         assert (
-            np.abs(frame - encoded(pixels(name).astype(float) / report["ring"]["white"])).max() <= 1
+            np.abs(frame - encoded(pixels(name).astype(float) / report["movie"]["white"])).max() <= 1
         )
     succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front")
     assert np.allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
@@ -208,3 +237,47 @@ def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
     assert report["psnr"] == {
         name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()
     }
+
+
+def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> None:
+    scene = ddrecon.load_scene("scene.yaml")
+    frames = [
+        {"transform_matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]], "file_path": f"no_{n}.png"}
+        for n, view in enumerate(scene.views)
+    ]
+    width = float(scene.views[0].camera.half_width)
+    angle = {"camera_angle_x": 2 * float(np.arctan(width))}
+    Path("path.json").write_text(json.dumps({**angle, "frames": frames}))
+    succeed(*RENDER, "--cameras", "path.json", "--size", "8", "6")
+    named = pixels("no_0")
+    succeed(*RENDER, "--overwrite")
+    np.testing.assert_allclose(named, pixels("front"), rtol=1e-4)
+
+
+def test_a_size_keeps_the_width_of_view(succeed: Run) -> None:
+    """The mean of twice as many pixels is near the picture of few, and a taller one goes on."""
+    succeed(*RENDER, "--view", "front", "--size", "80", "60")
+    fine = pixels("front")
+    succeed(*RENDER, "--overwrite", "--view", "front", "--size", "80", "100")
+    taller = pixels("front")
+    assert np.allclose(taller[20:80], fine, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("suffix", ["png", "mp4"])
+def test_a_movie_has_the_exposure_of_its_previews(succeed: Run, suffix: str) -> None:
+    import imageio.v3 as iio
+
+    pytest.importorskip("imageio_ffmpeg")
+    succeed(*RENDER, "--ring", "3", "--size", "33", "21", "--movie", f"m.{suffix}", "--fps", "12")
+    if suffix == "mp4":
+        times = frame_times(Path("m.mp4"))
+        frames = [read_frame(Path("m.mp4"), number)[:21, :33] for number in range(3)]
+        assert times == pytest.approx([0, 1 / 12, 2 / 12])
+    else:
+        frames = [*iio.imread("m.png", index=..., plugin="pillow")[..., :3]]
+    previews = [iio.imread(f"out/ring_{number:03d}.png") for number in range(3)]
+    for frame, preview in zip(frames, previews, strict=True):
+        assert np.abs(frame.astype(float) - preview).mean() < (3 if suffix == "mp4" else 0.01)
+    white = json.loads(Path("out/render.json").read_text())["movie"]["white"]
+    for number, preview in enumerate(previews):
+        assert np.abs(preview - encoded(pixels(f"ring_{number:03d}") / white)).max() <= 1

@@ -59,6 +59,36 @@ def nearest_frame(times: Sequence[float], time: float) -> int:
     return min(range(len(times)), key=lambda index: abs(times[index] - time))
 
 
+def write_film(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Writes `frames`, uint8 [h, w, 3] of sRGB, to `path` (.mp4) as H.264 of `fps` a second.
+
+    It is BT.709 with colors of half resolution, which players take; odd sides get a line more.
+    Raises FormatError without ffmpeg.
+    """
+    import numpy as np
+
+    from ddrecon.io.files.atomic import replace_file
+
+    height, width = frames[0].shape[:2]
+    to_yuv = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-crf", "16"]
+    tags = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
+    write = load_for_file("imageio_ffmpeg", path).write_frames
+    with replace_file(path) as temporary:
+        stream = write(
+            temporary,
+            (width + width % 2, height + height % 2),
+            fps=fps,
+            quality=None,
+            macro_block_size=1,
+            output_params=[*to_yuv, *tags, "-color_range", "tv", "-f", "mp4"],
+        )
+        stream.send(None)
+        for frame in frames:
+            padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+            stream.send(np.ascontiguousarray(padded))
+        stream.close()
+
+
 def _decode(path: Path, start: float, low: float, high: float) -> np.ndarray | None:
     """The frame shown between `low` and `high` [s], where decoding from `start` on comes by it."""
     # here, as scene files know suffixes without NumPy

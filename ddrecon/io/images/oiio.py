@@ -6,7 +6,7 @@ All but PNG are linear, and multiplied by their alpha: that of EXR is so by conv
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -121,10 +121,14 @@ def read_tiff(path: Path) -> np.ndarray:
     return pixels[..., 0] if len(channels) == 1 else pixels
 
 
-def write_exr(path: Path, pixels: np.ndarray) -> None:
-    """Writes `pixels` [h, w, 3] as float32 RGB; raises FormatError without OpenImageIO."""
+def write_exr(path: Path, pixels: np.ndarray, names: Sequence[str] = "RGB") -> None:
+    """Writes `pixels` [h, w, channels] as float32, whose channels have these `names`.
+
+    Raises FormatError without OpenImageIO.
+    """
     module = load_for_file(PACKAGE, path)
     spec = module.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
+    spec.channelnames = tuple(names)
     spec.attribute("compression", "zip")
     with replace_file(path) as temporary:
         file = module.ImageOutput.create(str(temporary))

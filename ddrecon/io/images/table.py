@@ -7,10 +7,11 @@ alpha: a pixel of alpha 0 is empty: black. Previews have exposure 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -44,13 +45,14 @@ BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"W
 
 Pillow alone would go by content whatever the suffix, and run Ghostscript on PostScript.
 """
-SECONDS = 4.0
-"""How long a movie takes from its first frame back to it."""
 COLORS = ("LA", "RGB", "RGBA")
 MODES = ("1", "L", "P", "I", "I;16", *COLORS)
 """Pillow's modes that are read: in PNG, I is 16 bits."""
 SPREAD = {"1": 255, "L;2": 85, "L;4": 17}
 """Factors by which Pillow scales samples of few bits to 8; it may forget the transparent one."""
+
+
+NO_LAYERS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,18 +143,29 @@ def _image_of(path: Path, values: np.ndarray, step: float = 0.0) -> Image:
     return Image(pixels, coverage, step)
 
 
-def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
+def write_linear(
+    stem: Path, pixels: np.ndarray, layers: Mapping[str, np.ndarray] = NO_LAYERS
+) -> list[Path]:
     """Writes `pixels` [h, w, 3] as float32 to `stem`.exr and `stem`.npy; returns these paths.
 
-    Where OpenImageIO is not installed, there is no .exr.
+    The .exr has `layers` as well: [h, w], as the channel of their name, or [h, w, 3], as NAME.R,
+    NAME.G and NAME.B. Where OpenImageIO is not installed, there is no .exr.
     """
     picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
-    with replace_file(array) as temporary:
-        np.save(temporary, as_float32(pixels), allow_pickle=False)
+    write_array(array, pixels)
     if find_spec(PACKAGE) is None:
         return [array]
-    write_exr(picture, pixels)
+    names = [*"RGB"]
+    for name, layer in layers.items():
+        names += [name] if layer.ndim == 2 else [f"{name}.{color}" for color in "RGB"]
+    write_exr(picture, np.dstack([pixels, *layers.values()]), names)
     return [picture, array]
+
+
+def write_array(path: Path, pixels: np.ndarray) -> None:
+    """Writes `pixels` as float32 to `path`, which ends in .npy."""
+    with replace_file(path) as temporary:
+        np.save(temporary, as_float32(pixels), allow_pickle=False)
 
 
 def encode(pixels: np.ndarray, extension: str, **settings: Any) -> bytes:
@@ -167,12 +180,11 @@ def webp_of(image: np.ndarray) -> bytes:
     return encode(image, ".webp", lossless=True, quality=90, method=4)
 
 
-def write_animation(path: Path, frames: Sequence[np.ndarray], white: float) -> None:
-    """Writes linear `frames` [h, w, 3] to `path` as an endless PNG movie; `white` > 0 is white."""
-    encoded = np.stack([srgb.encode_bytes(frame / white) for frame in frames])
+def write_animation(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Writes `frames`, uint8 [h, w, 3], to `path` as an endless PNG movie of `fps` a second."""
     with replace_file(path) as temporary:
-        timing = {"duration": 1000 * SECONDS / len(frames), "loop": 0}
-        temporary.write_bytes(encode(encoded, ".png", **timing))
+        timing = {"duration": 1000 / fps, "loop": 0}
+        temporary.write_bytes(encode(np.stack(frames), ".png", **timing))
 
 
 def png_of(pixels: np.ndarray) -> bytes:
@@ -186,11 +198,16 @@ def write_preview(path: Path, pixels: np.ndarray) -> None:
         temporary.write_bytes(png_of(pixels))
 
 
-def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
+def write_picture(
+    stem: Path,
+    pixels: np.ndarray,
+    preview: np.ndarray | None = None,
+    layers: Mapping[str, np.ndarray] = NO_LAYERS,
+) -> list[Path]:
     """`write_linear` of `pixels` [h, w, 3], and a preview of them, or of `preview`; all paths."""
     path = stem.with_name(stem.name + ".png")
     write_preview(path, pixels if preview is None else preview)
-    return [*write_linear(stem, pixels), path]
+    return [*write_linear(stem, pixels, layers), path]
 
 
 def _read_array(path: Path) -> np.ndarray:

@@ -15,7 +15,6 @@ from PIL import Image as Pillow
 from ddrecon.errors import FormatError
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.images.table import (
-    SECONDS,
     read_image,
     read_mask,
     write_animation,
@@ -246,16 +245,15 @@ def test_a_mask_of_labels_is_refused_but_a_black_one_is_none(tmp_path: Path, lev
             read_mask(tmp_path / name)
 
 
-def test_a_movie_keeps_its_frames_in_order_and_what_is_white(tmp_path: Path) -> None:
-    pictures = [np.full((17, 23, 3), level) for level in np.linspace(0, 2.16, 7)]
+def test_a_movie_keeps_its_frames_in_order(tmp_path: Path) -> None:
+    pictures = [np.full((17, 23, 3), level, np.uint8) for level in range(0, 210, 30)]
     for picture in pictures:
-        picture[:4, :4] += 0.3
-    write_animation(tmp_path / "ring.png", pictures, 2.0)
+        picture[:4, :4] += 40
+    write_animation(tmp_path / "ring.png", pictures, 8)
     frames = iio.imread(tmp_path / "ring.png", index=..., plugin="pillow")[..., :3]
-    assert np.array_equal(frames, [srgb.encode_bytes(picture / 2.0) for picture in pictures])
-    assert frames[0, 10, 10, 0] == 0 and frames[-2, 10, 10, 0] < frames[-1, 10, 10, 0] == 255
+    assert np.array_equal(frames, pictures)
     about = iio.immeta(tmp_path / "ring.png", plugin="pillow")
-    assert about["loop"] == 0 and about["duration"] == pytest.approx(1000 * SECONDS / 7, abs=1)
+    assert about["loop"] == 0 and about["duration"] == pytest.approx(125, abs=1)
 
 
 @pytest.mark.parametrize("suffix", ["png", "webp"])
