@@ -37,11 +37,12 @@ def draw_curve(
     # What is drawn: thinned, and by its logarithm where asked for.
     drawn = dict[str, list[Point]]()
     for name, points in series.items():
-        kept = [(x, y) for x, y in points if math.isfinite(y)]
+        finite = [(x, y) for x, y in points if math.isfinite(y)]
         if is_logarithmic:
-            kept = [(x, math.log10(y)) for x, y in kept if y > 0]
-        if kept:
-            drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST_POINTS)], kept[-1]]
+            finite = [(x, math.log10(y)) for x, y in finite if y > 0]
+        if finite:
+            stride = max(1, len(finite) // MOST_POINTS)
+            drawn[name] = [*finite[: len(finite) - 1 : stride], finite[-1]]
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
     ys = [y for points in drawn.values() for _, y in points] or [0.0]
     left, right, across_at = _axis(xs, LEFT, WIDTH - RIGHT)

@@ -63,10 +63,10 @@ def render_to_folder(
         names = ["", *(COMPONENTS if has_components else ())]
         if parameter is not None:
             names = [kind + name for name in names for kind in ("", GRADIENT)]
-        for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
+        for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
-            seconds[view.name], files[view.name] = taken, []
+            seconds[view.name], files[view.name] = elapsed, []
             for name, image in images.items():
                 called, picture = view.name + name, None
                 if name.startswith(GRADIENT):

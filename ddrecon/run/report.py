@@ -133,8 +133,8 @@ def volume_section(findings: Findings, summary: Mapping[str, Any]) -> str:
     """
     scene = findings.scene
     named = fields_of(scene)
-    both = (*named.items(), *findings.truths.items())
-    whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
+    shown = (*named.items(), *findings.truths.items())
+    whites = {name: max(find_white_value(v) for n, v in shown if n == name) for name in named}
     z, y, x = scene.volume.grid.extent
     fields = [
         Shown(name, of, value, (x, y, z), whites[name])

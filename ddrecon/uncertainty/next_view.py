@@ -29,9 +29,10 @@ def rank_views(scene: Scene) -> list[dict[str, Any]]:
     the nearest existing camera; `matrix` [4, 4], camera to world; and whether it `is_tied` with the
     best.
     """
-    taken, ranked = [_way_to(view.camera, scene) for view in scene.views], list[dict[str, Any]]()
+    existing = [_way_to(view.camera, scene) for view in scene.views]
+    ranked = list[dict[str, Any]]()
     for view in place_turntable(scene, scene.views[0], CANDIDATES):
-        angle = _nearest(_way_to(view.camera, scene), taken)
+        angle = _nearest(_way_to(view.camera, scene), existing)
         matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
         ranked.append({"name": view.name, "angle": angle, "matrix": matrix})
     ranked.sort(key=lambda candidate: -candidate["angle"])
