@@ -1,4 +1,4 @@
-"""All light inside a medium: not yet scattered, and scattered often.
+"""All light inside a medium: uncollided, that is not yet scattered, and collided.
 
 Only the terms that a scene needs are composed: no diffusion solve when the model is `none` or
 nothing scatters nor reflects, no quadrature over directions unless unscattered ambient light is
@@ -163,7 +163,7 @@ def _scatter_light(
     `unscattered`: phi [K, C, z, y, x] of light besides that of `lights`.
     """
     name_kernels(medium.extinction.field)
-    # Q0 and Q1 are of light not yet scattered; skies' mean enters through the faces (E2.6).
+    # Q0 and Q1 are the first-collision source; skies' mean enters through the faces (E2.6).
     received = receive_light(cells, lights, cells.degree)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]

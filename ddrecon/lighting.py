@@ -37,7 +37,7 @@ EXCHANGES = 4
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
-    """The light inside the volume of `scene`: not yet scattered, and scattered often (E2.4, E2.5).
+    """The light inside the volume of `scene`: uncollided and collided (E2.4, E2.5).
 
     With a ground, whose light is another source, it begins with light that goes to and fro on a
     coarse grid (E5.4).

@@ -23,6 +23,7 @@ from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
 from ddrecon.light_field import fluence_of
 from ddrecon.lighting import fluence, solve_light
+from ddrecon.numerics.periods import MARGIN, unroll_along
 from ddrecon.picture import render, view_image
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
@@ -198,6 +199,17 @@ def test_a_period_is_the_middle_of_many():
     many = repeated(density.repeat(7, 1, 7), **settings)
     many.volume.grid = Grid((42, 5, 49), (-3.6, 0.0, -4.2), (4.8, 1.0, 5.6))
     torch.testing.assert_close(render(many), render(one), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 7.0, 1e3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_units_and_precision_do_not_tell_how_many_cells_a_beam_passes(unit: float, dtype: Any):
+    """It leaves the box after exactly 15 cells along y."""
+    shape, sides = (6, 7, 8), (0.6, 0.8, 1.0)
+    lower, upper = (tuple(sign * unit * side / 2 for side in sides) for sign in (-1, 1))
+    direction = torch.nn.functional.normalize(torch.tensor([-0.7, -2, -1], dtype=dtype), dim=0)
+    period = unroll_along(Grid(shape, lower, upper, periodic=(1,)), direction)
+    assert (period.before, period.after) == ((0, MARGIN, 0), (0, MARGIN + 15, 0))
 
 
 LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"

@@ -428,8 +428,10 @@ def uncertainty(
     from ddrecon.uncertainty.folder import uncertainty_lines
 
     require_no_film(run)
-    taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
-    if taken.level.train.volume.grid != taken.problem.scene.volume.grid:
+    reconstruction = load_run(
+        run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype)
+    )
+    if reconstruction.level.train.volume.grid != reconstruction.problem.scene.volume.grid:
         raise UsageError(
             f"{run}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"
@@ -437,8 +439,10 @@ def uncertainty(
     noise = None if read is None else Noise(read, 0.0)
     request = Request(session.seed, experiments, noise)
     if not is_first():
-        follow_uncertainty(taken, request)
+        follow_uncertainty(reconstruction, request)
         return
     with claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
-        record = drive_uncertainty(taken, folder, request, resume=resume, is_quiet=session.is_quiet)
+        record = drive_uncertainty(
+            reconstruction, folder, request, resume=resume, is_quiet=session.is_quiet
+        )
     session.show(record, uncertainty_lines(record, output))

@@ -150,16 +150,16 @@ class Film:
         near = [n for n in self.done() if 0 < abs(n - number) <= far]
         return [n for n in near if n < number], [n for n in near if n > number]
 
-    def _flow(self, number: int, other: int) -> Tensor:
-        """The motion a frame from frame `number` to `other`, in cells: [3, z, y, x]."""
+    def _flow(self, start: int, end: int) -> Tensor:
+        """The motion a frame from frame `start` to `end`, in cells: [3, z, y, x]."""
         sums = []
-        for frame in (number, other):
+        for frame in (start, end):
             fields = _fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
             # Colors are averaged.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
             sums.append(torch.stack(values).sum(0))
-        return find_flow(*sums) / (other - number)
+        return find_flow(*sums) / (end - start)
 
     @property
     def optimized(self) -> list[str]:
@@ -201,8 +201,8 @@ def choose_frames(numbers: Sequence[int], frame_range: str | None) -> list[int]:
     first, last = (ends[1] or 0, ends[2] or numbers[-1]) if ends else (1, 0)
     chosen = [number for number in numbers if int(first) <= number <= int(last)]
     if not chosen:
-        whole = f"{numbers[0]}:{numbers[-1]}"
-        raise UsageError(f"--frames {frame_range}: names no frame; expected a part of {whole}")
+        film = f"{numbers[0]}:{numbers[-1]}"
+        raise UsageError(f"--frames {frame_range}: names no frame; expected a part of {film}")
     return chosen
 
 
@@ -256,9 +256,9 @@ def open_film(
             if not resume:
                 frames = [f"frames/{number:04d}/" for number in chosen]
                 frames += [f"{SEQUENCE}/film_{number:04d}." for number in chosen]
-                kept = [old_scene, scene_file.path, *referenced_files(scene_file)]
-                kept += [] if shared is None else [shared]
-                folder.clear(kept, frames if is_same else [""])
+                inputs = [old_scene, scene_file.path, *referenced_files(scene_file)]
+                inputs += [] if shared is None else [shared]
+                folder.clear(inputs, frames if is_same else [""])
             if calibration is not None:
                 file = path / SHARED
                 if file.is_file() and read_shared(file)["values"] != calibration["values"]:

@@ -13,7 +13,7 @@ K1, K2 = 0.01, 0.03
 
 
 def structural_similarity(
-    image: Tensor, other: Tensor, peak: Tensor, seen: Tensor | None = None
+    image: Tensor, reference: Tensor, peak: Tensor, seen: Tensor | None = None
 ) -> Tensor:
     """The structural similarity [c, h, w] of two images [c, h, w] whose largest value is `peak`.
 
@@ -33,9 +33,9 @@ def structural_similarity(
     def mean(values: Tensor) -> Tensor:
         return blur(values * seen) / weight
 
-    first, second = mean(image), mean(other)
-    contrast = mean(image * image) - first**2 + mean(other * other) - second**2
-    structure = mean(image * other) - first * second
+    first, second = mean(image), mean(reference)
+    contrast = mean(image * image) - first**2 + mean(reference * reference) - second**2
+    structure = mean(image * reference) - first * second
     low, high = (K1 * peak) ** 2, (K2 * peak) ** 2
     return ((2 * first * second + low) * (2 * structure + high)) / (
         (first**2 + second**2 + low) * (contrast + high)

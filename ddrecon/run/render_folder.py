@@ -78,10 +78,10 @@ def render_to_folder(
         names = [*parts, *(MATTE if has_components else ())]
         if parameter is not None:
             names += [GRADIENT + part for part in parts]
-        for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
+        for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
-            seconds[view.name], files[view.name] = taken, []
+            seconds[view.name], files[view.name] = elapsed, []
             stem, pictures = folder / view.name, dict(images)
             if parameter is not None:
                 slopes = {part: pictures.pop(GRADIENT + part) for part in parts}

@@ -244,9 +244,10 @@ def starting_point(
     """The value of each optimized parameter, of each of `names`, and of density.
 
     Density is the scene's own; where that is the same everywhere, what it starts from; where that
-    is, too, random numbers of which half are empty: a volume without any hides all else. What moves
-    rays or beams is moved by a random share of the variable's rate: along the lattice rays meet
-    centers of cells, where interpolation has a slope to each side, and differences a mean of both.
+    is, too, random numbers of which half are empty: a volume without any hides all else. A single
+    cell, which cannot vary, is not empty. What moves rays or beams is moved by a random share of
+    the variable's rate: along the lattice rays meet centers of cells, where interpolation has a
+    slope to each side, and differences a mean of both.
     """
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
@@ -255,11 +256,9 @@ def starting_point(
     if "density" in point and point["density"].ndim == 3:
         of_scene = scene.volume.density
         random = (2 * random_like(of_scene, generator) - 1).clamp(min=0)
-        point["density"] = next(
-            density
-            for density in (of_scene, point["density"], random)
-            if bool((density != density.flatten()[0]).any())
-        )
+        densities = (of_scene, point["density"], random)
+        varied = (item for item in densities if bool((item != item.flatten()[0]).any()))
+        point["density"] = next(varied, 1 - random)
     for name, value in point.items():
         kind = kind_of(name)
         if kind.difference_steps == SHORT_STEPS and not is_of_volume(name):

@@ -209,10 +209,9 @@ def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
     assert report["movie"]["file"] == "out/ring.png"
     assert report["psnr"] == {}
     assert list(report["files"]) == [f"ring_{index:03d}" for index in range(5)]
+    white = report["movie"]["white"]
     for frame, name in zip(movie, report["files"], strict=True):
-        assert (
-            np.abs(frame - encoded(pixels(name).astype(float) / report["movie"]["white"])).max() <= 1
-        )
+        assert np.abs(frame - encoded(pixels(name).astype(float) / white)).max() <= 1
     succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front")
     assert np.allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
 

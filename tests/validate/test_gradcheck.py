@@ -72,6 +72,12 @@ def test_albedo_1_of_thick_cells_passes() -> None:
     assert result.has_passed, result
 
 
+def test_a_single_cell_passes() -> None:
+    (result,) = check("density", overrides=(*ONE_ROUND, "volume.resolution=[1, 1, 1]"))
+    assert result.has_passed, result
+    assert result.entries[0].adjoint != 0
+
+
 def test_all_at_once_pass() -> None:
     overrides = [*SMALL, "diffusion.transport_rounds=1"]
     scene = load_scene(CONFIG, overrides=overrides, dtype=torch.float64)
