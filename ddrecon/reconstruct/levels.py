@@ -6,6 +6,8 @@ from dataclasses import replace
 
 from torch.nn.functional import adaptive_avg_pool2d
 
+from ddrecon.cameras import pixel_width
+from ddrecon.grid import Grid
 from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
@@ -21,24 +23,31 @@ def factors(scene: Scene) -> list[int]:
 
 
 def scene_at_level(scene: Scene, factor: int) -> Scene:
-    """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged."""
+    """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged.
+
+    Of pixels it has as many fewer again as leave a cell `CELL` of them wide: more say no more.
+    """
+    views = [_view_at_level(view, factor, scene.volume.grid) for view in scene.views]
     if factor == 1:
-        return scene
+        return replace(scene, views=views)
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
     coarse = volume_at_level(volume, grid)
     starts = {
         name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
         for name, start in scene.starts.items()
     }
-    views = [_view_at_level(view, factor) for view in scene.views]
     return replace(scene, volume=coarse, views=views, starts=starts)
 
 
-def _view_at_level(view: View, factor: int) -> View:
-    """`view` with up to `factor` times fewer pixels, a power of two, along each side."""
-    powers = (2**k for k in range(factor.bit_length()))
-    fits = [power for power in powers if min(view.camera.size) // power >= tuning.FEWEST_PIXELS]
-    camera, image, mask = view.camera.resize(max(fits, default=1)), view.image, view.mask
+def _view_at_level(view: View, factor: int, grid: Grid) -> View:
+    """`view` with up to `factor` times fewer pixels a side than cells of `grid` ask for."""
+    middle = view.camera.pose.new_tensor(grid.center_xyz)
+    width = min(grid.spacing) / pixel_width(view.camera, middle)
+    factor *= max(1, int(width / tuning.CELL))
+    most = max(1, min(factor, min(view.camera.size) // tuning.FEWEST_PIXELS))
+    if most == 1:
+        return view
+    camera, image, mask = view.camera.resize(most), view.image, view.mask
     background = view.background
     if background is not None and background.shape[1:] != (1, 1):
         background = adaptive_avg_pool2d(background, camera.size)
