@@ -304,20 +304,19 @@ def optimize(
     from ddrecon.diffusion.solve import name_kernels
     from ddrecon.io.files.folders import RUN, claim_folder
     from ddrecon.progress import tell
-    from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
+    from ddrecon.run.drive import optimize_in_folder, summary_lines
 
-    if not is_first():
-        follow_run(session.build(scene_file), scene_file, resume=resume)
-        return
-    with claim_folder(output, RUN, overwrite=overwrite, resume=resume) as claimed:
+    claim = claim_folder(output, RUN, overwrite=overwrite, resume=resume)
+    with claim if is_first() else nullcontext() as claimed:
         with tell("reading pictures and building the scene", session.is_quiet):
             if scene_file.tree.diffusion.is_conservative_p1:
                 name_kernels(session.empty())
             built, environment = session.build(scene_file), session.environment()
-        with tell("looking at what the pictures show", session.is_quiet):
-            run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
-        summary = drive_run(run, folder, preview_every, session.is_quiet)
-    session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
+        options: dict[str, Any] = {"preview_every": preview_every, "is_quiet": session.is_quiet}
+        arguments = built, scene_file, claimed, environment
+        summary = optimize_in_folder(*arguments, is_resumed=resume, **options)
+    if summary:
+        session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
 
 
 def _optimize_film(
@@ -382,8 +381,8 @@ def uncertainty(
     from ddrecon.ranks import is_first
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
-    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
-    from ddrecon.uncertainty.folder import uncertainty_lines
+    from ddrecon.uncertainty.experiments import Uncertainty
+    from ddrecon.uncertainty.folder import experiment_in_folder, uncertainty_lines
 
     require_no_film(run)
     taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
@@ -393,10 +392,9 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, experiments, noise)
-    if not is_first():
-        follow_uncertainty(taken, request)
-        return
-    with claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
-        record = drive_uncertainty(taken, folder, request, resume=resume, is_quiet=session.is_quiet)
-    session.show(record, uncertainty_lines(record, output))
+    job = Uncertainty(taken, session.seed, experiments, noise)
+    claim = claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume)
+    with claim if is_first() else nullcontext() as folder:
+        record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
+    if record:
+        session.show(record, uncertainty_lines(record, output))
