@@ -6,8 +6,7 @@ scene file, are shown at once.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
@@ -22,7 +21,6 @@ from ddrecon.errors import DataWarning, UsageError
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
     from ddrecon.film.folder import Film
-    from ddrecon.scene import Scene, View
     from ddrecon.scene_file.load import SceneFile
 
 
@@ -122,103 +120,50 @@ def render(
     **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    choice = _Choice(is_relit=bool(lights), overwrite=overwrite, **options)
-    if choice.exported and not choice.has_fluence:
+    if options["exported"] and not options["has_fluence"]:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
     if lights:
         typed = " ".join(f"--light {light}" for light in lights)
         session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
-    from ddrecon.io.files.folders import FILM, RENDER, claim_folder, kind_of_folder
-    from ddrecon.ranks import is_first
+    from ddrecon.io.files.folders import FILM, RENDER, kind_of_folder
 
+    options = {"is_relit": bool(lights), **options}
     if kind_of_folder(scene) != FILM:
         if frames is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
-        session.show(*_render(session, scene, output, choice))
+        session.show(*_render(session, scene, output, overwrite, options))
         return
     from ddrecon.film.folder import finished_frames
 
-    runs = finished_frames(scene, frames)
-    claim = claim_folder(output, RENDER, overwrite=overwrite)
-    with claim if is_first() else nullcontext() as folder:
+    with session.claim(output, RENDER, overwrite=overwrite) as folder:
+        runs = finished_frames(scene, frames)
         if folder is not None and frames is None:
             folder.clear()
-        reports = {run.name: _render(session, run, output / run.name, choice) for run in runs}
+        pairs = {
+            run.name: _render(session, run, output / run.name, overwrite, options) for run in runs
+        }
     session.show(
-        {name: report for name, (report, _) in reports.items()},
-        [*chain.from_iterable(lines for _, lines in reports.values())],
+        {name: report for name, (report, _) in pairs.items()},
+        [*chain.from_iterable(lines for _, lines in pairs.values())],
     )
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """What `render` makes of each scene, by the options of its command."""
-
-    is_relit: bool
-    overwrite: bool
-    names: tuple[str, ...]
-    components: bool
-    parameter: str | None
-    count: int | None
-    has_fluence: bool
-    exported: str | None
 
 
 def _render(
-    session: Session, scene: Path, output: Path, choice: _Choice
+    session: Session, scene: Path, output: Path, overwrite: bool, options: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
     scene_file = session.read(scene)
-    from ddrecon.io.files.folders import RENDER, claim_folder
-    from ddrecon.ranks import is_first
+    from ddrecon.io.files.folders import RENDER
+    from ddrecon.run.render_folder import Choice, choose_views, render_lines, render_to_folder
     from ddrecon.scene_file.load import referenced_files
 
-    claim = claim_folder(output, RENDER, overwrite=choice.overwrite)
-    with claim if is_first() else nullcontext() as folder:
-        loaded, views = _choose_views(session, scene_file, choice)
+    choice, are_rounds_said = Choice(**options), _are_rounds_said(session, scene_file)
+    with session.claim(output, RENDER, overwrite=overwrite) as folder:
+        chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
         if folder is not None:
             folder.clear([scene_file.path, *referenced_files(scene_file)])
-        return _render_views(session, loaded, views, output, choice)
-
-
-def _choose_views(
-    session: Session, scene_file: SceneFile, choice: _Choice
-) -> tuple[Scene, list[View]]:
-    """The scene that is rendered, and its views that are."""
-    from ddrecon.run.render_folder import remove_targets, require_variation
-
-    loaded = session.build(scene_file)
-    if choice.has_fluence and not _are_rounds_said(session, scene_file):
-        # light in empty cells, which views do not see, takes a second one
-        rounds = loaded.diffusion.rounds
-        loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
-    views = [loaded.view(name) for name in dict.fromkeys(choice.names)] or loaded.views
-    if choice.is_relit or choice.count is not None:
-        loaded = remove_targets(loaded, views, choice.count)
-        views = list(loaded.views)
-    if choice.parameter is not None:
-        require_variation(loaded, choice.parameter)
-    return loaded, views
-
-
-def _render_views(
-    session: Session, loaded: Scene, views: list[View], output: Path, choice: _Choice
-) -> tuple[dict[str, Any], list[str]]:
-    from ddrecon.io.files.atomic import write_json
-    from ddrecon.ranks import is_first
-    from ddrecon.run.render_folder import render_lines, render_to_folder, write_ring
-
-    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
-    progress, parameter = session.progress, choice.parameter
-    report = render_to_folder(
-        loaded, views, output, choice.components, progress, parameter, [*kinds]
-    )
-    if not is_first():
-        return {}, []
-    if choice.count is not None:
-        report["ring"] = write_ring(views, output)
-    write_json(output / "render.json", report)
-    return report, render_lines(report, output, session.quiet)
+        report = render_to_folder(*chosen, output, choice, session.progress)
+    return report, render_lines(report, output, session.quiet) if report else []
 
 
 def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
@@ -289,8 +234,6 @@ def optimize(
         typed = f"--iterations {iterations}"
         session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
-    from ddrecon.ranks import is_first
-
     if scene_file.tree.frames is not None:
         from ddrecon.film.folder import Film
 
@@ -302,12 +245,11 @@ def optimize(
     if of_films := [option for option, value in film_options.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
     from ddrecon.diffusion.solve import name_kernels
-    from ddrecon.io.files.folders import RUN, claim_folder
+    from ddrecon.io.files.folders import RUN
     from ddrecon.progress import tell
     from ddrecon.run.drive import optimize_in_folder, summary_lines
 
-    claim = claim_folder(output, RUN, overwrite=overwrite, resume=resume)
-    with claim if is_first() else nullcontext() as claimed:
+    with session.claim(output, RUN, overwrite=overwrite, resume=resume) as claimed:
         with tell("reading pictures and building the scene", session.is_quiet):
             if scene_file.tree.diffusion.is_conservative_p1:
                 name_kernels(session.empty())
@@ -376,9 +318,8 @@ def uncertainty(
     resume: bool,
 ) -> None:
     """Say by experiments how sure RUN, the folder of a finished run, is of each cell and number."""
-    from ddrecon.io.files.folders import UNCERTAINTY, claim_folder
+    from ddrecon.io.files.folders import UNCERTAINTY
     from ddrecon.pictures.noise import Noise
-    from ddrecon.ranks import is_first
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.experiments import Uncertainty
@@ -393,8 +334,7 @@ def uncertainty(
         )
     noise = None if read is None else Noise(read, 0.0)
     job = Uncertainty(taken, session.seed, experiments, noise)
-    claim = claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume)
-    with claim if is_first() else nullcontext() as folder:
+    with session.claim(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
         record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
     if record:
         session.show(record, uncertainty_lines(record, output))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,6 +15,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.table import PREVIEW, read_image, write_animation, write_picture
 from ddrecon.light_field import LightField, fluence_of
 from ddrecon.lighting import solve_light
@@ -40,28 +41,62 @@ FEW = 12
 COMPONENTS = (".reduced", ".single", ".multiple")
 
 
-def render_to_folder(
-    scene: Scene,
-    views: list[View],
-    folder: Path,
-    has_components: bool,
-    progress: Progress,
-    parameter: str | None = None,
-    kinds: Sequence[str] = (),
-) -> dict[str, Any]:
-    """The report of rendering `views` of `scene`, with their components if asked for, to `folder`.
+@dataclass(frozen=True)
+class Choice:
+    """What is rendered of a scene: the views `names`, or all; with a `count` so many around it.
 
-    With a `parameter`, which `require_variation` must allow, also the images' derivatives by it.
-    The fluence is written in files of these `kinds`. The first rank alone writes.
+    A scene that `is_relit` is compared with no picture. With a `parameter` there are derivatives by
+    it as well; the fluence is written as .npz, and `exported` as another kind.
+    """
+
+    names: tuple[str, ...] = ()
+    components: bool = False
+    parameter: str | None = None
+    count: int | None = None
+    has_fluence: bool = False
+    exported: str | None = None
+    is_relit: bool = False
+
+
+def choose_views(
+    scene: Scene, choice: Choice, are_rounds_said: bool
+) -> tuple[Scene, Sequence[View]]:
+    """The scene that is rendered, and its views that are.
+
+    Raises UsageError unless the parameter of the `choice` names a number of the scene.
+    """
+    if choice.has_fluence and not are_rounds_said:
+        # light in empty cells, which views do not see, takes a second one
+        rounds = scene.diffusion.rounds
+        scene.diffusion = replace(scene.diffusion, transport_rounds=rounds and max(rounds, 2))
+    views = [scene.view(name) for name in dict.fromkeys(choice.names)] or scene.views
+    if choice.count is not None:
+        views = place_turntable(scene, views[0], choice.count)
+        scene = replace(scene, views=views)
+    elif choice.is_relit:
+        views = [View(view.name, view.camera) for view in views]
+        scene = replace(scene, views=views)
+    if choice.parameter is not None:
+        require_variation(scene, choice.parameter)
+    return scene, views
+
+
+def render_to_folder(
+    scene: Scene, views: Sequence[View], folder: Path, choice: Choice, progress: Progress
+) -> dict[str, Any]:
+    """The report of rendering `views` of `scene` to `folder`, which it is written to as well.
+
+    The first rank alone writes; that of others is empty.
     """
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
-    with torch.no_grad(), varied(scene, parameter) as world:
+    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
+    with torch.no_grad(), varied(scene, choice.parameter) as world:
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
-        fluence_files = _write_fluence(light_field, scene, folder, kinds) if kinds else []
-        names = ["", *(COMPONENTS if has_components else ())]
-        if parameter is not None:
+        fluence_files = _write_fluence(light_field, scene, folder, [*kinds]) if kinds else []
+        names = ["", *(COMPONENTS if choice.components else ())]
+        if choice.parameter is not None:
             names = [kind + name for name in names for kind in ("", GRADIENT)]
         for view, images, taken in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
@@ -77,6 +112,8 @@ def render_to_folder(
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
                 quality[view.name] = float(target.psnr_of(images[""]))
+    if not is_first():
+        return {}
     solves = [{**asdict(r), "residual": float(r.residual)} for r in memory.records]
     report: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
@@ -94,8 +131,11 @@ def render_to_folder(
         }
     if fluence_files:
         report["fluence"] = fluence_files
-    if parameter is not None:
-        report["gradient"] = {"parameter": parameter, "full_scale": scales}
+    if choice.parameter is not None:
+        report["gradient"] = {"parameter": choice.parameter, "full_scale": scales}
+    if choice.count is not None:
+        report["ring"] = write_ring(views, folder)
+    write_json(folder / "render.json", report)
     return report
 
 
@@ -114,22 +154,12 @@ def _write_fluence(
     return [f"{stem.parent.name}/{name}" for name in names]
 
 
-def write_ring(views: list[View], folder: Path) -> dict[str, Any]:
+def write_ring(views: Sequence[View], folder: Path) -> dict[str, Any]:
     """What the report says of the movie `ring.png` of all `views` in `folder`."""
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
     write_animation(folder / "ring.png", images, white)
     return {"files": ["ring.png"], "white": white}
-
-
-def remove_targets(scene: Scene, views: list[View], count: int | None) -> Scene:
-    """`scene` with `views` alone, and without their target images.
-
-    With `count`, so many views around the volume from the first of `views` take their place.
-    """
-    if count is not None:
-        return replace(scene, views=place_turntable(scene, views[0], count))
-    return replace(scene, views=[View(view.name, view.camera) for view in views])
 
 
 def require_variation(scene: Scene, parameter: str) -> None:
@@ -211,7 +241,7 @@ def _images(
 def _render_in_turns(
     light_field: LightField,
     scene: Scene,
-    views: list[View],
+    views: Sequence[View],
     names: Sequence[str],
     progress: Progress,
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
