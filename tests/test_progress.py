@@ -6,24 +6,23 @@ import pty
 import re
 import sys
 from contextlib import suppress
-from types import SimpleNamespace
 
 import pytest
 from tqdm import tqdm
 
 from ddrecon.progress import bar_settings
-from ddrecon.run.drive import advance
+from ddrecon.run.job import drive
 
 
-class FakeRun:
-    """A run of so many iterations, which take no time."""
+class FakeJob:
+    """A job of so many iterations, which take no time."""
 
     def __init__(self, count: int):
-        self.schedule, self.iteration = SimpleNamespace(is_auto=False, most=count), 0
+        self.total, self.iteration = count, 0
 
     @property
     def is_done(self) -> bool:
-        return self.iteration == self.schedule.most
+        return self.iteration == self.total
 
     def step(self) -> str:
         """One more iteration, and what is said of it."""
@@ -37,8 +36,7 @@ def test_a_bar_of_80_columns_and_a_log(monkeypatch: pytest.MonkeyPatch, is_termi
     stderr.isatty = lambda: is_terminal  # type: ignore[method-assign]
     monkeypatch.setattr(sys, "stderr", stderr)
     monkeypatch.setenv("COLUMNS", "80")
-    run, folder = FakeRun(1000), SimpleNamespace(save_in_time=lambda run: None)
-    advance(run, run.step, folder, is_quiet=False, title="optimize")  # type: ignore[arg-type]
+    drive(FakeJob(1000), None, "optimize", is_quiet=False)  # type: ignore[arg-type]
     *states, last = stderr.getvalue().rstrip().split("\r")
     assert len(last) < 80 and last.endswith("PSNR 41.3/31.2 dB]")
     assert len(re.search(r"\|(.*)\|", last).group(1)) >= 10  # type: ignore[union-attr]

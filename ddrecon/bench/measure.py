@@ -7,7 +7,7 @@ precision; the whole error is against path tracing by Mitsuba 3.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -32,8 +32,6 @@ from ddrecon.scene import Scene
 from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
 
-LEAST_DRAWN = 1e-8
-"""Errors below this are drawn as this."""
 EXACT: dict[str, Any] = {"tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
 """The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
@@ -45,8 +43,21 @@ PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
 """Paths a pixel that Mitsuba is tried with."""
 TRUTH_PASSES, TRUTH_SEED = 4, 1000
 """The truth is the mean of so many images of the most paths, whose seeds begin here."""
+HEAD: tuple[str, ...] = ("variant", "image s", "+ gradient s", "times base", "iterations")
+HEAD += ("image num. error", "gradient num. error", "image error", "")
 
-Change = Callable[[Scene], Scene]
+
+@dataclass(frozen=True)
+class Shot:
+    """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean by
+    density, None of path tracing. `iterations` are the first solve's, or samples a pixel.
+    """
+
+    image: Tensor
+    gradient: Tensor | None
+    image_seconds: float
+    gradient_seconds: float
+    iterations: int
 
 
 @dataclass(frozen=True)
@@ -55,8 +66,8 @@ class Row:
 
     Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
     `gradient_numerical` are against the same model solved exactly; `image_error` is against path
-    tracing, whose `image_noise` is subtracted in quadrature. `iterations` are the first solve's, or
-    samples a pixel. `is_best`: no other row is known to be faster and as close to the truth.
+    tracing, whose `image_noise` is subtracted in quadrature. `is_best`: no other row is known to be
+    faster and as close to the truth.
     """
 
     name: str
@@ -78,6 +89,17 @@ class Row:
             return max(self.image_error, least_error(self.image_noise))
         return math.inf if self.image_numerical is None else self.image_numerical
 
+    def cells(self, base: Row) -> list[str]:
+        """What a table has of the row; times are multiples of those of `base`."""
+        numerical = self.image_numerical, self.gradient_numerical
+        noisy = "" if self.image_error is None else error_text(self.image_error, self.image_noise)
+        return [
+            *(self.name, f"{self.image_seconds:.3f}", f"{self.both_seconds:.3f}"),
+            *(f"{self.both_seconds / base.both_seconds:.2f}", str(self.iterations)),
+            *("" if error is None else f"{error:.1e}" for error in numerical),
+            *(noisy, "best" if self.is_best else ""),
+        ]
+
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
     """The same rows, those marked that no other beats in both time of an image and error."""
@@ -88,120 +110,64 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
     return [replace(row, is_best=not is_beaten(row)) for row in rows]
 
 
-HEAD = (
-    "| variant | image s | + gradient s | times base | iterations | image num. error "
-    "| gradient num. error | image error |  |"
-)
-
-
 def bench_lines(rows: Sequence[Row]) -> list[str]:
-    """The rows as a Markdown table, with times as multiples of the first's, and Mitsuba's time."""
+    """The rows as a Markdown table, and Mitsuba's time."""
     base, last = rows[0], rows[-1]
-    lines = [HEAD, "|" + " --- |" * (HEAD.count("|") - 1)]
-    for row in rows:
-        numerical = (row.image_numerical, row.gradient_numerical)
-        cells = [
-            row.name,
-            f"{row.image_seconds:.3f}",
-            f"{row.both_seconds:.3f}",
-            f"{row.both_seconds / base.both_seconds:.2f}",
-            str(row.iterations),
-            *("" if error is None else f"{error:.1e}" for error in numerical),
-            "" if row.image_error is None else error_text(row.image_error, row.image_noise),
-            "best" if row.is_best else "",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
+    lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, *(row.cells(base) for row in rows))]
+    lines.insert(1, "|" + " --- |" * len(HEAD))
     if last.image_error is not None:
+        times = last.image_seconds / base.image_seconds
         lines.append(
             f"image error is against path tracing, whose noise, {last.image_noise:.2g}, is "
-            f"subtracted; {last.name} take {last.image_seconds / base.image_seconds:.3g} times as "
-            "long as base"
+            f"subtracted; {last.name} take {times:.3g} times as long as base"
         )
     return lines
 
 
-def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
-    """The bench as plain values."""
-    height, width = scene.views[0].camera.size
-    has_truth = rows[0].image_error is not None
-    return {
-        "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
-        "truth_noise": {"image": rows[0].image_noise} if has_truth else None,
-        "environment": environment,
-        "rows": [asdict(row) for row in rows],
-    }
-
-
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Writes a PNG of times against errors: of the image, and of image and gradient.
+    """Writes a PNG of times of an image against errors; dots have the numbers of their rows.
 
-    Dots have the numbers of their rows. Raises MissingExtraError where matplotlib is not installed.
+    Raises MissingExtraError where matplotlib is not installed.
     """
     load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
+    figure, axis = plt.subplots(figsize=(11, 6), layout="constrained")
     for number, row in enumerate(rows, 1):
-        dots = (row.image_seconds, row.error), (row.both_seconds, row.gradient_numerical)
-        for axis, (seconds, error) in zip(axes, dots, strict=True):
-            if error is not None:
-                place = seconds, max(error, LEAST_DRAWN)
-                axis.plot(*place, "o", color=f"C{number % 10}", label=f"{number}  {row.name}")
-                axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
-    for axis, timed in zip(axes, ("an image", "an image and its gradient"), strict=True):
-        axis.set(xscale="log", yscale="log", xlabel=f"seconds of {timed}", ylabel="relative error")
-        axis.grid(which="major", alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+        axis.plot(row.image_seconds, row.error, "o", label=f"{number}  {row.name}")
+        axis.annotate(str(number), (row.image_seconds, row.error))
+    axis.set(xscale="log", yscale="log", xlabel="seconds of an image", ylabel="relative error")
+    figure.legend(loc="outside right center", fontsize=8)
     with replace_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)
 
 
-def variants_of(scene: Scene, is_quick: bool) -> dict[str, Change]:
-    """What makes the variants of `scene`, by name: itself first, then all that differ from it."""
-    settings = _settings(scene)
-    changes = (item for item in _changes(is_quick) if _settings(item[1](scene)) != settings)
-    return {"base": lambda scene: scene, **dict(changes)}
+def variants_of(scene: Scene, is_quick: bool) -> dict[str, Scene]:
+    """`scene` by name: as it is, then by other settings, one at a time; fewer if it `is_quick`."""
 
+    def vary(section: str, **changes: Any) -> Scene:
+        return replace(scene, **{section: replace(getattr(scene, section), **changes)})
 
-def exact_scene(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
-    marched in finer steps, ray by ray.
-    """
-    steps = max(EXACT_STEPS, scene.render.steps)
-    render = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
-    diffusion = replace(scene.diffusion, **EXACT)
-    if diffusion.model == "flux_limited":
-        diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
-    return replace(scene, render=render, diffusion=diffusion)
-
-
-def _changes(is_quick: bool) -> Iterator[tuple[str, Change]]:
-    """What is tried, one setting at a time; a quick bench tries less."""
-    tolerances = (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
-    for tolerance in tolerances:
-        yield f"tolerance {tolerance}", _vary("diffusion", tolerance=tolerance)
+    variants = {"base": scene}
+    for tolerance in (1e-2, 1e-4, 1e-6) if is_quick else (1e-1, 1e-2, 1e-3, 1e-4, 1e-6):
+        variants[f"tolerance {tolerance}"] = vary("diffusion", tolerance=tolerance)
     for closure in CLOSURES:
-        yield f"closure {closure}", _vary("diffusion", closure=closure)
+        variants[f"closure {closure}"] = vary("diffusion", closure=closure)
     for model in ("p1",) if is_quick else ("p1", "flux_limited"):
-        yield f"model {model}", _vary("diffusion", model=model, transport_rounds=None)
+        variants[f"model {model}"] = vary("diffusion", model=model, transport_rounds=None)
     for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
-        change = _vary("diffusion", transport_rounds=rounds, degree=degree)
-        yield f"rounds {rounds}, degree {degree}", change
+        change = vary("diffusion", transport_rounds=rounds, degree=degree)
+        variants[f"rounds {rounds}, degree {degree}"] = change
     for steps in (1, 2):
-        yield f"steps {steps}", _vary("render", steps_per_voxel=steps)
+        variants[f"steps {steps}"] = vary("render", steps_per_voxel=steps)
     for tolerance in (0, 0.05) if is_quick else (0, 0.01, 0.05, 1):
-        yield f"pixels {tolerance}", _vary("render", tolerance=tolerance)
+        variants[f"pixels {tolerance}"] = vary("render", tolerance=tolerance)
     for factor in (2,) if is_quick else (2, 4):
-        yield f"grid {factor} times coarser", partial(_coarsen, factor)
-
-
-def _vary(section: str, **changes: Any) -> Change:
-    return lambda scene: replace(scene, **{section: replace(getattr(scene, section), **changes)})
-
-
-def _coarsen(factor: int, scene: Scene) -> Scene:
-    return replace(scene_at_level(scene, factor), views=scene.views)
+        coarse = replace(scene_at_level(scene, factor), views=scene.views)
+        variants[f"grid {factor} times coarser"] = coarse
+    base = _settings(scene)
+    return {n: v for n, v in variants.items() if n == "base" or _settings(v) != base}
 
 
 def _settings(scene: Scene) -> tuple[object, ...]:
@@ -212,17 +178,16 @@ def _settings(scene: Scene) -> tuple[object, ...]:
     return scene.volume.grid.shape, scene.render, diffusion
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean by
-    density, None of path tracing. `iterations` are the first solve's, or samples a pixel.
+def exact_scene(scene: Scene) -> Scene:
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows, and
+    marched in finer steps, ray by ray.
     """
-
-    image: Tensor
-    gradient: Tensor | None
-    image_seconds: float
-    gradient_seconds: float
-    iterations: int
+    steps = max(EXACT_STEPS, scene.render.steps)
+    diffusion = replace(scene.diffusion, **EXACT)
+    if diffusion.model == "flux_limited":
+        diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
+    settings = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
+    return replace(scene, render=settings, diffusion=diffusion)
 
 
 def shoot(scene: Scene) -> Shot:
@@ -252,16 +217,17 @@ def run_bench(
 
     `double` is `scene` in double precision; without `tracer` there is no path tracing.
     """
-    contestants, exact = dict[str, Callable[[], Shot]](), dict[str, Shot]()
-    solved = dict[tuple[object, ...], Shot]()  # alike models are solved once
-    variants = variants_of(scene, is_quick)
-    for name, change in progress(list(variants.items()), "exact solutions"):
-        contestants[name] = partial(shoot, change(scene))
-        reference = exact_scene(change(double))
-        shape, _, diffusion = _settings(reference)
-        if (shape, diffusion) not in solved:
-            solved[shape, diffusion] = shoot(reference)
-        exact[name] = solved[shape, diffusion]
+    contestants: dict[str, Callable[[], Shot]] = {
+        name: partial(shoot, variant) for name, variant in variants_of(scene, is_quick).items()
+    }
+    exact, solved = (
+        dict[str, Shot](),
+        dict[tuple[object, ...], Shot](),
+    )  # alike ones are solved once
+    for name, variant in progress([*variants_of(double, is_quick).items()], "exact solutions"):
+        reference = exact_scene(variant)
+        key = _settings(replace(reference, render=double.render))
+        exact[name] = solved[key] = solved[key] if key in solved else shoot(reference)
     truth = None
     if tracer is not None:
         paths = QUICK_PATHS if is_quick else PATHS
@@ -270,8 +236,7 @@ def run_bench(
         for samples in paths:
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
-    rows = [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
-    return with_best(rows)
+    return with_best([row_of(name, taken, exact.get(name), truth) for name, taken in shots.items()])
 
 
 def measure(
@@ -303,6 +268,18 @@ def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced |
     image_seconds = median(shot.image_seconds for shot in shots)
     both_seconds = median(shot.image_seconds + shot.gradient_seconds for shot in shots)
     return Row(name, image_seconds, both_seconds, shot.iterations, **errors)
+
+
+def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
+    """The bench as plain values."""
+    height, width = scene.views[0].camera.size
+    has_truth = rows[0].image_error is not None
+    return {
+        "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
+        "truth_noise": {"image": rows[0].image_noise} if has_truth else None,
+        "environment": environment,
+        "rows": [asdict(row) for row in rows],
+    }
 
 
 def _now(like: Tensor) -> float:

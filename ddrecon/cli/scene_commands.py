@@ -7,8 +7,7 @@ scene file, are shown at once.
 from __future__ import annotations
 
 import json
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
@@ -23,7 +22,6 @@ from ddrecon.errors import DataWarning, UsageError
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
     from ddrecon.film.folder import Film
-    from ddrecon.scene import Scene, View
     from ddrecon.scene_file.load import SceneFile
 
 
@@ -146,121 +144,64 @@ def render(
     scene: Path,
     output: Path,
     lights: tuple[str, ...],
+    cameras: Path | None,
     frames: str | None,
     overwrite: bool,
     **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    choice = _Choice(is_relit=bool(lights), overwrite=overwrite, **options)
-    if choice.exported and not choice.has_fluence:
+    if options["exported"] and not options["has_fluence"]:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
-    if choice.cameras is not None:
-        typed, path = f"--cameras {choice.cameras}", json.dumps(str(choice.cameras))
+    if cameras is not None:
+        typed, path = f"--cameras {cameras}", json.dumps(str(cameras))
         session = session.with_override(f"views={{transforms: {path}}}", typed)
         session = session.with_override("optimize=", typed)
     if lights:
         typed = " ".join(f"--light {light}" for light in lights)
         session = session.with_override(f"lights=[{', '.join(lights)}]", typed)
-    from ddrecon.io.files.folders import FILM, RENDER, claim_folder, kind_of_folder
-    from ddrecon.ranks import is_first
+    from ddrecon.io.files.folders import FILM, RENDER, kind_of_folder
 
+    is_moved = cameras is not None or options["size"] is not None
+    options |= {"is_relit": bool(lights), "is_moved": is_moved}
     if kind_of_folder(scene) != FILM:
         if frames is not None:
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
-        session.show(*_render(session, scene, output, choice))
+        session.show(*_render(session, scene, output, overwrite, options))
         return
     from ddrecon.film.folder import finished_frames
 
-    runs = finished_frames(scene, frames)
-    claim = claim_folder(output, RENDER, overwrite=overwrite)
-    with claim if is_first() else nullcontext() as folder:
+    with session.claim(output, RENDER, overwrite=overwrite) as folder:
+        runs = finished_frames(scene, frames)
         if folder is not None and frames is None:
             folder.clear()
-        reports = {run.name: _render(session, run, output / run.name, choice) for run in runs}
+        pairs = {
+            run.name: _render(session, run, output / run.name, overwrite, options) for run in runs
+        }
     session.show(
-        {name: report for name, (report, _) in reports.items()},
-        [*chain.from_iterable(lines for _, lines in reports.values())],
+        {name: report for name, (report, _) in pairs.items()},
+        [*chain.from_iterable(lines for _, lines in pairs.values())],
     )
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """What `render` makes of each scene, by the options of its command."""
-
-    is_relit: bool
-    overwrite: bool
-    names: tuple[str, ...]
-    components: bool
-    parameter: str | None
-    count: int | None
-    cameras: Path | None
-    size: tuple[int, int] | None
-    movie: Path | None
-    fps: float
-    has_fluence: bool
-    exported: str | None
 
 
 def _render(
-    session: Session, scene: Path, output: Path, choice: _Choice
+    session: Session, scene: Path, output: Path, overwrite: bool, options: dict[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
     scene_file = session.read(scene)
-    from ddrecon.io.files.folders import RENDER, claim_folder
-    from ddrecon.ranks import is_first
+    from ddrecon.io.files.folders import RENDER
+    from ddrecon.run.render_folder import Choice, choose_views, render_lines, render_to_folder
+    from ddrecon.scene_file.build_views import remove_pictures
     from ddrecon.scene_file.load import referenced_files
 
-    claim = claim_folder(output, RENDER, overwrite=choice.overwrite)
-    with claim if is_first() else nullcontext() as folder:
-        loaded, views = _choose_views(session, scene_file, choice)
+    choice, are_rounds_said = Choice(**options), _are_rounds_said(session, scene_file)
+    with session.claim(output, RENDER, overwrite=overwrite) as folder:
+        if choice.is_moved:
+            scene_file = remove_pictures(scene_file, choice.size)
+        chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
         if folder is not None:
             folder.clear([scene_file.path, *referenced_files(scene_file)])
-        return _render_views(session, loaded, views, output, choice)
-
-
-def _choose_views(
-    session: Session, scene_file: SceneFile, choice: _Choice
-) -> tuple[Scene, list[View]]:
-    """The scene that is rendered, and its views that are."""
-    from ddrecon.run.render_folder import remove_targets, require_movie, require_variation
-    from ddrecon.scene_file.build_views import remove_pictures
-
-    is_moved = choice.cameras is not None or choice.size is not None
-    loaded = session.build(remove_pictures(scene_file, choice.size) if is_moved else scene_file)
-    if choice.has_fluence and not _are_rounds_said(session, scene_file):
-        # light in empty cells, which views do not see, takes a second one
-        rounds = loaded.diffusion.rounds
-        loaded.diffusion = replace(loaded.diffusion, transport_rounds=rounds and max(rounds, 2))
-    views = [loaded.view(name) for name in dict.fromkeys(choice.names)] or loaded.views
-    if choice.is_relit or is_moved or choice.count is not None:
-        loaded = remove_targets(loaded, views, choice.count)
-        views = list(loaded.views)
-    if choice.movie is not None:
-        require_movie(choice.movie, views)
-    if choice.parameter is not None:
-        require_variation(loaded, choice.parameter)
-    return loaded, views
-
-
-def _render_views(
-    session: Session, loaded: Scene, views: list[View], output: Path, choice: _Choice
-) -> tuple[dict[str, Any], list[str]]:
-    from ddrecon.io.files.atomic import write_json
-    from ddrecon.ranks import is_first
-    from ddrecon.run.render_folder import render_lines, render_to_folder, write_movie
-
-    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
-    progress, parameter = session.progress, choice.parameter
-    report = render_to_folder(
-        loaded, views, output, choice.components, progress, parameter, [*kinds]
-    )
-    if not is_first():
-        return {}, []
-    movie = choice.movie or (output / "ring.png" if choice.count is not None else None)
-    if movie is not None:
-        report |= write_movie(views, output, movie, choice.fps)
-    write_json(output / "render.json", report)
-    return report, render_lines(report, output, session.quiet)
+        report = render_to_folder(*chosen, output, choice, session.progress)
+    return report, render_lines(report, output, session.quiet) if report else []
 
 
 def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
@@ -331,8 +272,6 @@ def optimize(
         typed = f"--iterations {iterations}"
         session = session.with_override(f"optimize.iterations={iterations}", typed)
     scene_file = session.read(scene)
-    from ddrecon.ranks import is_first
-
     if scene_file.tree.frames is not None:
         from ddrecon.film.folder import Film
 
@@ -344,22 +283,20 @@ def optimize(
     if of_films := [option for option, value in film_options.items() if value is not None]:
         raise click.UsageError(f"{of_films[0]} is for films: SCENE has no section frames")
     from ddrecon.diffusion.solve import name_kernels
-    from ddrecon.io.files.folders import RUN, claim_folder
+    from ddrecon.io.files.folders import RUN
     from ddrecon.progress import tell
-    from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
+    from ddrecon.run.drive import optimize_in_folder, summary_lines
 
-    if not is_first():
-        follow_run(session.build(scene_file), scene_file, resume=resume)
-        return
-    with claim_folder(output, RUN, overwrite=overwrite, resume=resume) as claimed:
+    with session.claim(output, RUN, overwrite=overwrite, resume=resume) as claimed:
         with tell("reading pictures and building the scene", session.is_quiet):
             if scene_file.tree.diffusion.is_conservative_p1:
                 name_kernels(session.empty())
             built, environment = session.build(scene_file), session.environment()
-        with tell("looking at what the pictures show", session.is_quiet):
-            run, folder = open_run(built, scene_file, claimed, environment, resume=resume)
-        summary = drive_run(run, folder, preview_every, session.is_quiet)
-    session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
+        options: dict[str, Any] = {"preview_every": preview_every, "is_quiet": session.is_quiet}
+        arguments = built, scene_file, claimed, environment
+        summary = optimize_in_folder(*arguments, is_resumed=resume, **options)
+    if summary:
+        session.show(summary, summary_lines(summary, output, monotonic() - session.begun))
 
 
 def _optimize_film(
@@ -419,13 +356,12 @@ def uncertainty(
     resume: bool,
 ) -> None:
     """Say by experiments how sure RUN, the folder of a finished run, is of each cell and number."""
-    from ddrecon.io.files.folders import UNCERTAINTY, claim_folder
+    from ddrecon.io.files.folders import UNCERTAINTY
     from ddrecon.pictures.noise import Noise
-    from ddrecon.ranks import is_first
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
-    from ddrecon.uncertainty.drive import Request, drive_uncertainty, follow_uncertainty
-    from ddrecon.uncertainty.folder import uncertainty_lines
+    from ddrecon.uncertainty.experiments import Uncertainty
+    from ddrecon.uncertainty.folder import experiment_in_folder, uncertainty_lines
 
     require_no_film(run)
     reconstruction = load_run(
@@ -437,12 +373,8 @@ def uncertainty(
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    request = Request(session.seed, experiments, noise)
-    if not is_first():
-        follow_uncertainty(reconstruction, request)
-        return
-    with claim_folder(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
-        record = drive_uncertainty(
-            reconstruction, folder, request, resume=resume, is_quiet=session.is_quiet
-        )
-    session.show(record, uncertainty_lines(record, output))
+    job = Uncertainty(reconstruction, session.seed, experiments, noise)
+    with session.claim(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
+        record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
+    if record:
+        session.show(record, uncertainty_lines(record, output))

@@ -9,6 +9,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -21,6 +22,7 @@ from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.atomic import write_json
+from ddrecon.io.files.folders import Folder, claim_folder
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT, require_no_film
@@ -117,6 +119,14 @@ class Session:
             )
         file = path / RESULT if os.path.isdir(path) else path
         return read_scene(file, self.overrides, self.options)
+
+    def claim(
+        self, path: Path, kind: str, *, overwrite: bool, resume: bool = False
+    ) -> AbstractContextManager[Folder | None]:
+        """The folder `path` of a job of this `kind`, claimed; None where another rank has it."""
+        if not is_first():
+            return nullcontext()
+        return claim_folder(path, kind, overwrite=overwrite, resume=resume)
 
     def build(self, scene_file: SceneFile, dtype: torch.dtype | None = None) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant.

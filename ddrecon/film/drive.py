@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from statistics import mean
 from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Any
@@ -25,23 +24,12 @@ from ddrecon.io.volumes.table import field_names, read_field, write_fields
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Together
-from ddrecon.run.checkpoint import (
-    PREVIOUS,
-    continue_from,
-    fingerprint,
-    load_checkpoint,
-    newest_checkpoint,
-)
-from ddrecon.run.drive import advance, drive_run, open_run
+from ddrecon.run.checkpoint import PREVIOUS, fingerprint, newest_checkpoint
+from ddrecon.run.drive import optimize_in_folder
+from ddrecon.run.job import CHECKPOINTS, Checkpoints, Iterations, drive, resume
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
-from ddrecon.run.run_folder import (
-    CHECKPOINTS,
-    SCENE,
-    Checkpoints,
-    volume_file,
-    write_volume,
-)
+from ddrecon.run.run_folder import SCENE, volume_file, write_volume
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
@@ -118,26 +106,22 @@ def _report(film: Film) -> dict[str, Any]:
 def drive_frames(film: Film, numbers: Sequence[int]) -> Iterator[int]:
     """Yields the frames `numbers` of `film` as they are finished.
 
-    A frame that fails is named, skipped, and gone back to once, from both sides; where it fails
-    again, its error is raised when all others are done.
+    A frame that fails is named and left out; its error is raised when all others are done.
     """
     with film.claim():
         calibrate(film)
-    failed = dict[int, DdreconError]()
-    for is_second in (False, True):
-        for number in [*failed] if is_second else numbers:
-            try:
-                _drive_frame(film, number, is_second)
-                failed.pop(number, None)
-            except (SolveError, FormatError, SceneError) as error:
-                failed[number] = error
-                action = "left out" if is_second else "skipped for now"
-                first, *_ = str(error).splitlines()
-                warnings.warn(f"frame {number}, {action}: {first}", DataWarning, 2)
-                continue
-            yield number
-    if failed:
-        raise next(iter(failed.values()))
+    failures = list[DdreconError]()
+    for number in numbers:
+        try:
+            _drive_frame(film, number)
+        except (SolveError, FormatError, SceneError) as error:
+            failures.append(error)
+            first, *_ = str(error).splitlines()
+            warnings.warn(f"frame {number}, left out: {first}", DataWarning, 2)
+            continue
+        yield number
+    if failures:
+        raise failures[0]
 
 
 def calibrate(film: Film) -> None:
@@ -162,41 +146,39 @@ def calibrate(film: Film) -> None:
         f"frame {number}": fingerprint(file, dtype)
         for number, file in zip(numbers, files, strict=True)
     }
-    folder = film.path / "calibration"
-    checkpoints = folder / CHECKPOINTS
-    checkpoints.mkdir(parents=True, exist_ok=True)
-    if newest_checkpoint(checkpoints) is not None:
-        state, loaded = load_checkpoint(checkpoints, described)
-        together.restore(state)
-        continue_from(loaded)
-
-    def make_iteration() -> str:
-        return f"PSNR {mean(row.psnr for row in together.advance()):.1f} dB"
-
-    title = f"calibrate by {len(numbers)} frames"
-    saved = Checkpoints(folder, described)
-    advance(together, make_iteration, saved, film.is_quiet, title)
+    job, saved = Iterations(together), Checkpoints(film.path / "calibration", described)
+    saved.folder.mkdir(parents=True, exist_ok=True)
+    if newest_checkpoint(saved.folder) is not None:
+        resume(job, saved)
+    drive(job, saved, f"calibrate by {len(numbers)} frames", film.is_quiet)
     for number, frame in zip(numbers, together.frames, strict=True):
         grid = frame.problem.scene.volume.grid
         for p in frame.parameters:
             if p.is_field:
                 write_volume(film.calibrated(number), p.name, p.value_on(grid), grid)
     write_shared(path, together, numbers)
-    for file in checkpoints.iterdir():
+    for file in saved.folder.iterdir():
         file.unlink()
     film.shared = read_shared(path)
 
 
-def _drive_frame(film: Film, number: int, is_second: bool) -> None:
-    """Finishes the frame `number`, from where it was, or anew where it `is_second` time."""
+def _drive_frame(film: Film, number: int) -> None:
+    """Finishes the frame `number`, from where it was."""
     folder = film.of(number)
     if number not in film.done():
         with claim_folder(folder, RUN, overwrite=True) as claimed:
-            resume = newest_checkpoint(folder / CHECKPOINTS) is not None and not is_second
-            scene_file = read_scene(folder / SCENE) if resume else film.scene_of(number, is_second)
-            arguments = film.build(scene_file), scene_file, claimed, film.environment
-            run, run_folder = open_run(*arguments, resume=resume)
-            drive_run(run, run_folder, film.preview_every, film.is_quiet, f"frame {number}")
+            is_resumed = newest_checkpoint(folder / CHECKPOINTS) is not None
+            scene_file = read_scene(folder / SCENE) if is_resumed else film.scene_of(number)
+            optimize_in_folder(
+                film.build(scene_file),
+                scene_file,
+                claimed,
+                film.environment,
+                is_resumed=is_resumed,
+                preview_every=film.preview_every,
+                is_quiet=film.is_quiet,
+                frame=f"frame {number}",
+            )
             (folder / CHECKPOINTS / PREVIOUS).unlink(missing_ok=True)
     if not volume_file(folder, VELOCITY).is_file():
         film.write_velocity(number)

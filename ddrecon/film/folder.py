@@ -101,16 +101,15 @@ class Film:
         """The folder of the volumes that the frame `number` had in the calibration."""
         return self.path / "calibration" / f"{number:04d}"
 
-    def scene_of(self, number: int, is_between: bool) -> SceneFile:
+    def scene_of(self, number: int) -> SceneFile:
         """The scene of the frame `number`, with what is shared fixed.
 
-        It begins with the frames before it, or with those on both sides where it `is_between` them.
         What it begins with is written to its folder.
         """
         described = describe(at_frame(self.scene_file, number))
         fix(described, self.shared.get("values", {}), self.path / SHARED)
         optimize = described["optimize"]
-        fields = self._start(number, [*optimize["parameters"]], is_between)
+        fields = self._start(number, [*optimize["parameters"]])
         start = self.of(number).absolute() / "start"
         for name, value in fields.items():
             file = start / write_volume(start, name, value, self.grid)
@@ -119,36 +118,27 @@ class Film:
             optimize["keep_start"] = MIXED
         return read_described(described, self.scene_file.path)
 
-    def _start(self, number: int, names: list[str], is_between: bool) -> dict[str, Tensor]:
+    def _start(self, number: int, names: list[str]) -> dict[str, Tensor]:
         """What the frame `number` begins with: those of the variables `names` that are fields.
 
-        They are those that it had in the calibration where no frame close before it is done, nor
-        one after it where it `is_between` them; none where it had none.
+        They are those of a frame close before it, carried on, else those that it had in the
+        calibration, if any.
         """
-        earlier, later = self._near(number)
-        later = later if is_between else []
-        if not earlier and not later:
+        before = self._before(number)
+        if before is None:
             return _fields_in(self.calibrated(number), names)
-        if not earlier or not later:
-            nearest = earlier[-1] if earlier else later[0]
-            fields, motion = _fields_in(self.of(nearest), names), self._velocity(nearest)
-            if motion is None:
-                return fields
-            # The air goes on as it went, and its motion with it.
-            displacement = motion * (number - nearest)
-            displacement = carry(displacement, displacement)
-            return {name: carry(value, displacement) for name, value in fields.items()}
-        last, following = earlier[-1], later[0]
-        motion = self._flow(last, following)
-        ours, theirs = (_fields_in(self.of(frame), names) for frame in (last, following))
-        forth, back = ((number - frame) * motion for frame in (last, following))
-        return {name: (carry(ours[name], forth) + carry(theirs[name], back)) / 2 for name in ours}
+        fields, motion = _fields_in(self.of(before), names), self._velocity(before)
+        if motion is None:
+            return fields
+        # The air goes on as it went, and its motion with it.
+        displacement = motion * (number - before)
+        displacement = carry(displacement, displacement)
+        return {name: carry(value, displacement) for name, value in fields.items()}
 
-    def _near(self, number: int) -> tuple[list[int], list[int]]:
-        """The frames that are done and close to the frame `number`: before it, and after it."""
+    def _before(self, number: int) -> int | None:
+        """The last frame that is done close before the frame `number`."""
         far = MOST_APART * self.frames.step
-        near = [n for n in self.done() if 0 < abs(n - number) <= far]
-        return [n for n in near if n < number], [n for n in near if n > number]
+        return max((n for n in self.done() if 0 < number - n <= far), default=None)
 
     def _flow(self, start: int, end: int) -> Tensor:
         """The motion a frame from frame `start` to `end`, in cells: [3, z, y, x]."""
@@ -172,11 +162,11 @@ class Film:
 
         The first frame of a part has that of the second.
         """
-        earlier, _ = self._near(number)
-        if not earlier:
+        before = self._before(number)
+        if before is None:
             return
-        motion = self._flow(earlier[-1], number) * self._cell
-        for frame in (number, earlier[-1]):
+        motion = self._flow(before, number) * self._cell
+        for frame in (number, before):
             with claim_folder(self.of(frame), RUN, resume=True, tell=self._tell):
                 if not volume_file(self.of(frame), VELOCITY).is_file():
                     write_volume(self.of(frame), VELOCITY, motion.flip(0), self.grid)

@@ -19,7 +19,6 @@ import torch
 
 from ddrecon.errors import DataWarning, FormatError, UsageError
 from ddrecon.io.files.atomic import refusals, replace_file_durably
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene_file.load import SceneFile, describe, referenced_files
 
 FORMAT = 9
@@ -82,14 +81,6 @@ def continue_from(loaded: Path) -> None:
     """Makes the checkpoint `loaded` the last one: what was damaged after it goes."""
     with refusals(loaded):
         os.replace(loaded, loaded.with_name(LAST))
-
-
-def restore_run(run: Reconstruction, state: dict[str, Any], loaded: Path) -> None:
-    """Has `run` go on from the `state` in the file `loaded`; FormatError where it does not fit."""
-    try:
-        run.restore(state)
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise FormatError(loaded, UNUSABLE) from error
 
 
 def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:

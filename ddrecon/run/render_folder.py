@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,6 +16,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
 from ddrecon.extras import advice
+from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
 from ddrecon.io.images.table import (
     NO_LAYERS,
@@ -54,47 +55,91 @@ MOVIES = {".mp4": write_film, ".png": write_animation}
 """What writes movies, by their suffixes."""
 
 
-def render_to_folder(
-    scene: Scene,
-    views: list[View],
-    folder: Path,
-    has_components: bool,
-    progress: Progress,
-    parameter: str | None = None,
-    kinds: Sequence[str] = (),
-) -> dict[str, Any]:
-    """The report of rendering `views` of `scene`, with their components if asked for, to `folder`.
+@dataclass(frozen=True)
+class Choice:
+    """What is rendered of a scene: the views `names`, or all; with a `count` so many around it.
 
-    With a `parameter`, which `require_variation` must allow, also the images' derivatives by it.
-    The fluence is written in files of these `kinds`. The first rank alone writes.
+    A scene that `is_relit` or `is_moved`, to a `size` (width, height) of its own, is compared with
+    no picture. With a `parameter` there are derivatives by it as well; the fluence is written as
+    .npz, and `exported` as another kind. A `movie` has `fps` views a second.
+    """
+
+    names: tuple[str, ...] = ()
+    components: bool = False
+    parameter: str | None = None
+    count: int | None = None
+    has_fluence: bool = False
+    exported: str | None = None
+    is_relit: bool = False
+    is_moved: bool = False
+    size: tuple[int, int] | None = None
+    movie: Path | None = None
+    fps: float = 24.0
+
+
+def choose_views(
+    scene: Scene, choice: Choice, are_rounds_said: bool
+) -> tuple[Scene, Sequence[View]]:
+    """The scene that is rendered, and its views that are.
+
+    Raises UsageError unless the parameter of the `choice` names a number of the scene.
+    """
+    if choice.has_fluence and not are_rounds_said:
+        # light in empty cells, which views do not see, takes a second one
+        rounds = scene.diffusion.rounds
+        scene.diffusion = replace(scene.diffusion, transport_rounds=rounds and max(rounds, 2))
+    views = [scene.view(name) for name in dict.fromkeys(choice.names)] or scene.views
+    if choice.count is not None:
+        views = place_turntable(scene, views[0], choice.count)
+        scene = replace(scene, views=views)
+    elif choice.is_relit or choice.is_moved:
+        views = [View(view.name, view.camera) for view in views]
+        scene = replace(scene, views=views)
+    if choice.movie is not None:
+        require_movie(choice.movie, views)
+    if choice.parameter is not None:
+        require_variation(scene, choice.parameter)
+    return scene, views
+
+
+def render_to_folder(
+    scene: Scene, views: Sequence[View], folder: Path, choice: Choice, progress: Progress
+) -> dict[str, Any]:
+    """The report of rendering `views` of `scene` to `folder`, which it is written to as well.
+
+    The first rank alone writes; that of others is empty.
     """
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
-    with torch.no_grad(), varied(scene, parameter) as world:
+    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
+    with torch.no_grad(), varied(scene, choice.parameter) as world:
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
-        fluence_files = _write_fluence(light_field, scene, folder, kinds) if kinds else []
-        parts = ["", *(COMPONENTS if has_components else ())]
-        names = [*parts, *(MATTE if has_components else ())]
-        if parameter is not None:
+        fluence_files = _write_fluence(light_field, scene, folder, [*kinds]) if kinds else []
+        parts = ["", *(COMPONENTS if choice.components else ())]
+        names = [*parts, *(MATTE if choice.components else ())]
+        if choice.parameter is not None:
             names += [GRADIENT + part for part in parts]
         for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
             seconds[view.name], files[view.name] = elapsed, []
-            stem, pictures = folder / view.name, dict(images)
-            if parameter is not None:
-                slopes = {part: pictures.pop(GRADIENT + part) for part in parts}
-                stem_of_slopes = stem.with_name(stem.name + GRADIENT)
-                shown = {part: diverging(slope) for part, slope in slopes.items()}
-                scales |= {stem_of_slopes.name + part: full for part, (_, full) in shown.items()}
-                previews = {part: preview for part, (preview, _) in shown.items()}
-                files[view.name] += _write_images(stem_of_slopes, slopes, previews)
-            files[view.name][:0] = _write_images(stem, pictures)
+            stem = folder / view.name
+            shown = {name: image for name, image in images.items() if not name.startswith(GRADIENT)}
+            files[view.name] += _write_images(stem, shown)
+            if choice.parameter is not None:
+                stem = stem.with_name(stem.name + GRADIENT)
+                slopes = {part: images[GRADIENT + part] for part in parts}
+                signed = {part: diverging(slope) for part, slope in slopes.items()}
+                scales |= {stem.name + part: full for part, (_, full) in signed.items()}
+                previews = {part: preview for part, (preview, _) in signed.items()}
+                files[view.name] += _write_images(stem, slopes, previews)
             if view.image is not None:
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
                 quality[view.name] = float(target.psnr_of(images[""]))
+    if not is_first():
+        return {}
     solves = [{**asdict(r), "residual": float(r.residual)} for r in memory.records]
     report: dict[str, Any] = {
         "seconds": {"light": light_seconds, "views": seconds},
@@ -112,8 +157,12 @@ def render_to_folder(
         }
     if fluence_files:
         report["fluence"] = fluence_files
-    if parameter is not None:
-        report["gradient"] = {"parameter": parameter, "full_scale": scales}
+    if choice.parameter is not None:
+        report["gradient"] = {"parameter": choice.parameter, "full_scale": scales}
+    movie = choice.movie or (None if choice.count is None else folder / "ring.png")
+    if movie is not None:
+        report |= write_movie(views, folder, movie, choice.fps)
+    write_json(folder / "render.json", report)
     return report
 
 
@@ -164,7 +213,7 @@ def require_movie(path: Path, views: Sequence[View]) -> None:
         raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
 
 
-def write_movie(views: list[View], folder: Path, path: Path, fps: float) -> dict[str, Any]:
+def write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> dict[str, Any]:
     """What the report says of the movie at `path` of all `views` in `folder`.
 
     Its exposure is that of all previews from now on: the brightest view is just white.
@@ -177,16 +226,6 @@ def write_movie(views: list[View], folder: Path, path: Path, fps: float) -> dict
         write_preview(folder / f"{view.name}.png", image)
     preview = f"sRGB of linear radiance: {white:.6g} and more is white"
     return {"movie": {"file": str(path), "white": white}, "preview": preview}
-
-
-def remove_targets(scene: Scene, views: list[View], count: int | None) -> Scene:
-    """`scene` with `views` alone, and without their target images.
-
-    With `count`, so many views around the volume from the first of `views` take their place.
-    """
-    if count is not None:
-        return replace(scene, views=place_turntable(scene, views[0], count))
-    return replace(scene, views=[View(view.name, view.camera) for view in views])
 
 
 def require_variation(scene: Scene, parameter: str) -> None:
@@ -269,7 +308,7 @@ def _images(
 def _render_in_turns(
     light_field: LightField,
     scene: Scene,
-    views: list[View],
+    views: Sequence[View],
     names: Sequence[str],
     progress: Progress,
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:

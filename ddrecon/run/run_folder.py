@@ -17,21 +17,16 @@ from ddrecon.grid import Grid
 from ddrecon.io.files.atomic import flush, refusals, write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
-from ddrecon.progress import Progress
-from ddrecon.reconstruct.loop import Reconstruction, Together
+from ddrecon.progress import Progress, say
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.checkpoint import (
-    continue_from,
-    load_checkpoint,
-    newest_checkpoint,
-    restore_run,
-    save_checkpoint,
-)
+from ddrecon.run.checkpoint import load_checkpoint, newest_checkpoint
 from ddrecon.run.diagnoses import diagnose
+from ddrecon.run.job import CHECKPOINTS, Iterations, restore
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import Findings, describe_loss, find_results
-from ddrecon.run.report import GOES_ON, list_numbers, write_run_report
+from ddrecon.run.report import FINER, GOES_ON, list_numbers, write_run_report
 from ddrecon.run.result import RESULT, describe_result, plain, poses_of, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import (
@@ -52,12 +47,8 @@ from ddrecon.variables.kinds import (
 )
 from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
-CHECKPOINTS, SCENE = "checkpoints", "scene.yaml"
-"""Where a run folder keeps its checkpoints, and its resolved scene."""
-CHECKPOINT_SECONDS = 60.0
-"""A run writes a checkpoint about this often,"""
-CHECKPOINT_SHARE = 0.05
-"""unless that would take more than this part of its time."""
+SCENE = "scene.yaml"
+"""The resolved scene of a run."""
 PAGE_SECONDS, PAGE_SHARE = 20.0, 0.02
 """The report is written about this often, and takes at most this part of the run's time."""
 REPORT, SUMMARY = "report.html", "summary.json"
@@ -75,7 +66,7 @@ def load_run(folder: Path, build: Callable[[torch.dtype], Scene]) -> Reconstruct
     run = Reconstruction(
         build(next(iter(state["frames"][0]["parameters"].values()))["value"].dtype)
     )
-    restore_run(run, state, loaded)
+    restore(run, state, loaded)
     return run
 
 
@@ -87,96 +78,73 @@ def require_run(folder: Path) -> Path:
     return checkpoints
 
 
-class Checkpoints:
-    """The checkpoints in the folder `path` of a run, or of several together, written now and then.
+class RunFolder(Iterations):
+    """The job of a `run` of `scene_file` in an `environment`, and its folder, `path`.
 
-    `result_of` describes what the result depends on.
+    Pictures are written each `preview_every` iterations; with `is_silent` nothing is told.
     """
-
-    def __init__(self, path: Path, result_of: Mapping[str, Any]):
-        self.checkpoints, self.result_of = path / CHECKPOINTS, result_of
-        self.saved, self.next_save = -1, 0.0
-
-    def save(self, run: Together) -> None:
-        """Writes a checkpoint, unless the last is of this very iteration."""
-        if self.saved != run.iteration:
-            start = monotonic()
-            save_checkpoint(self.checkpoints, run.state(), self.result_of)
-            self.note_saved(run, monotonic() - start)
-
-    def save_in_time(self, run: Together) -> None:
-        """Writes a checkpoint if the last is old."""
-        if monotonic() >= self.next_save:
-            self.save(run)
-
-    def note_saved(self, run: Together, seconds: float) -> None:
-        """Notes that the last checkpoint is of `run` as it is, and took so many `seconds`."""
-        self.saved = run.iteration
-        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
-
-
-class RunFolder(Checkpoints):
-    """The output folder `path` of one run of `scene_file` in an `environment`."""
 
     def __init__(
         self,
+        run: Reconstruction,
         path: Path,
         scene_file: SceneFile,
-        result_of: Mapping[str, Any],
         environment: Mapping[str, Any],
+        preview_every: int | None = None,
+        is_silent: bool = True,
     ):
-        super().__init__(path, result_of)
-        self.path, self.scene_file, self.environment = path, scene_file, environment
-        with refusals(path):
-            for name in ("volumes", "previews", CHECKPOINTS):
-                (path / name).mkdir(exist_ok=True)
+        super().__init__(run)
+        self.run, self.path, self.scene_file, self.environment = run, path, scene_file, environment
+        self.preview_every, self.is_silent, self.cells = preview_every, is_silent, 0
         self.log = LossLog(path / "loss.csv")
         self.next_page = monotonic() + PAGE_SECONDS
 
-    def start(self, run: Reconstruction) -> None:
-        """Begins the log and the checkpoints of a new run."""
-        self.log.cut(0)
-        self.save(run)
+    def begin(self) -> None:
+        """Makes the folders, and cuts the log to end where the run does."""
+        with refusals(self.path):
+            for name in ("volumes", "previews"):
+                (self.path / name).mkdir(exist_ok=True)
+        write_json(self.path / "environment.json", self.environment)
+        self.log.cut(self.iteration)
 
-    def resume(self, run: Reconstruction, loaded: Path) -> None:
-        """Goes on with `run` from the checkpoint `loaded`.
+    def step(self) -> str:
+        """Makes an iteration and its row of the log; how near its pictures are.
 
-        The log is cut to end where it does, and a damaged checkpoint after it is replaced.
+        Now and then it writes the report of the run so far.
         """
-        continue_from(loaded)
-        self.log.cut(run.iteration)
-        self.note_saved(run, 0.0)
+        row = self.run.step()
+        self.log.add(row)
+        if self.cells not in (0, row.cells):
+            text = f"iteration {row.iteration}: {row.cells:,} cells from here; {FINER}"
+            say(text, self.is_silent)
+        self.cells = row.cells
+        if self.preview_every and row.iteration % self.preview_every == 0:
+            self._pictures(find_results(self.run), f".{row.iteration:06d}")
+        start = monotonic()
+        if start >= self.next_page and not self.is_done:
+            findings = find_results(self.run)
+            summary = _summary(self.run) | {"ended": GOES_ON, "diagnoses": []}
+            self._report(findings, summary)
+            seconds = monotonic() - start
+            self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
+        test_psnr = self.run.total.test_psnr
+        test = "" if test_psnr is None else f"/{test_psnr:.1f}"
+        return f"PSNR {row.psnr:.1f}{test} dB"
 
-    def save(self, run: Together) -> None:
-        """Writes a checkpoint after the log, which therefore has all rows that it counts."""
+    def state(self) -> dict[str, Any]:
+        """That of the run; the log has all rows that it counts."""
         flush(self.log.path)
-        super().save(run)
+        return super().state()
 
-    def save_in_time(self, run: Together) -> None:
-        """Writes a checkpoint if the last is old, and likewise the report of the run so far."""
-        super().save_in_time(run)
-        if isinstance(run, Reconstruction) and run.iteration:
-            start = monotonic()
-            if start >= self.next_page:
-                findings = find_results(run)
-                summary = _summary(run) | {"ended": GOES_ON}
-                self._report(run, findings, summary | {"views": findings.quality, "diagnoses": []})
-                seconds = monotonic() - start
-                self.next_page = monotonic() + max(PAGE_SECONDS, seconds / PAGE_SHARE)
-
-    def _report(self, run: Reconstruction, findings: Findings, summary: Mapping[str, Any]) -> None:
-        rows = self.log.rows(run.iteration)
+    def _report(self, findings: Findings, summary: Mapping[str, Any]) -> None:
+        run, rows = self.run, self.log.rows(self.iteration)
         numbers = list_numbers(run.parameters, run.problem.scene, findings.scene)
         path = self.path / REPORT
         write_run_report(path, findings, rows, summary, self.environment, numbers)
 
-    def preview(self, run: Reconstruction) -> None:
-        """Writes pictures of every view and of the volume, marked with the iteration."""
-        self._pictures(find_results(run), f".{run.iteration:06d}")
-
-    def finish(self, run: Reconstruction, progress: Progress) -> dict[str, Any]:
-        """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
-        self.save(run)
+    def finish(self, progress: Progress) -> dict[str, Any]:
+        """The summary of the run; writes it and volumes, parameters, result, pictures, report."""
+        run = self.run
         findings = find_results(run, progress)
         scene = findings.scene
         names = result_names([parameter.name for parameter in run.parameters])
@@ -192,7 +160,7 @@ class RunFolder(Checkpoints):
         seen = [view["registered"] for view in findings.quality.values() if "registered" in view]
         if seen:
             summary["registered"] = {key: mean(view[key] for view in seen) for key in seen[0]}
-        self._report(run, findings, summary)
+        self._report(findings, summary)
         write_json(self.path / SUMMARY, summary)
         return summary
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from time import perf_counter
 from typing import Any
 
 import torch
@@ -31,15 +32,16 @@ MOST_ROUNDS = 16
 
 
 class Uncertainty:
-    """Experiments about what `run`, which is done, has found; `step` makes one iteration of them.
+    """Experiments, so many `wanted`, about what `run`, which is done, has found: a job.
 
     `values` are what was found, by name, and `errors` of each experiment so far how far it was from
     its own `truth`. `residuals` [3, h, w] are what is left of each training view's target, by name,
     and `noise`, of all pictures, replaces what the scene says; `deviation` is that of all pixels.
     """
 
-    def __init__(self, run: Reconstruction, seed: int, noise: Noise | None = None):
+    def __init__(self, run: Reconstruction, seed: int, wanted: int = 2, noise: Noise | None = None):
         self.run, self.parameters, self.seed = run, run.parameters, seed
+        self.wanted, self.noise, self.seconds = wanted, noise, 0.0
         views, settings = run.level.train.views, run.problem.settings
         self.values = {p.name: p.value.detach() for p in run.parameters}
         images = photograph(run.level.train, self.values)
@@ -74,12 +76,27 @@ class Uncertainty:
         """How many iterations have been made, of all experiments."""
         return self.count * self.run.iteration + (self.trial.iteration if self.trial else 0)
 
-    def step(self) -> None:
+    @property
+    def total(self) -> int:
+        """How many iterations there are at most."""
+        return self.wanted * self.run.iteration
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all experiments are made."""
+        return self.count >= self.wanted
+
+    def step(self) -> str:
         """One more iteration; the last one of an experiment ends it."""
+        start, text = perf_counter(), f"experiment {self.count + 1}"
         trial = self.trial = self.trial or self._begin()
         trial.step()
-        if not trial.is_done and trial.iteration < self.run.iteration:
-            return
+        if trial.is_done or trial.iteration >= self.run.iteration:
+            self._end(trial)
+        self.seconds += perf_counter() - start
+        return text
+
+    def _end(self, trial: Reconstruction) -> None:
         values = {p.name: p.value.detach() for p in trial.parameters}
         self.errors.append({name: values[name] - self.truth[name] for name in values})
         self.trial = None
@@ -93,11 +110,13 @@ class Uncertainty:
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
         trial = None if self.trial is None else self.trial.state()
-        return {"errors": self.errors, "truth": self.truth, "trial": trial}
+        names = "errors", "truth", "seconds"
+        return {name: getattr(self, name) for name in names} | {"trial": trial}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up where `state` was."""
         like = next(iter(self.values.values()))
+        self.seconds = state["seconds"]
         self.errors = [{n: e.to(like) for n, e in entries.items()} for entries in state["errors"]]
         self.truth = {name: value.to(like) for name, value in state["truth"].items()}
         if state["trial"] is not None:

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.io.files.atomic import write_json
-from ddrecon.io.files.folders import UNCERTAINTY, kind_of_folder
+from ddrecon.io.files.folders import UNCERTAINTY, Folder, kind_of_folder
+from ddrecon.ranks import leave_ranks
 from ddrecon.report.page import write_page
+from ddrecon.run.job import Checkpoints, drive, resume
 from ddrecon.run.report import describe_fields
 from ddrecon.run.run_folder import write_values
 from ddrecon.uncertainty.deviations import RATIO, Deviations
+from ddrecon.uncertainty.experiments import Uncertainty
 from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import fields_of
 
@@ -25,16 +28,45 @@ ASSUMED = (
 )
 
 
-def write_deviations(deviations: Deviations, path: Path, seconds: float) -> dict[str, Any]:
+def experiment_in_folder(
+    experiments: Uncertainty, claimed: Folder | None, *, is_resumed: bool, is_quiet: bool
+) -> dict[str, Any]:
+    """What `uncertainty.json` says after the `experiments`, in the folder that is `claimed`.
+
+    It `is_resumed` from there. A rank whose folder is None does its part and writes nothing.
+    """
+    saved = None if claimed is None else Checkpoints(claimed.path, _describe(experiments))
+    if is_resumed:
+        resume(experiments, saved)
+    elif claimed is not None:
+        claimed.clear()
+    drive(experiments, saved, "uncertainty", is_quiet)
+    # What is left the first rank does by itself.
+    if claimed is None:
+        return {}
+    leave_ranks()
+    return write_deviations(Deviations(experiments), claimed.path)
+
+
+def _describe(experiments: Uncertainty) -> dict[str, Any]:
+    """What experiments depend on, in plain values, so that only those of the same run go on."""
+    run, noise = experiments.run, experiments.noise
+    sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
+    described = {"iteration": run.iteration, "values": sums, "seed": experiments.seed}
+    return described | {"noise": None if noise is None else vars(noise)}
+
+
+def write_deviations(deviations: Deviations, path: Path) -> dict[str, Any]:
     """What `uncertainty.json` says; writes it, volumes and report to `path`."""
     experiments, fields = deviations.experiments, deviations.fields
+    (path / "volumes").mkdir(exist_ok=True)
     for name, field in fields.items():
         for kind, values in {"std": field.deviation, "mean": field.value}.items():
             stem, is_map = path / "volumes" / f"{name}_{kind}", not kind_of(name).is_cellwise
             write_values(stem, stem.name, values, field.parameter.grid, is_map=is_map)
     record: dict[str, Any] = {
         "experiments": experiments.count,
-        "seconds": seconds,
+        "seconds": experiments.seconds,
         "iterations": experiments.iteration,
         "noise": {
             "deviation": experiments.deviation,
@@ -62,7 +94,7 @@ def write_deviations(deviations: Deviations, path: Path, seconds: float) -> dict
 
 
 def volumes_in(folder: Path) -> list[Path]:
-    """The volumes of the `folder` that `drive_uncertainty` wrote, in order; else none."""
+    """The volumes of the `folder` of experiments, in order; else none."""
     is_sure = kind_of_folder(folder) == UNCERTAINTY
     return sorted((folder / "volumes").glob("*.npz")) if is_sure else []
 

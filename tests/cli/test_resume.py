@@ -14,7 +14,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import LOCK, hold
 from ddrecon.reconstruct import recording, tuning
 from ddrecon.reconstruct.search import Search
-from ddrecon.run import drive, quality
+from ddrecon.run import job, quality
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
@@ -110,14 +110,14 @@ def test_what_is_resumed_is_read_once_no_other_process_can_write(
     succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     succeed(*OPTIMIZE, "out")
-    load = drive.load_checkpoint
+    load = job.load_checkpoint
 
     def load_locked(*arguments: Any) -> Any:
         with pytest.raises(UsageError, match="is writing there"), hold(Path("out", LOCK)):
             pass
         return load(*arguments)
 
-    monkeypatch.setattr(drive, "load_checkpoint", load_locked)
+    monkeypatch.setattr(job, "load_checkpoint", load_locked)
     succeed(*OPTIMIZE, "out", "--resume")
 
 

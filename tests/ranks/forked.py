@@ -28,9 +28,9 @@ from zero_tangents import ask_python
 # pictures and derivatives in forward mode need.
 from ddrecon.cli import main
 from ddrecon.errors import FormatError
-from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.loop import Together
 
-for name in ("cli.session", "run.render_folder", "scene_file.doubts", "uncertainty.drive"):
+for name in ("cli.session", "run.render_folder", "scene_file.doubts", "uncertainty.folder"):
     import_module(f"ddrecon.{name}")
 PIL.Image.init()
 ask_python(everything=False)
@@ -83,16 +83,16 @@ def do(job: dict[str, Any], rank: int) -> int:
 
 def fail_before(iteration: int, how: str) -> None:
     """Has this process fail before it makes `iteration`."""
-    step = Reconstruction.step
+    advance = Together.advance
 
-    def fail(run: Reconstruction) -> Any:
+    def fail(run: Together) -> Any:
         if run.iteration + 1 == iteration:
             if how == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
             raise FormatError("some.file", how)
-        return step(run)
+        return advance(run)
 
-    Reconstruction.step = fail  # type: ignore[method-assign]
+    Together.advance = fail  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

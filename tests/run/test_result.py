@@ -79,10 +79,10 @@ def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g
         parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
     (folder / "out").mkdir()
     dump_scene(describe(scene_file), folder / "out" / "scene.yaml")
-    run_folder = RunFolder(folder / "out", scene_file, {}, {})
-    run_folder.start(run)
+    run_folder = RunFolder(run, folder / "out", scene_file, {})
+    run_folder.begin()
     run_folder.log.add(row)
-    run_folder.finish(run, lambda views, _: views)
+    run_folder.finish(lambda views, _: views)
     return run.current_scene()
 
 

@@ -23,7 +23,7 @@ import torch
 from tiny_scene import write_scene
 
 from ddrecon.cli.commands import main
-from ddrecon.run import run_folder
+from ddrecon.run import job
 
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
@@ -141,7 +141,7 @@ def fill(folder: Path, count: int, whole: dict[str, object]) -> dict[str, object
 def run(folder: Path, signals: int, shortages: int) -> None:
     torch.set_num_threads(1)
     random.seed(0)
-    run_folder.CHECKPOINT_SECONDS, run_folder.CHECKPOINT_SHARE = 0.0, 1e9
+    job.CHECKPOINT_SECONDS, job.CHECKPOINT_SHARE = 0.0, 1e9
     write_scene(folder)
     # Here, so that what is imported on the way is imported once.
     with suppress(SystemExit), redirect_stdout(StringIO()):

@@ -12,9 +12,7 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.search import Search
-from ddrecon.run import drive
 from ddrecon.run.checkpoint import (
     LAST,
     MOST_CHANGES,
@@ -23,6 +21,7 @@ from ddrecon.run.checkpoint import (
     require_same,
     save_checkpoint,
 )
+from ddrecon.run.job import Checkpoints, Job
 
 pytestmark = pytest.mark.slow
 
@@ -173,18 +172,18 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
 def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As often as they are to be, unless they take more than their share of the time."""
     saved: list[int] = []
-    original = drive.RunFolder.save
+    original = Checkpoints.save
 
-    def save(self: drive.RunFolder, run: Reconstruction) -> None:
-        saved.append(run.iteration)
-        original(self, run)
+    def save(self: Checkpoints, job: Job) -> None:
+        saved.append(job.iteration)
+        original(self, job)
 
-    monkeypatch.setattr(drive.RunFolder, "save", save)
-    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
+    monkeypatch.setattr(Checkpoints, "save", save)
+    monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e9)
     run(*OPTIMIZE, "--iterations", "4")
-    assert saved == [0, 0, 1, 2, 3, 4]
+    assert saved == [0, 1, 2, 3, 4]
     saved.clear()
-    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e-9)
+    monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e-9)
     run(*OPTIMIZE, "--iterations", "4", "--overwrite")
     assert saved == [0, 4]

@@ -35,7 +35,7 @@ def found_of(values: dict[str, Tensor]) -> Uncertainty:
     found.parameters = [parameter_of(name, value) for name, value in values.items()]
     found.values, found.truth = values, dict(values)
     found.run, found.trial = SimpleNamespace(iteration=1), None
-    found.seed, found.errors = 0, []
+    found.seed, found.errors, found.seconds = 0, [], 0.0
     return found
 
 
@@ -64,7 +64,7 @@ def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does(
     )
     wrong = float((near - far).abs().mean())
     for noise in (None, Noise(0.08, 0.0)):
-        found = Uncertainty(run, 0, noise)
+        found = Uncertainty(run, 0, noise=noise)
         for found.errors, signs in (([], [-1]), ([{}], [-1, 1])):
             views = found._begin().problem.train.views
             for view, given, as_run, true in zip(views, scene.views, near, far, strict=True):
