@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
 from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol, write_vti
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
-from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
+from ddrecon.io.volumes.vdb_read import describe_vdb, read_vdb, vdb_names
+from ddrecon.io.volumes.vdb_write import write_vdb
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,13 @@ class VolumeFormat:
     """How one kind of volume file is read and written.
 
     Without `names`, a file holds one field and does not name it; without `write` it is only read.
+    `describe` says what else is in it, for JSON.
     """
 
     write: Callable[[Path, Fields, np.ndarray], None] | None
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
+    describe: Callable[[Path], dict[str, Any]] | None = None
 
 
 def refuse_reading(path: Path, *_: str) -> NoReturn:
@@ -39,7 +42,7 @@ def refuse_reading(path: Path, *_: str) -> NoReturn:
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, describe_vdb),
     ".vti": VolumeFormat(write_vti, refuse_reading, refuse_reading),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(write_stack, read_stack)),
