@@ -181,13 +181,13 @@ class _File:
         assert grid.coding is not None
         return Tree(self.stream, grid.coding, grid.begin)
 
-    def measure(self, grid: Grid) -> tuple[np.ndarray, int]:
-        """The box [2, 3] of voxels of `grid`, as `Tree.measure`, and how many are active."""
-        box, count = self.tree_of(grid).measure(grid.name)
+    def measure(self, grid: Grid) -> np.ndarray:
+        """The box [2, 3] of the voxels of `grid` that are active, or cells of ours."""
+        box, _ = self.tree_of(grid).measure(grid.name)
         cells = grid.labels.get(RESOLUTION, b"")
         if len(cells) == 12 and min(sides := struct.unpack("<3i", cells)) > 0:
             box = join(box, np.array([[0, 0, 0], sides]))
-        return box, count
+        return box
 
     def place(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         """The box [2, 3] of voxels of all grids like `grid`, and the center [3] of its first.
@@ -199,7 +199,7 @@ class _File:
         box, is_motion = NOWHERE, grid.name.lower() in MOTION
         for name, shift in same.items():
             if is_motion or name.lower() not in MOTION:
-                box = join(box, self.measure(self.grids[name])[0] + shift)
+                box = join(box, self.measure(self.grids[name]) + shift)
         if (box[0] >= box[1]).any():
             raise FormatError(self.path, f"{grid.name} has no active voxel")
         assert grid.coding is not None
@@ -233,7 +233,7 @@ def describe_vdb(path: Path) -> dict[str, Any]:
         methods = [method for flag, method in COMPRESSIONS.items() if grid.flags & flag]
         grids[name] = {"tree": grid.tree, "class": grid.kind, "compression": methods}
         if not grid.fault:
-            box, count = file.measure(grid)
+            box, count = file.tree_of(grid).measure(name)
             low, high = (box if count else np.zeros((2, 3), int)).tolist()
             grids[name] |= {"active": count, "voxels": [low, high], "transform": grid.map}
             grids[name] |= {"voxel": np.linalg.norm(grid.steps, axis=1).tolist()}
@@ -259,8 +259,9 @@ def read_vdb(path: Path, name: str) -> Field:
     # The same by index: its axes are exchanged, and run backward where a step does.
     by_index = values.transpose(2, 1, 0, 3)[tuple(slice(None, None, sign) for sign in signs)]
     tree.fill(by_index.transpose(*np.argsort(order), 3), box[0])
-    corners = center + np.stack([[-0.5] * 3, sides - 0.5]) @ grid.steps
-    return check_field(path, name, values, np.sort(corners, axis=0))
+    corner = center - grid.steps.sum(0) / 2
+    bounds = np.sort([corner, corner + sides @ grid.steps], axis=0)
+    return check_field(path, name, values, bounds)
 
 
 def _find_axes(steps: np.ndarray) -> tuple[np.ndarray, list[int]] | None:
@@ -272,9 +273,7 @@ def _find_axes(steps: np.ndarray) -> tuple[np.ndarray, list[int]] | None:
     return order, [int(np.sign(steps[index, axis])) for axis, index in enumerate(order)]
 
 
-def _read_turned(
-    file: _File, grid: Grid, tree: Tree, box: np.ndarray, center: np.ndarray
-) -> Field:
+def _read_turned(file: _File, grid: Grid, tree: Tree, box: np.ndarray, center: np.ndarray) -> Field:
     """The `tree` of a turned `grid`, of which `box` has its first voxel at `center`, resampled.
 
     In an upright box around it, in cubes of its shortest step, by trilinear interpolation.

@@ -1,7 +1,7 @@
-"""Trees of OpenVDB files: a root, upper nodes of 32³ children, lower nodes of 16³, leaves of 8³ voxels.
+"""Trees of OpenVDB files: root, upper nodes (32³ children), lower nodes (16³), leaves (8³).
 
-A file has first the topology of a tree: each node before its children, with the values of its
-tiles, which are children that are the same all over, and of leaves which voxels are active. Then it
+A file has the topology of a tree first: each node before its children, with the values of its
+tiles, which are children that are the same all over; of leaves, which voxels are active. Then it
 has the voxels, leaf by leaf. Indices run as OpenVDB's do, z fastest.
 """
 
@@ -98,13 +98,13 @@ class Nodes:
 
         Without any, the first are behind the last.
         """
-        is_some = self.is_active.any(tuple(range(1, self.is_active.ndim)))
+        is_some = self.is_active if self.is_active.ndim == 1 else self.is_active.any(1)
         corners, ends = self.corners[is_some], self.corners[is_some] + self.side
         count = len(corners) * self.side**3
         if self.values is None:
             blocks = self.is_active[is_some].reshape(-1, SIDE, SIDE, SIDE)
             count, starts = int(np.count_nonzero(blocks)), corners
-            along = [blocks.any((2, 3)), blocks.any((1, 3)), blocks.any((1, 2))]
+            along = [np.asarray(blocks.any(others)) for others in ((2, 3), (1, 3), (1, 2))]
             corners = starts + np.stack([active.argmax(1) for active in along], 1)
             ends = starts + SIDE - np.stack([active[:, ::-1].argmax(1) for active in along], 1)
         if not len(corners):
@@ -151,7 +151,7 @@ class Tree:
             if packed > 0 and self.coding.flags & BLOSC:
                 data = unpack_blosc(stream.path, data, size)
             elif packed > 0:
-                data = zlib.decompressobj().decompress(data, size or 1)
+                data = zlib.decompressobj().decompress(data, size + 1)  # no more, of a bomb
         if len(data) != size:
             raise ValueError(f"values of {size} bytes have {len(data)}")
         return np.frombuffer(data, stored).reshape(count, self.coding.components)
@@ -237,7 +237,7 @@ class Tree:
     def fill(self, values: np.ndarray, low: np.ndarray) -> None:
         """Writes the tree's values to `values` [x, y, z, C], the voxels from the index `low` on."""
         values[:] = self.background
-        leaves = list[np.ndarray]()
+        leaves = list[list[int]]()
         for nodes in self.read_topology():
             starts = (nodes.corners - low).tolist()
             if nodes.values is None:
