@@ -156,6 +156,6 @@ def _advise_on_cells(width: float) -> str:
     if width < TOO_WIDE:
         return ""
     return (
-        f", which show less than the pictures: {CELL:g} would do, by smaller cells "
-        f"(volume.resolution: auto) or by pictures {width / CELL:.2g} times smaller"
+        f", which show less than the pictures: a run averages {int(width / CELL)} x"
+        f" {int(width / CELL)} pixels; smaller cells (volume.resolution: auto) show more"
     )

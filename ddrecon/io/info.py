@@ -28,7 +28,7 @@ def describe(path: Path) -> dict[str, Any]:
         report = describe_medium(values, {}, bounds)
         for name, field in fields.items():
             report["fields"][name] |= {"unit": field.unit} if field.unit else {}
-        if more := FORMATS[suffix].describe:
+        if more := FORMATS[path.suffix.lower()].describe:
             report |= more(path)
         return report | ({"no_fields": reasons} if reasons else {})
     image = read_image(path)

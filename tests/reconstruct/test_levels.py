@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ddrecon.cameras import Camera, cast_rays
+from ddrecon.cameras import Camera, cast_rays, pixel_width
 from ddrecon.grid import Grid
+from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level
 
 
@@ -31,6 +33,35 @@ def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
     for fine_view, view in zip(ball_scene.views, coarse.views, strict=True):
         assert torch.allclose(view.image.mean(), fine_view.image.mean(), rtol=1e-5)
         assert tuple(view.image.shape[1:]) == view.camera.size
+
+
+@pytest.mark.parametrize("times", [1, 6, 24])
+def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times: int) -> None:
+    """A photograph of ten million pixels shows a grid of 32^3 cells no better than a small one."""
+    view, grid = ball_scene.views[0], ball_scene.volume.grid
+    image = view.image.repeat_interleave(times, 1).repeat_interleave(times, 2)
+    large = replace(view, image=image, camera=replace(view.camera, size=tuple(image.shape[1:])))
+    (averaged,) = scene_at_level(replace(ball_scene, views=[large]), 1).views
+    middle = view.camera.pose.new_tensor(grid.center_xyz)
+    before, after = (min(grid.spacing) / pixel_width(v.camera, middle) for v in (large, averaged))
+    assert averaged.image.shape[1:] == averaged.camera.size
+    assert averaged is large if before < 2 * tuning.CELL else tuning.CELL <= after < 3.5
+    assert torch.allclose(averaged.image.mean(), view.image.mean(), rtol=1e-3)
+
+
+def test_noise_of_averaged_pictures_is_less(ball_scene) -> None:
+    """The loss that given noise explains is that of pictures with such noise, at each level."""
+    noise = Noise(0.03, 0.0)
+    view = ball_scene.views[0]
+    black = replace(view, image=torch.zeros(3, 96, 96), noise=noise, mask=None)
+    black = replace(black, camera=replace(view.camera, size=(96, 96)))
+    noisy = replace(black, image=0.03 * torch.randn(3, 96, 96, generator=torch.manual_seed(0)))
+    frame = Frame(replace(ball_scene, views=[noisy]), None)
+    for level in range(len(frame.problem.factors)):
+        frame.enter(level)
+        (shown,) = frame.level.train.views
+        loss = float(shown.image.square().mean()) / frame.problem.power
+        assert frame.noise_loss() == pytest.approx(loss, rel=0.1)
 
 
 def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
