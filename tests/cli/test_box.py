@@ -145,12 +145,13 @@ def test_smoke_outside_of_the_box_is_refused_and_far_off_is_told(
 def test_cells_far_wider_than_pixels_and_far_too_many_are_told(
     scene: Callable[..., Path], run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With by how much smaller pictures would do."""
+    """With how many pixels a run averages."""
     scene()
     told = run("check", "auto.yaml", "-D", "volume.resolution=[3, 3, 3]").stdout
     (width,) = re.findall("cells: (.*) to", told)
-    assert f"by pictures {float(width) / 2:.1g}" in told and "times smaller" in told
-    assert "times smaller" not in run("check", "auto.yaml").stdout
+    size = int(float(width) / 2)
+    assert f"averages {size} x {size} pixels" in told
+    assert "averages" not in run("check", "auto.yaml").stdout
     x, y, z = read_scene("auto.yaml").tree.volume.resolution
     monkeypatch.setattr("ddrecon.scene_file.box.MANY_CELLS", x * y * z // 8 + 1)
     told = run("check", "auto.yaml").stderr

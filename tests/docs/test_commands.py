@@ -59,7 +59,7 @@ def quick(command: str) -> list[str]:
         "gradcheck": [*ONE_PARAMETER, *NO_ROUNDS, "-D", "ground=null"],
     }.get(name, [])
     if rest[0].startswith("configs"):
-        is_empty = name in ("render", "bench") and "density" not in command
+        is_empty = name in ("render", "bench") and ".vdb" not in command
         added += fewer_cells(rest[0]) + (ONE if is_empty else [])
     return [name, *rest, *added]
 
