@@ -54,7 +54,12 @@ def fit_volume(scene_file: SceneFile) -> SceneFile:
             fault = f"{x} x {y} x {z} cells two pixels wide take hours: {fewer}"
             warnings.warn(f"volume.resolution: {fault}", DataWarning, 2)
         sides = cell * sides.new_tensor(resolution)
-    if not isinstance(bounds, Bounds):
+    if isinstance(bounds, Bounds):
+        # Other programs take cubes: the box grows upwards, to the right and backward for them.
+        grows = [name not in tree.volume.periodic for name in "xyz"]
+        ends = (corners[0] + sides).where(torch.tensor(grows), corners[1]).tolist()
+        bounds = Bounds(bounds.min, (ends[0], ends[1], ends[2]))
+    else:
         digits = 3 - math.floor(math.log10(float(sides.max())))
         low = [round(x, digits) for x in (middle - sides / 2).tolist()]
         # Sides have more digits, or cells would be no cubes.

@@ -84,6 +84,28 @@ def test_a_box_holds_what_is_seen_and_little_more(scene: Callable[..., Path], le
     assert read_scene("plain.yaml").tree == found.tree
 
 
+@pytest.mark.parametrize("periodic", [False, True])
+def test_cells_of_a_box_in_numbers_are_cubes_but_for_its_period(
+    scene: Callable[..., Path], periodic: bool
+) -> None:
+    """The box keeps its lower corner, and grows by less than a cell."""
+    low, high = np.array([-1.0, -0.9, -0.8]), np.array([1.0, 1.13, 0.97])
+    box = f"{{min: {low.tolist()}, max: {high.tolist()}}}"
+    along = ["volume.periodic=[x]"] if periodic else []
+    volume = read_scene(scene(), [f"volume.bounds={box}", *along]).tree.volume
+    bounds = np.array([volume.bounds.min, volume.bounds.max])
+    cells = (bounds[1] - bounds[0]) / volume.resolution
+    np.testing.assert_allclose(cells[1:], cells[1], rtol=1e-6)
+    assert np.array_equal(bounds[0], low)
+    grown = (bounds[1] - high) / cells
+    assert (grown >= -1e-9).all() and (grown < 1).all()
+    assert (
+        (bounds[1, 0] == high[0] and cells[0] < cells[1])
+        if periodic
+        else cells[0] > 0.99 * cells[1]
+    )
+
+
 def test_dark_smoke_before_something_bright_has_the_box_of_bright_smoke(
     scene: Callable[..., Path], run: Callable[..., Result]
 ) -> None:
