@@ -40,8 +40,9 @@ def write_film_report(film: Film) -> dict[str, Any]:
         registered = summaries[number].get("registered", {})
         row |= {f"registered_{key}": value for key, value in registered.items()}
         rows.append({"frame": number, **row})
-    calibration = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
-    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | calibration
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows}
+    if values := film.shared.get("values"):
+        record["values"] = values
     write_json(film.path / RECORD, record)
     if rows:
         write_page(
@@ -51,7 +52,7 @@ def write_film_report(film: Film) -> dict[str, Any]:
             goes_on=len(rows) < record["asked"],
             plots={"heading": "Quality", "drawn": _curves(rows)},
             frames=_figures(film, summaries),
-            numbers=_calibration(film.shared) if calibration.get("values") else None,
+            numbers=_calibration(film.shared) if values else None,
         )
     return record
 
@@ -111,23 +112,11 @@ def _strip(path: Path) -> np.ndarray:
 
 
 def _calibration(shared: Mapping[str, Any]) -> dict[str, Any]:
-    """What all frames share, and by how much those that found it disagree."""
-
-    def text_of(numbers: Any) -> str:
-        return ", ".join(f"{number:.4g}" for number in np.ravel(numbers))
-
-    texts, rows = shared.get("texts", {}), []
-    for name in shared["values"]:
-        spread = shared.get("spread", {}).get(name, [])
-        if name.endswith(".camera") and spread:
-            spread = f"turned {text_of(spread[:3])} rad, moved {text_of(spread[3:])} u"
-        else:
-            spread = text_of(spread)
-        rows.append((name, texts.get(name, f"in {SHARED}"), spread))
-    frames = ", ".join(map(str, shared.get("frames", [])))
-    text = (
-        f"Found from frames {frames} together. The last column is the standard deviation, from "
-        "frame to frame, of what each alone would change with its volume as it is."
-    )
-    head = ["number", "value", "spread"]
-    return {"heading": "Calibration", "head": head, "rows": rows, "text": text}
+    """What all frames share."""
+    texts, frames = shared.get("texts", {}), ", ".join(map(str, shared.get("frames", [])))
+    return {
+        "heading": "Calibration",
+        "head": ["number", "value"],
+        "rows": [(name, texts.get(name, f"in {SHARED}")) for name in shared["values"]],
+        "text": f"Found from frames {frames} together.",
+    }
