@@ -326,14 +326,16 @@ def uncertainty(
     from ddrecon.uncertainty.folder import experiment_in_folder, uncertainty_lines
 
     require_no_film(run)
-    taken = load_run(run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype))
-    if taken.level.train.volume.grid != taken.problem.scene.volume.grid:
+    reconstruction = load_run(
+        run, lambda dtype: session.build(session.read(run / "scene.yaml"), dtype)
+    )
+    if reconstruction.level.train.volume.grid != reconstruction.problem.scene.volume.grid:
         raise UsageError(
             f"{run}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"
         )
     noise = None if read is None else Noise(read, 0.0)
-    job = Uncertainty(taken, session.seed, experiments, noise)
+    job = Uncertainty(reconstruction, session.seed, experiments, noise)
     with session.claim(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
         record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
     if record:

@@ -61,11 +61,12 @@ def draw_curve(
     # What is drawn: thinned, and by its logarithm where asked for.
     drawn = dict[str, list[Point]]()
     for name, points in series.items():
-        kept = [(x, y) for x, y in points if math.isfinite(y)]
+        finite = [(x, y) for x, y in points if math.isfinite(y)]
         if is_logarithmic:
-            kept = [(x, math.log10(y)) for x, y in kept if y > 0]
-        if kept:
-            drawn[name] = [*kept[: len(kept) - 1 : max(1, len(kept) // MOST_POINTS)], kept[-1]]
+            finite = [(x, math.log10(y)) for x, y in finite if y > 0]
+        if finite:
+            stride = max(1, len(finite) // MOST_POINTS)
+            drawn[name] = [*finite[: len(finite) - 1 : stride], finite[-1]]
     left, right, across_at = _axis([x for p in drawn.values() for x, _ in p], LEFT, WIDTH - RIGHT)
     low, high, up_at = _axis([y for p in drawn.values() for _, y in p], HEIGHT - BOTTOM, TOP)
     plot = Plot(title)

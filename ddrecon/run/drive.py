@@ -57,8 +57,8 @@ def optimize_in_folder(
     if is_resumed:
         resume(folder, saved)
         if run.iteration > run.schedule.most:
-            made = f"{run.iteration} iterations are made already"
-            raise UsageError(f"{path}: {made}; ask for more than that, in all, with --iterations")
+            advice = "ask for more than that, in all, with --iterations"
+            raise UsageError(f"{path}: {run.iteration} iterations are made already; {advice}")
     write_scene(scene_file, path)
     if not is_resumed:
         claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])

@@ -58,7 +58,7 @@ def write_run_report(
     """
     scene = findings.scene
     versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
-    found = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
+    table = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
     write_page(
         path,
         title=f"ddrecon: {path.absolute().parent.name}",
@@ -68,7 +68,7 @@ def write_run_report(
         volume=describe_findings(findings, summary),
         plots={"heading": "Loss", "drawn": curves(rows), "text": _explain_steps(rows)},
         views=describe_views(findings),
-        numbers=found if numbers else None,
+        numbers=table if numbers else None,
         physics=needed_terms(scene),
         settings=path.with_name("scene.yaml").read_text(encoding="utf-8"),
         environment=[(name, " ".join(map(str, values))) for name, values in versions],

@@ -354,8 +354,11 @@ def test_a_frame_that_fails_is_named_and_left_to_a_resume(film: Path, run: Run) 
     assert warned.startswith(f"warning: frame 1, left out: {film}/front_01.npy: ")
     assert told.startswith(f"{film}/front_01.npy: ")
     assert len(json.loads(Path("out/film.json").read_text())["frames"]) == FRAMES - 1
+    page, refresh = Path("out/report.html"), 'http-equiv="refresh"'
+    assert refresh in page.read_text()
     np.save("front_01.npy", np.load("front_00.npy"))
     assert run(*optimize("-o", "out", "--resume", *FEW)).exit_code == 0
+    assert refresh not in page.read_text()
 
 
 @pytest.mark.parametrize(
