@@ -23,8 +23,7 @@ from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, find_white_value
-from ddrecon.run.quality import Findings
-from ddrecon.run.registration import shift_between
+from ddrecon.run.quality import Findings, shift_between
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import upright_axis
