@@ -19,7 +19,7 @@ from ddrecon.pictures import srgb
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import pixels, shrink
-from ddrecon.run.report import registered_text
+from ddrecon.run.report import psnr_text
 from ddrecon.run.run_folder import REPORT, SUMMARY
 
 RECORD, MOVIE = "film.json", "movie.png"
@@ -65,12 +65,9 @@ def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
 def _lead(record: Mapping[str, Any]) -> str:
     rows = record["frames"]
     means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
-    text = f"PSNR {means['psnr']:.2f} dB"
-    if "test_psnr" in means:
-        registered = {key: means[f"registered_{key}"] for key in ("psnr", "ssim", "shift")}
-        text += (
-            f", test PSNR {means['test_psnr']:.2f} dB (registered {registered_text(registered)})"
-        )
+    kind = "registered_"
+    registered = {k.removeprefix(kind): v for k, v in means.items() if k.startswith(kind)}
+    text = psnr_text({**means, "registered": registered})
     return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {text}"
 
 

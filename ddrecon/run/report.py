@@ -99,17 +99,21 @@ def list_numbers(
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
     cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
-    test = ""
-    if summary["test_psnr"] is not None:
-        test = (
-            f", {summary['test_psnr']:.2f} dB (SSIM {summary['test_ssim']:.4f}) of views held out"
-        )
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"PSNR {summary['psnr']:.2f} dB of views trained on{test}. "
-        f"All of these compare {summary['compared']}; the loss is {summary['loss_function']}."
-        f" It {summary['ended']['text']}."
+        f"{psnr_text(summary)}; all compare {summary['compared']}. "
+        f"The loss is {summary['loss_function']}. It {summary['ended']['text']}."
     )
+
+
+def psnr_text(summary: Mapping[str, Any]) -> str:
+    """How near the pictures of a run are, of those trained on and those held out."""
+    text = f"PSNR {summary['psnr']:.2f} dB"
+    if summary.get("test_psnr") is not None:
+        text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    if registered := summary.get("registered"):
+        text += f" (registered {registered_text(registered)})"
+    return text
 
 
 def describe_findings(findings: Findings, summary: Mapping[str, Any]) -> dict[str, Any]:
