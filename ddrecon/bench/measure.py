@@ -236,7 +236,9 @@ def run_bench(
         for samples in paths:
             contestants[f"Mitsuba {samples} paths a pixel"] = partial(trace, tracer, samples)
     shots = measure(contestants, 1 if is_quick else TURNS, progress)
-    return with_best([row_of(name, taken, exact.get(name), truth) for name, taken in shots.items()])
+    return with_best(
+        [row_of(name, series, exact.get(name), truth) for name, series in shots.items()]
+    )
 
 
 def measure(

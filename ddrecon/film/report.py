@@ -19,7 +19,7 @@ from ddrecon.pictures import srgb
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import pixels, shrink
-from ddrecon.run.report import registered_text
+from ddrecon.run.report import psnr_text
 from ddrecon.run.run_folder import REPORT, SUMMARY
 
 RECORD, MOVIE = "film.json", "movie.png"
@@ -42,8 +42,9 @@ def write_film_report(film: Film) -> dict[str, Any]:
         registered = summaries[number].get("registered", {})
         row |= {f"registered_{key}": value for key, value in registered.items()}
         rows.append({"frame": number, **row})
-    calibration = {key: film.shared[key] for key in ("values", "spread") if key in film.shared}
-    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows} | calibration
+    record: dict[str, Any] = {"asked": len(film.frames.numbers), "frames": rows}
+    if values := film.shared.get("values"):
+        record["values"] = values
     write_json(film.path / RECORD, record)
     if rows:
         write_page(
@@ -53,7 +54,7 @@ def write_film_report(film: Film) -> dict[str, Any]:
             goes_on=len(rows) < record["asked"],
             plots={"heading": "Quality", "drawn": _curves(rows)},
             frames=_figures(film, summaries),
-            numbers=_calibration(film.shared) if calibration.get("values") else None,
+            numbers=_calibration(film.shared) if values else None,
         )
     return record
 
@@ -66,12 +67,9 @@ def film_lines(record: Mapping[str, Any], folder: Path) -> list[str]:
 def _lead(record: Mapping[str, Any]) -> str:
     rows = record["frames"]
     means = {key: mean(row[key] for row in rows if key in row) for key in rows[0]}
-    text = f"PSNR {means['psnr']:.2f} dB"
-    if "test_psnr" in means:
-        registered = {key: means[f"registered_{key}"] for key in ("psnr", "ssim", "shift")}
-        text += (
-            f", test PSNR {means['test_psnr']:.2f} dB (registered {registered_text(registered)})"
-        )
+    kind = "registered_"
+    registered = {k.removeprefix(kind): v for k, v in means.items() if k.startswith(kind)}
+    text = psnr_text({**means, "registered": registered})
     return f"{len(rows)} of {record['asked']} frames, {means['seconds']:.1f} s each: {text}"
 
 
@@ -114,23 +112,11 @@ def _strip(path: Path) -> np.ndarray:
 
 
 def _calibration(shared: Mapping[str, Any]) -> dict[str, Any]:
-    """What all frames share, and by how much those that found it disagree."""
-
-    def text_of(numbers: Any) -> str:
-        return ", ".join(f"{number:.4g}" for number in np.ravel(numbers))
-
-    texts, rows = shared.get("texts", {}), []
-    for name in shared["values"]:
-        spread = shared.get("spread", {}).get(name, [])
-        if name.endswith(".camera") and spread:
-            spread = f"turned {text_of(spread[:3])} rad, moved {text_of(spread[3:])} u"
-        else:
-            spread = text_of(spread)
-        rows.append((name, texts.get(name, f"in {SHARED}"), spread))
-    frames = ", ".join(map(str, shared.get("frames", [])))
-    text = (
-        f"Found from frames {frames} together. The last column is the standard deviation, from "
-        "frame to frame, of what each alone would change with its volume as it is."
-    )
-    head = ["number", "value", "spread"]
-    return {"heading": "Calibration", "head": head, "rows": rows, "text": text}
+    """What all frames share."""
+    texts, frames = shared.get("texts", {}), ", ".join(map(str, shared.get("frames", [])))
+    return {
+        "heading": "Calibration",
+        "head": ["number", "value"],
+        "rows": [(name, texts.get(name, f"in {SHARED}")) for name in shared["values"]],
+        "text": f"Found from frames {frames} together.",
+    }

@@ -1,7 +1,6 @@
 """Cameras, exposures and lights, which do not change in a film: found once, and then fixed.
 
-It is found from several frames together; `shared.json` keeps it, with what is known of it: by how
-much the frames disagree.
+It is found from several frames together; `shared.json` keeps it.
 """
 
 from __future__ import annotations
@@ -34,10 +33,9 @@ def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
             values[p.name] = {"file": write_values(stem, p.name, value, grid, is_map=True)}
         else:
             values[p.name] = poses.get(p.name) or plain(value)
-    spread = {name: value.tolist() for name, value in together.deviations().items()}
     start = together.frames[0].problem.scene
     texts = {name: text for name, _, text in list_numbers(together.shared, start, scene)}
-    write_json(path, {"frames": numbers, "values": values, "spread": spread, "texts": texts})
+    write_json(path, {"frames": numbers, "values": values, "texts": texts})
 
 
 def read_shared(path: Path) -> dict[str, Any]:

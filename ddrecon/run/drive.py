@@ -17,7 +17,7 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import fingerprint
 from ddrecon.run.job import Checkpoints, Iterations, drive, resume
 from ddrecon.run.quality import describe_loss, loss_text
-from ddrecon.run.report import registered_text
+from ddrecon.run.report import psnr_text
 from ddrecon.run.run_folder import SCENE, RunFolder, write_scene
 from ddrecon.scene import Scene
 from ddrecon.scene_file.load import SceneFile, referenced_files
@@ -57,8 +57,8 @@ def optimize_in_folder(
     if is_resumed:
         resume(folder, saved)
         if run.iteration > run.schedule.most:
-            made = f"{run.iteration} iterations are made already"
-            raise UsageError(f"{path}: {made}; ask for more than that, in all, with --iterations")
+            advice = "ask for more than that, in all, with --iterations"
+            raise UsageError(f"{path}: {run.iteration} iterations are made already; {advice}")
     write_scene(scene_file, path)
     if not is_resumed:
         claimed.clear([scene_file.path, path / SCENE, *referenced_files(scene_file)])
@@ -94,13 +94,8 @@ def summary_lines(summary: dict[str, Any], folder: Path, seconds: float) -> list
     line = (
         f"{summary['iterations']} iterations in {summary['seconds']:.1f} s, and {seconds:.1f} s "
         "with all before and after: "
-        f"loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
+        f"loss {summary['loss']:.4g}, {psnr_text(summary)}, of {summary['compared']}"
     )
-    if summary["test_psnr"] is not None:
-        line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
-    if registered := summary.get("registered"):
-        line += f" (registered {registered_text(registered)})"
-    line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     ended = [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
     lines = [line, *ended, *diagnoses, f"density and all else written to {folder}"]

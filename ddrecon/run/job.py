@@ -62,30 +62,24 @@ class Iterations:
 
     @property
     def iteration(self) -> int:
-        """How many iterations are made."""
         return self.together.iteration
 
     @property
     def total(self) -> int | None:
-        """How many iterations there are to be, unless the run ends by itself."""
         schedule = self.together.schedule
         return None if schedule.is_auto else schedule.most
 
     @property
     def is_done(self) -> bool:
-        """Whether no iteration is left."""
         return self.together.is_done
 
     def step(self) -> str:
-        """Makes an iteration; how near its pictures are."""
         return f"PSNR {mean(row.psnr for row in self.together.advance()):.1f} dB"
 
     def state(self) -> dict[str, Any]:
-        """That of the run."""
         return self.together.state()
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Takes up where `state` was."""
         self.together.restore(state)
 
 

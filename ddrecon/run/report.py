@@ -23,8 +23,7 @@ from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
 from ddrecon.report.volumes import Shown, describe_volume, find_white_value
-from ddrecon.run.quality import Findings
-from ddrecon.run.registration import shift_between
+from ddrecon.run.quality import Findings, shift_between
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import upright_axis
@@ -58,7 +57,7 @@ def write_run_report(
     """
     scene = findings.scene
     versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
-    found = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
+    table = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
     write_page(
         path,
         title=f"ddrecon: {path.absolute().parent.name}",
@@ -68,7 +67,7 @@ def write_run_report(
         volume=describe_findings(findings, summary),
         plots={"heading": "Loss", "drawn": curves(rows), "text": _explain_steps(rows)},
         views=describe_views(findings),
-        numbers=found if numbers else None,
+        numbers=table if numbers else None,
         physics=needed_terms(scene),
         settings=path.with_name("scene.yaml").read_text(encoding="utf-8"),
         environment=[(name, " ".join(map(str, values))) for name, values in versions],
@@ -100,17 +99,21 @@ def list_numbers(
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
     cells = " x ".join(str(count) for count in reversed(scene.volume.grid.shape))
-    test = ""
-    if summary["test_psnr"] is not None:
-        test = (
-            f", {summary['test_psnr']:.2f} dB (SSIM {summary['test_ssim']:.4f}) of views held out"
-        )
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"PSNR {summary['psnr']:.2f} dB of views trained on{test}. "
-        f"All of these compare {summary['compared']}; the loss is {summary['loss_function']}."
-        f" It {summary['ended']['text']}."
+        f"{psnr_text(summary)}; all compare {summary['compared']}. "
+        f"The loss is {summary['loss_function']}. It {summary['ended']['text']}."
     )
+
+
+def psnr_text(summary: Mapping[str, Any]) -> str:
+    """How near the pictures of a run are, of those trained on and those held out."""
+    text = f"PSNR {summary['psnr']:.2f} dB"
+    if summary.get("test_psnr") is not None:
+        text += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    if registered := summary.get("registered"):
+        text += f" (registered {registered_text(registered)})"
+    return text
 
 
 def describe_findings(findings: Findings, summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from ddrecon.grid import Grid
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.picture import view_picture
-from ddrecon.run.registration import register, shift_between
+from ddrecon.run.quality import register, shift_between
 
 
 @pytest.mark.parametrize("loss", ["l2", "display"])
