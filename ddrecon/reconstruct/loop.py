@@ -71,8 +71,8 @@ class Together:
             frame.parameters = [shared.get(p.name, p) for p in frame.parameters]
             self.blocks |= {self._key(frame, p): p for p in frame.parameters}
         every = list(self.blocks.values())
-        self.numbers = Numbers([frame.problem.train for frame in self.frames], every)
         problem = self.frames[0].problem
+        self.numbers = Numbers(problem.train, every)
         stages = find_stages(len(problem.factors), problem.train, every)
         self.schedule = Schedule(problem.settings.iterations, stages)
         self.diagonals: Values = {}
@@ -129,15 +129,6 @@ class Together:
     def shared(self) -> list[Parameter]:
         """The parameters that all frames have in common."""
         return [p for p in self.blocks.values() if not p.is_field]
-
-    def deviations(self) -> dict[str, Tensor]:
-        """The disagreement of the frames on each single number, entry by entry, by name."""
-        evaluations = [frame.evaluate() for frame in self.frames]
-        pairs = zip(self.frames, evaluations, strict=True)
-        self.numbers.prepare([frame.point(evaluation.compared) for frame, evaluation in pairs])
-        return self.numbers.deviations(
-            [evaluation.objective.gradients for evaluation in evaluations]
-        )
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""

@@ -53,19 +53,17 @@ class Point:
 
 
 class Numbers:
-    """The single numbers among `parameters`, which the views of several `scenes` show.
+    """The single numbers among `parameters`, which the views of `train` and scenes like it show.
 
     `matrix` is J^T W J between all entries, one after another, with what the calibrations of
     cameras say; `prior` is the latter alone. Both are 0 until `prepare` was called.
     """
 
-    def __init__(self, scenes: Sequence[Scene], parameters: Sequence[Parameter]):
+    def __init__(self, train: Scene, parameters: Sequence[Parameter]):
         self.numbers = single_numbers(parameters)
         self.places = _places(self.numbers)
         size = sum(p.value.numel() for p in self.numbers)
         self.matrix = self.prior = torch.zeros(size, size).double()
-        self.of_scenes = [self.matrix for _ in scenes]
-        train = scenes[0]
         self.gauges = find_gauges(train, self.numbers)
         poses = [p for p in self.numbers if p.key == "camera"]
         # Where some cameras are optimized no calibration is to be mended: they may be far off.
@@ -77,8 +75,8 @@ class Numbers:
 
     def prepare(self, points: Sequence[Point]) -> None:
         """Takes the metric at `points`, one for each scene."""
-        self.of_scenes = [find_matrix(point, self.numbers) for point in points]
-        matrix, prior = torch.stack(self.of_scenes).sum(0), torch.zeros_like(self.matrix)
+        matrix = torch.stack([find_matrix(point, self.numbers) for point in points]).sum(0)
+        prior = torch.zeros_like(matrix)
         for p, precision in self.precisions.items():
             # As strong as what one picture says of a shift in the image by `TRUST` pixels.
             at = self.places[p]
@@ -91,13 +89,11 @@ class Numbers:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
-        return {"matrix": self.matrix, "prior": self.prior, "of_scenes": self.of_scenes}
+        return {"matrix": self.matrix, "prior": self.prior}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Takes up a `state`."""
-        self.matrix, self.prior, self.of_scenes = (
-            state[name] for name in ("matrix", "prior", "of_scenes")
-        )
+        self.matrix, self.prior = state["matrix"], state["prior"]
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
         """What calibrations add to the objective at `values`, and its derivatives by name."""
@@ -119,19 +115,6 @@ class Numbers:
             solution = self._solve(self.matrix, self._join(residual)[at], at)
             result[at] = from_first(solution)
         return self._split(result, residual)
-
-    def deviations(self, gradients: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-        """The disagreement of the scenes on each number, entry by entry, by name.
-
-        It is the standard deviation of the steps that each would make alone, by its `gradients`.
-        """
-        at = torch.arange(len(self.matrix))
-        steps = [
-            self._solve(matrix + self.prior, self._join(bars), at)
-            for matrix, bars in zip(self.of_scenes, gradients, strict=True)
-        ]
-        values = {p.name: p.value for p in self.numbers}
-        return self._split(torch.stack(steps).std(0), values) if len(steps) > 1 else {}
 
     def hold_gauges(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """`values` without what gauges forbid."""

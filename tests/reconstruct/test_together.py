@@ -33,8 +33,6 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
     assert together.is_done
     for run in together.frames:
         torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
-    # Copies have nothing to disagree on.
-    assert all(float(spread.max()) < 1e-4 for spread in together.deviations().values())
 
 
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
@@ -46,7 +44,6 @@ def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     one, two = map(values, together.frames)
     for name in one:
         assert torch.equal(one[name], two[name]) == (name != "density")
-    assert any(float(spread.max()) > 0 for spread in together.deviations().values())
     # It goes on from its state to the same bits.
     again = Together([still, other])
     again.restore(state)
