@@ -32,7 +32,7 @@ from torch.profiler import ProfilerActivity, profile
 from ddrecon.bench.plume import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.errors import MissingExtraError
+from ddrecon.errors import MissingExtraError, SceneError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.lighting import solve_light
 from ddrecon.reconstruct.gradients import differentiate
@@ -206,7 +206,7 @@ def agree(check: Check) -> Iterator[str]:
         use_engine("torch")
         try:
             known = results(path, torch.device("cpu"))
-        except MissingExtraError as error:
+        except (MissingExtraError, SceneError) as error:  # of a volume that is not there
             yield f"| {path.stem} | - | - | - | {error} |"
             continue
         for engine in ENGINES if check.engine == "warp" else ("torch",):

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 
 ROOT = Path(__file__).parents[1]
 ALIKE = ("film", "noisy", "plume", "satellite", "fig06_light", "fig07", "fig08", "fig09")
-ALIKE += ("fig12_single", "fig13", "fire", "ground")
+ALIKE += ("fig12_single", "fig13", "fire", "ground", "cloud")
 """Configs whose lights, media and settings are of the kinds of others."""
 CONFIGS = sorted(one for one in (ROOT / "configs").rglob("*.yaml") if one.stem not in ALIKE)
 CLOSE = {torch.float32: 1e-5, torch.float64: 1e-11}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch.nn.functional import adaptive_avg_pool2d
 
 from ddrecon.cameras import pixel_width
@@ -41,7 +42,7 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
 
 def _view_at_level(view: View, factor: int, grid: Grid) -> View:
     """`view` with up to `factor` times fewer pixels a side than cells of `grid` ask for."""
-    middle = view.camera.pose.new_tensor(grid.center_xyz)
+    middle = torch.tensor(grid.center_xyz)
     width = min(grid.spacing) / pixel_width(view.camera, middle)
     factor *= max(1, int(width / tuning.CELL))
     most = max(1, min(factor, min(view.camera.size) // tuning.FEWEST_PIXELS))
