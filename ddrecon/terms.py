@@ -69,7 +69,8 @@ def _terms(scene: Scene) -> Iterator[str]:
         yield "no multiple scattering: no diffusion solve"
     depth = greatest_depth(volume) / scene.diffusion.times
     samples = _count(scene.render.steps, "sample")
-    yield f"view rays: {samples} a cell of at most {depth:.2g} optical depths"
+    thickest = f" of at most {depth:.2g} optical depths" if depth > 0 else ""
+    yield f"view rays: {samples} a cell{thickest}"
 
 
 def _color_term(scene: Scene) -> str:

@@ -226,7 +226,7 @@ class VolumeSection(MediumSection, BoxSection):
     temperature: In place of `emission`, of a black body [K]: absorption times its radiance, of
         luminance 1 at 1500 K ([E2.11](theory.md#2-the-forward-model)).
     index: Refractive index inside the box, whose flat faces refract and reflect light; outside it
-        is 1. Not with a ground, point lights or cameras inside.
+        is 1. Not with a period, a ground, point lights or cameras inside.
     """
 
     g: Density = bounded(0.0, above=-1, below=1)  # type: ignore[assignment]
