@@ -164,7 +164,9 @@ def _scatter_light(
     """
     name_kernels(medium.extinction.field)
     # Q0 and Q1 are of light not yet scattered; skies' mean enters through the faces (E2.6).
-    received = receive_light(cells, lights, cells.degree)
+    parts = refine_medium(medium, settings.receive or 1)
+    narrow = None if parts is medium else average_cells(parts)
+    received = receive_light(cells, lights, cells.degree, narrow)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]
     scattering = (weigh(light, remaining_moments(cells)) for light in unscattered)
