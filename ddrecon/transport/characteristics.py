@@ -204,8 +204,11 @@ def enter_again(
     """
     first = entering = leave(nothing)
     is_whole = [not any(drift % 1 for drift in course.drift) for course in courses]
-    # Each goes around until it is at rest, whatever the others do.
-    rests = list(is_whole)
+    # Each goes around until it is at rest, whatever the others do; some do not go around.
+    rests = [
+        is_parallel or not course.wraps[0]
+        for is_parallel, course in zip(is_whole, courses, strict=True)
+    ]
     for _ in range(MOST_LAPS):
         if all(rests):
             break

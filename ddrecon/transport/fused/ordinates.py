@@ -169,17 +169,22 @@ def _make_tables(
     points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
     if pieces is None:
-        teams = [Team(o.senses[0], [o], []) for o in ordinates]
+        # Those that go around are followed again and again: they are in chunks of their own.
+        groups = [
+            [Team(o.senses[0], [o], []) for o in ordinates if (o.axis in grid.periodic) == wraps]
+            for wraps in (False, True)
+        ]
     else:
-        teams = _team_rows(ordinates, pieces)
+        groups = [_team_rows(ordinates, pieces)]
     order, rows, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
-    for number in range(0, len(teams), together):
+    starts = ((teams, n) for teams in groups for n in range(0, len(teams), together))
+    for teams, number in starts:
         first, several = len(order), teams[number : number + together]
         for team in several:
             begin, middle = len(order), len(order) + len(team.up)
             order += team.up + team.down
             rows.append([begin, middle, len(order), team.sense])
-        chunks.append(Chunk(first, len(order) - first, number, len(several)))
+        chunks.append(Chunk(first, len(order) - first, len(rows) - len(several), len(several)))
     numbers = [o.number for o in order]
     paths = torch.tensor([o.numbers() for o in order], dtype=torch.float64)
     values, set_weights = harmonics[numbers], harmonics.new_tensor(weights)[numbers, None]
