@@ -183,7 +183,7 @@ class _File:
 
     def measure(self, grid: Grid) -> np.ndarray:
         """The box [2, 3] of the voxels of `grid` that are active, or cells of ours."""
-        box, _ = self.tree_of(grid).measure(grid.name)
+        box, _ = self.tree_of(grid).measure()
         cells = grid.labels.get(RESOLUTION, b"")
         if len(cells) == 12 and min(sides := struct.unpack("<3i", cells)) > 0:
             box = join(box, np.array([[0, 0, 0], sides]))
@@ -232,12 +232,16 @@ def describe_vdb(path: Path) -> dict[str, Any]:
     for name, grid in file.grids.items():
         methods = [method for flag, method in COMPRESSIONS.items() if grid.flags & flag]
         grids[name] = {"tree": grid.tree, "class": grid.kind, "compression": methods}
-        if not grid.fault:
-            box, count = file.tree_of(grid).measure(name)
-            low, high = (box if count else np.zeros((2, 3), int)).tolist()
-            grids[name] |= {"active": count, "voxels": [low, high], "transform": grid.map}
-            grids[name] |= {"voxel": np.linalg.norm(grid.steps, axis=1).tolist()}
-            grids[name] |= {"origin": grid.origin.tolist()}
+        if grid.fault:
+            continue
+        box, count = file.tree_of(grid).measure()
+        grids[name] |= {
+            "active": count,
+            "voxels": (box if count else 0 * box).tolist(),
+            "transform": grid.map,
+            "voxel": np.linalg.norm(grid.steps, axis=1).tolist(),
+            "origin": grid.origin.tolist(),
+        }
     return {"file_version": file.version, "grids": grids}
 
 

@@ -221,17 +221,12 @@ class Tree:
             for child in children:
                 yield from self.read_node(child, *below)
 
-    def measure(self, name: str) -> tuple[np.ndarray, int]:
-        """The box [2, 3] of active voxels, as `Nodes.measure`, and their number.
-
-        Raises FormatError where a box around the tree, called `name`, takes too much memory.
-        """
+    def measure(self) -> tuple[np.ndarray, int]:
+        """The box [2, 3] of active voxels, as `Nodes.measure`, and their number."""
         box, count = NOWHERE, 0
         for nodes in self.read_topology():
             box_of_nodes, active = nodes.measure()
             box, count = join(box, box_of_nodes), count + active
-            if count:
-                check_box(self.stream.path, name, box, self.coding.components)
         return box, count
 
     def fill(self, values: np.ndarray, low: np.ndarray) -> None:

@@ -142,6 +142,26 @@ def test_a_damaged_block_of_lz4(packed: bytes, size: int) -> None:
         unpack_lz4(packed, size)
 
 
+def test_a_stream_that_grows_without_end_is_left() -> None:
+    """No more is unpacked than there should be: here ten megabytes from forty kilobytes."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="damaged"):
+            unpack_lz4(b"\x1fa\x01\x00" + b"\xff" * 40000 + b"\0\0", 300)
+        assert tracemalloc.get_traced_memory()[1] < 10**5
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("place", [3, 4, 8])
+def test_a_header_of_nothing(place: int) -> None:
+    """Numbers, chunks and blocks have bytes."""
+    chunk = bytearray(vdb_files.pack_blosc(bytes(range(100))))
+    chunk[place] = 0
+    with pytest.raises(ValueError, match="a packed chunk of 100 bytes has"):
+        unpack_blosc(Path("a.vdb"), bytes(chunk), 100)
+
+
 def test_another_codec_of_blosc_is_named() -> None:
     for codec, name in ((0, "BloscLZ"), (4, "Zstandard"), (7, "codec 7")):
         chunk = bytearray(vdb_files.pack_blosc(bytes(100)))
@@ -161,6 +181,9 @@ def test_a_shared_tree_has_its_own_transform(tmp_path: Path) -> None:
     second.parent = "heat"
     told = refusal(write_file(path, first, second), "density[1]")
     assert told == "density[1] shares the tree of heat, which is not there"
+    second.parent, first.parent = first.name, second.name
+    told = refusal(write_file(path, first, second), "density[0]")
+    assert told == "density[0] shares the tree of density[1], which is not there"
 
 
 def moved(*steps: float, by: tuple[float, float, float] = (0, 0, 0)) -> tuple[str, list[float]]:
@@ -171,7 +194,7 @@ def test_grids_with_the_same_voxels_share_a_box(tmp_path: Path) -> None:
     """Also where their voxels are counted from elsewhere; a velocity widens no other grid's box."""
     leaf_of = {(0, 0, 0): (np.ones((512, 1)), np.ones(512, bool))}
     density = Grid(leaves=leaf_of, map=moved(0.1, 0.2, 0.3))
-    heat = Grid("heat", leaves=leaf_of, map=moved(0.1, 0.2, 0.3, by=(1.6, 0, -0.3)))
+    heat = Grid("heat", leaves=leaf_of, map=moved(0.1, 0.2, 0.3, by=(1.6 + 1e-9, 0, -0.3)))
     finer = Grid("finer", leaves=leaf_of, map=moved(0.05, 0.2, 0.3))
     aside = Grid("aside", leaves=leaf_of, map=moved(0.1, 0.2, 0.3, by=(0.05, 0, 0)))
     empty = Grid("empty", map=moved(0.1, 0.2, 0.3))
@@ -311,6 +334,14 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         assert told == f"is of the file version {version}; 220 to 225 are read"
     write_file(path, Grid(leaves=FULL), has_places=0)
     assert refusal(path) == "was written as a stream: save it as a file, by OpenVDB's File"
+    whole = write_file(path, Grid(leaves=FULL)).read_bytes()
+    begin = struct.pack("<q", at := whole.index(b"Tree") + len("Tree_float_5_4_3") + 4 + 24)
+    for wrong in (0, at - 1, 2**62):
+        path.write_bytes(whole.replace(begin, struct.pack("<q", wrong)))
+        assert refusal(path).startswith(f"is damaged: density begins at {wrong} and ends at ")
+    ones = np.ones(512, "<f4").tobytes()
+    path.write_bytes(whole.replace(b"\0" + ones, b"\7" + ones))
+    assert refusal(path) == "is damaged: a node has the code 7"
     path.write_bytes(b"VDB" * 100)
     assert refusal(path) == "is no OpenVDB file"
 
