@@ -208,7 +208,7 @@ def _render(
         if choice.is_moved:
             scene_file = remove_pictures(scene_file, choice.size)
         chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
-        if choice.movie is not None:
+        if choice.movie is not None and folder is not None:
             require_movie(choice.movie, chosen[1], output)
         if folder is not None:
             folder.clear([scene_file.path, *referenced_files(scene_file)])
