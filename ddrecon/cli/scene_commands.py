@@ -192,7 +192,7 @@ def _render(
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
     scene_file = session.read(scene)
-    from ddrecon.io.files.folders import RENDER
+    from ddrecon.io.files.folders import RENDER, require_free_files
     from ddrecon.run.render_folder import (
         Choice,
         choose_views,
@@ -209,6 +209,7 @@ def _render(
             scene_file = remove_pictures(scene_file, choice.size)
         chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
         if choice.movie is not None and folder is not None:
+            require_free_files([choice.movie], may_exist=overwrite)
             require_movie(choice.movie, chosen[1], output)
         if folder is not None:
             folder.clear([scene_file.path, *referenced_files(scene_file)])

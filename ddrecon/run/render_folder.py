@@ -214,8 +214,6 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
         raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
     if path.is_dir():
         raise UsageError(f"--movie {path}: is a folder")
-    if not path.parent.is_dir():
-        raise UsageError(f"--movie {path}: there is no folder {path.parent}")
     if path.resolve() in {(folder / f"{view.name}.png").resolve() for view in views}:
         raise UsageError(f"--movie {path}: is the preview of a view; choose another name")
     if path.suffix.lower() == ".mp4":
