@@ -16,7 +16,7 @@ from warnings import warn
 
 import click
 
-from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_session
+from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, FiniteRange, in_session
 from ddrecon.errors import DataWarning, UsageError
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 MOST_SIDE = 2**15
 """Pixels along a side, at most."""
+MOST_AROUND = 10000
+"""Views of a ring, at most, as of `views.ring` in a scene file."""
 EXPORTED = click.Choice(["vdb", "npz"])
 
 
@@ -104,7 +106,7 @@ def balance(session: Session, scene: Path) -> None:
 @click.option(
     "--ring",
     "count",
-    type=click.IntRange(min=2),
+    type=click.IntRange(2, MOST_AROUND),
     metavar="N",
     help="N views around the volume instead, and a movie of them, ring.png or --movie.",
 )
@@ -128,7 +130,7 @@ def balance(session: Session, scene: Path) -> None:
 )
 @click.option(
     "--fps",
-    type=click.FloatRange(1, 240),
+    type=FiniteRange(1, 240),
     default=24.0,
     show_default=True,
     help="Its pictures a second.",
@@ -168,6 +170,8 @@ def render(
             raise click.UsageError("--frames is for the folders of films: SCENE is none")
         session.show(*_render(session, scene, output, overwrite, options))
         return
+    if options["movie"] is not None:
+        raise click.UsageError("--movie is of one frame: name it, such as FILM/frames/0003")
     from ddrecon.film.folder import finished_frames
 
     with session.claim(output, RENDER, overwrite=overwrite) as folder:
@@ -188,8 +192,14 @@ def _render(
 ) -> tuple[dict[str, Any], list[str]]:
     """The report of `render` on the one `scene`, and its lines; on the first rank alone."""
     scene_file = session.read(scene)
-    from ddrecon.io.files.folders import RENDER
-    from ddrecon.run.render_folder import Choice, choose_views, render_lines, render_to_folder
+    from ddrecon.io.files.folders import RENDER, require_free_files
+    from ddrecon.run.render_folder import (
+        Choice,
+        choose_views,
+        render_lines,
+        render_to_folder,
+        require_movie,
+    )
     from ddrecon.scene_file.build_views import remove_pictures
     from ddrecon.scene_file.load import referenced_files
 
@@ -198,6 +208,9 @@ def _render(
         if choice.is_moved:
             scene_file = remove_pictures(scene_file, choice.size)
         chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
+        if choice.movie is not None and folder is not None:
+            require_free_files([choice.movie], may_exist=overwrite)
+            require_movie(choice.movie, chosen[1], output)
         if folder is not None:
             folder.clear([scene_file.path, *referenced_files(scene_file)])
         report = render_to_folder(*chosen, output, choice, session.progress)
@@ -338,7 +351,7 @@ def _optimize_film(
 @click.option(
     "--noise",
     "read",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     metavar="X",
     help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
     "reconstruction leaves.",

@@ -26,6 +26,7 @@ def factors(scene: Scene) -> list[int]:
 def scene_at_level(scene: Scene, factor: int) -> Scene:
     """`scene` with about `factor` times fewer cells and pixels a side; targets are averaged.
 
+    A pixel is the mean of those in it that count, and counts where more than half of them do.
     Of pixels it has as many fewer again as leave a cell `CELL` of them wide: more say no more.
     """
     views = [_view_at_level(view, factor, scene.volume.grid) for view in scene.views]
@@ -52,8 +53,9 @@ def _view_at_level(view: View, factor: int, grid: Grid) -> View:
     background = view.background
     if background is not None and background.shape[1:] != (1, 1):
         background = adaptive_avg_pool2d(background, camera.size)
+    share = None if mask is None else adaptive_avg_pool2d(mask[None], camera.size)[0]
     if image is not None:
-        image = adaptive_avg_pool2d(image, camera.size)
-    if mask is not None:
-        mask = (adaptive_avg_pool2d(mask[None], camera.size)[0] > 0.5).to(mask.dtype)
+        image = adaptive_avg_pool2d(image if mask is None else image * mask, camera.size)
+        image = image if share is None else image / share.where(share > 0, 1)
+    mask = None if share is None else (share > 0.5).to(share.dtype)
     return replace(view, camera=camera, image=image, mask=mask, background=background)

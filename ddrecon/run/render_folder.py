@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import UsageError, suggestion
-from ddrecon.extras import advice
+from ddrecon.extras import advice, load_for_file
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.images.films import write_film
 from ddrecon.io.images.table import (
@@ -95,8 +95,6 @@ def choose_views(
     elif choice.is_relit or choice.is_moved:
         views = [View(view.name, view.camera) for view in views]
         scene = replace(scene, views=views)
-    if choice.movie is not None:
-        require_movie(choice.movie, views)
     if choice.parameter is not None:
         require_variation(scene, choice.parameter)
     return scene, views
@@ -205,12 +203,21 @@ def _write_fluence(
     return [f"{stem.parent.name}/{name}" for name in names]
 
 
-def require_movie(path: Path, views: Sequence[View]) -> None:
-    """Raises UsageError unless `views` can be the frames of a movie at `path`."""
+def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
+    """Raises UsageError unless `views`, written to `folder`, can be frames of a movie at `path`.
+
+    Raises FormatError where that takes a package which is not installed.
+    """
     if path.suffix.lower() not in MOVIES:
         raise UsageError(f"--movie {path}: expected a name that ends in {' or '.join(MOVIES)}")
     if len({view.camera.size for view in views}) > 1:
         raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
+    if path.is_dir():
+        raise UsageError(f"--movie {path}: is a folder")
+    if path.resolve() in {(folder / f"{view.name}.png").resolve() for view in views}:
+        raise UsageError(f"--movie {path}: is the preview of a view; choose another name")
+    if path.suffix.lower() == ".mp4":
+        load_for_file("imageio_ffmpeg", path)
 
 
 def write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> dict[str, Any]:

@@ -31,7 +31,16 @@ render scene.yaml -o file => 2 file: is a file; name a folder for the output
 optimize scene.yaml -o file --overwrite => 2 file: is a file; name a folder for the output
 render scene.yaml -o out --view back => 2 no view 'back'; the views are front, side
 render scene.yaml -o out --gradient densty => 2 --gradient densty: the scene has no number densty;
-render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range x>=2
+render scene.yaml -o out --ring 1 => 2 Error: Invalid value for '--ring': 1 is not in the range 2<=x
+render scene.yaml -o out --ring 99999 => 2 Error: Invalid value for '--ring': 99999 is not in the
+render scene.yaml -o out --ring 3 --fps nan => 2 Error: Invalid value for '--fps': nan is not finite
+render scene.yaml -o out --movie m.avi => 2 --movie m.avi: expected a name that ends in .mp4 or .png
+render scene.yaml -o out --movie no/m.png => 2 no/m.png: there is no folder
+render scene.yaml -o out --movie mine.png => 2 mine.png: already there; choose another name, or
+render scene.yaml -o out --overwrite --movie full.png => 2 --movie full.png: is a folder
+render scene.yaml -o out --movie out/../out/side.png => 2 --movie out/../out/side.png: is the
+render film -o out --movie m.png => 2 Error: --movie is of one frame: name it, such as FILM/frames
+uncertainty done -o sure --noise inf => 2 Error: Invalid value for '--noise': inf is not finite
 render scene.yaml -o out --light '{type: sun}' => 2 --light {type: sun}: lights.0.type: expected
 render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
@@ -89,10 +98,11 @@ def test_what_cannot_be_done_is_refused(
 ) -> None:
     del folder
     Path("plain.yaml").write_text(SCENE.partition("optimize:")[0])
-    texts = dict.fromkeys(["full/notes.txt", "file", "front.txt", "bad.npz"], "mine")
+    texts = dict.fromkeys(["full/notes.txt", "file", "front.txt", "bad.npz", "mine.png"], "mine")
     runs = "done/scene.yaml", "done/result.yaml", "film/frames/0003/result.yaml", "begun/scene.yaml"
     texts |= dict.fromkeys(runs, SCENE) | {"begun/loss.csv": ""}
     texts |= {f"film/{MANIFEST}": f"ddrecon {FILM}\n"}
+    Path("full.png").mkdir()
     for name, text in texts.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(text)

@@ -11,6 +11,7 @@ from click.testing import Result
 from small_scene import contents
 
 import ddrecon
+from ddrecon.extras import advice
 from ddrecon.io.images.films import frame_times, read_frame
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
@@ -280,3 +281,10 @@ def test_a_movie_has_the_exposure_of_its_previews(succeed: Run, suffix: str) -> 
     white = json.loads(Path("out/render.json").read_text())["movie"]["white"]
     for number, preview in enumerate(previews):
         assert np.abs(preview - encoded(pixels(f"ring_{number:03d}") / white)).max() <= 1
+
+
+def test_a_movie_that_lacks_a_package_is_refused_before_rendering(
+    refuse: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert refuse(3, *RENDER, "--movie", "m.mp4") == [f"m.mp4: {advice('imageio_ffmpeg')}"]

@@ -49,6 +49,17 @@ def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times
     assert torch.allclose(averaged.image.mean(), view.image.mean(), rtol=1e-3)
 
 
+def test_pixels_that_do_not_count_are_in_no_average(ball_scene) -> None:
+    """They may hold any number; those beside them keep theirs."""
+    view = ball_scene.views[0]
+    mask = (torch.rand(view.camera.size, generator=torch.manual_seed(0)) > 0.3).float()
+    image = torch.full((3, *mask.shape), 0.25).where(mask > 0, 1000.0)
+    masked = replace(view, image=image, mask=mask)
+    (averaged,) = scene_at_level(replace(ball_scene, views=[masked]), 2).views
+    assert averaged.image.shape[1] < mask.shape[0] and averaged.mask.mean() > 0.5
+    assert torch.allclose(averaged.image[:, averaged.mask > 0], torch.tensor(0.25))
+
+
 def test_noise_of_averaged_pictures_is_less(ball_scene) -> None:
     """The loss that given noise explains is that of pictures with such noise, at each level."""
     noise = Noise(0.03, 0.0)
