@@ -83,7 +83,7 @@ def write_deviations(deviations: Deviations, path: Path) -> dict[str, Any]:
     numbers = [(name, _number(number)) for name, number in record["numbers"].items()]
     write_page(
         path / "report.html",
-        title=f"ddrecon: how sure {path.absolute().name} is",
+        title=f"ddrecon: how sure a run is ({path.absolute().name})",
         lead=f"{_lead(record).capitalize()}.",
         volume=describe_fields(
             scene, {"result": smoke | off}, _describe_fields(record), next(iter(off), "density")
