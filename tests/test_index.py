@@ -105,8 +105,7 @@ def test_no_power_is_lost_or_made(light: str) -> None:
     lights = {"directional": None, "ambient": (1.0,)} if light == "ambient" else lights
     medium = {"sigma_a": (1.0,), "sigma_s": (4.0,), "g": 0.3, "degree": 5}
     density = 0.5 + random_values(6, 7, 5)
-    # Light that a refracted sun sends through each face ends within cells, with their parts too.
-    scene = within(1.4, density, **lights, **medium, transport_rounds=8, receive=1)
+    scene = within(1.4, density, **lights, **medium, transport_rounds=8)
     scene = replace(scene, lights=[BeamLight(*BEAM)]) if light == "beam" else scene
     report, plain = find_balance(scene), find_balance(with_index(scene, 1.0))
     assert abs(report["defect_percent"]) < abs(plain["defect_percent"]) + 0.5

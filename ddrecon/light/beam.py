@@ -9,13 +9,12 @@ from functools import reduce
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
-from ddrecon.medium.coefficients import Medium, along_colors, mean_width
+from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -27,8 +26,6 @@ MOST_NUMBERS = 1 << 23
 """Numbers of masses held at once, or a quarter of the moments' where that is more: cells then
 receive the light of several beams in one pass. torch's operations hold more of each.
 """
-HAZE = 1e-6
-"""Optical depths of a cell that count as there, so that light in an empty one is the mean."""
 MOST_BEAMS = 48
 """Beams that kernels receive at once, at most."""
 
@@ -77,37 +74,18 @@ def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Bea
     ]
 
 
-def receive_beams(
-    cells: Medium, lights: Sequence[DirectionalLight], degree: int, narrow: Medium | None = None
-) -> Tensor:
+def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Tensor:
     """phi up to `degree` of what `cells` scatter of the beams of `lights` (E2.2, E2.8).
 
-    These moments are the sum of p_l Y_k(w) E tau / (4 pi). tau is that of the parts of `narrow`
-    cells, where there are any (E5.10).
+    These moments are the sum of p_l Y_k(w) E tau / (4 pi).
     """
     directions, *_ = unit_directions(*(light.direction for light in lights))
     weights = _beam_weights(directions, degree, *(light.irradiance for light in lights))
     factors = remaining_moments(cells)
-    if not cells.is_cellwise:
-        weights = weights * by_harmonic(factors, degree).flatten(1)
-    if narrow is None:
-        light = attenuate(cells, directions, weights, is_kept=True)
-    else:
-        tau = [_pool(cells, narrow, travel) for travel in split_directions(directions, 1)]
-        light = torch.einsum("lkc,lczyx->kczyx", weights, torch.cat(tau))
-    return weigh(light, factors) if cells.is_cellwise else light
-
-
-def _pool(cells: Medium, narrow: Medium, travel: Tensor) -> Tensor:
-    """tau [1, C, z, y, x] of a beam along `travel` [1, 3] in `cells`, of `narrow` ones (E5.10)."""
-
-    def pool(field: Tensor) -> Tensor:
-        return adaptive_avg_pool3d(field, cells.grid.shape)
-
-    scale, field = narrow.extinction.scale, narrow.extinction.field
-    haze = HAZE / (scale.mean() * mean_width(cells.grid)).clamp(min=1e-30)
-    (tau,) = attenuate_few(narrow, travel, torch.ones_like(scale).view(1, 1, -1), is_kept=True)
-    return (pool((field + haze) * tau) / (pool(field) + haze))[None]
+    if cells.is_cellwise:
+        return weigh(attenuate(cells, directions, weights, is_kept=True), factors)
+    weights = weights * by_harmonic(factors, degree).flatten(1)
+    return attenuate(cells, directions, weights, is_kept=True)
 
 
 @remember
