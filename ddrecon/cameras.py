@@ -19,6 +19,8 @@ from ddrecon.lenses import distort, ray_through
 from ddrecon.records import bounded, one_of
 from ddrecon.settings import LENSES
 
+CELL = 2.0
+"""How many pixels wide a cell is best: finer pictures show no more of it."""
 NEWTON_STEPS = 12
 """Steps of Newton's method that find a view ray through a pane to rounding."""
 
@@ -156,6 +158,14 @@ def pixel_width(camera: Camera, place: Tensor) -> float:
     width = 2 * float(camera.half_width) / camera.size[1]
     distance = float(camera.pose[:, 3].cpu().dist(place.to(camera.pose.dtype)))
     return width * distance if camera.is_perspective else width
+
+
+def cell_width(grid: Grid, camera: Camera) -> float:
+    """How many pixels of `camera` a cell in the middle of `grid` is wide, along its shortest side.
+
+    A width of `CELL` fits pictures best.
+    """
+    return min(grid.spacing) / pixel_width(camera, torch.tensor(grid.center_xyz))
 
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -7,9 +7,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
-import torch
-
-from ddrecon.cameras import pixel_width
+from ddrecon.cameras import CELL, cell_width
 from ddrecon.engine import current_engine
 from ddrecon.errors import SceneError
 from ddrecon.io.info import sizes_text
@@ -24,7 +22,6 @@ from ddrecon.reconstruct.support import (
 )
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
-from ddrecon.scene_file.box import CELL
 from ddrecon.scene_file.build import needs_of_scene
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
@@ -83,7 +80,6 @@ def describe(
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
     low, high = grid.bounds_xyz
-    middle = torch.tensor(grid.center_xyz)
     loss = None
     if scene.optimize is not None:
         loss = describe_loss(scene.optimize, train) if train.views else None
@@ -105,7 +101,7 @@ def describe(
                 "height": view.camera.size[0],
                 "split": "test" if view.is_test else "train",
                 "has_image": view.image is not None,
-                "cell": min(grid.spacing) / pixel_width(view.camera, middle),
+                "cell": cell_width(grid, view.camera),
             }
             for view in scene.views
         ],

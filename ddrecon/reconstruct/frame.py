@@ -93,11 +93,11 @@ class Frame:
         weights = sum(view.weight for view in train.views)
         for view in train.views:
             image, target = target_of(view), self.level.targets[view.name]
-            given = given_noise(view, settings)
-            noise = given or estimate_noise(image, view.step)
+            known = given_noise(view, settings)
+            noise = known or estimate_noise(image, view.step)
             # A mean of pixels has less noise than each, which estimates see.
             whole = target_of(self.problem.train.view(view.name))
-            share = image.numel() / whole.numel() if given else 1.0
+            share = image.numel() / whole.numel() if known else 1.0
             square = share * noise.deviation(image) ** 2 + (tuning.MODEL_ERROR * image) ** 2
             loss = (target.weights_at(image) * square).sum() / 2
             total += view.weight / weights * float(loss)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
 from torch.nn.functional import adaptive_avg_pool2d
 
-from ddrecon.cameras import pixel_width
+from ddrecon.cameras import CELL, cell_width
 from ddrecon.grid import Grid
 from ddrecon.medium.levels import resample, volume_at_level
 from ddrecon.reconstruct import tuning
@@ -43,9 +42,7 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
 
 def _view_at_level(view: View, factor: int, grid: Grid) -> View:
     """`view` with up to `factor` times fewer pixels a side than cells of `grid` ask for."""
-    middle = torch.tensor(grid.center_xyz)
-    width = min(grid.spacing) / pixel_width(view.camera, middle)
-    factor *= max(1, int(width / tuning.CELL))
+    factor *= max(1, int(cell_width(grid, view.camera) / CELL))
     most = max(1, min(factor, min(view.camera.size) // tuning.FEWEST_PIXELS))
     if most == 1:
         return view

@@ -60,8 +60,6 @@ MOST_ITERATIONS = 300
 FEWEST_CELLS, FEWEST_PIXELS = 16, 16
 """No side of a grid or image is coarsened below these: a grid of 9 x 6 x 8 cells spread fog that
 views from above did not take away."""
-CELL = 2.0
-"""Pictures are averaged until a cell is less than one pixel more than so many wide."""
 GRADIENT_ERROR = 0.01
 """The relative error that each of the two solves may make in the gradient."""
 TEST_EVERY = 10

@@ -114,24 +114,22 @@ def render_to_folder(
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
         fluence_files = _write_fluence(light_field, scene, folder, [*kinds]) if kinds else []
-        parts = ["", *(COMPONENTS if choice.components else ())]
-        names = [*parts, *(MATTE if choice.components else ())]
+        components = ["", *(COMPONENTS if choice.components else ())]
+        names = [*components, *(MATTE if choice.components else ())]
         if choice.parameter is not None:
-            names += [GRADIENT + part for part in parts]
+            names += [GRADIENT + name for name in components]
         for view, images, elapsed in _render_in_turns(light_field, world, views, names, progress):
             if not is_first():
                 continue
             seconds[view.name], files[view.name] = elapsed, []
             stem = folder / view.name
-            shown = {name: image for name, image in images.items() if not name.startswith(GRADIENT)}
-            files[view.name] += _write_images(stem, shown)
+            plain = {name: image for name, image in images.items() if not name.startswith(GRADIENT)}
+            files[view.name] += _write_images(stem, plain)
             if choice.parameter is not None:
-                stem = stem.with_name(stem.name + GRADIENT)
-                slopes = {part: images[GRADIENT + part] for part in parts}
-                signed = {part: diverging(slope) for part, slope in slopes.items()}
-                scales |= {stem.name + part: full for part, (_, full) in signed.items()}
-                previews = {part: preview for part, (preview, _) in signed.items()}
-                files[view.name] += _write_images(stem, slopes, previews)
+                slopes = {name: images[GRADIENT + name] for name in components}
+                files[view.name] += _write_slopes(
+                    stem.with_name(stem.name + GRADIENT), slopes, scales
+                )
             if view.image is not None:
                 loss = "display" if view.step else "l2"
                 target = Target.of(view.image, view.mask, loss)
@@ -164,26 +162,33 @@ def render_to_folder(
     return report
 
 
+def _write_slopes(stem: Path, slopes: Mapping[str, Tensor], scales: dict[str, float]) -> list[str]:
+    """As `_write_images`, of derivatives; the values of full red are added to `scales`, by file."""
+    pairs = {name: diverging(slope) for name, slope in slopes.items()}
+    scales |= {stem.name + name: full for name, (_, full) in pairs.items()}
+    return _write_images(stem, slopes, {name: preview for name, (preview, _) in pairs.items()})
+
+
 def _write_images(
     stem: Path, images: Mapping[str, Tensor], previews: Mapping[str, np.ndarray] = NO_LAYERS
 ) -> list[str]:
-    """The names of files of the image called "" and of its parts, which are layers of one .exr.
+    """The names of files of the image called "" and of its components, layers of one .exr.
 
-    By itself each part is an array and, but for the depth, a preview, where `previews` has none.
+    Every component is an array as well and, but for the depth, a preview, its own or of `previews`.
     """
-    arrays, layers, written = {part: pixels(i) for part, i in images.items()}, {}, list[Path]()
+    arrays, layers, written = {name: pixels(i) for name, i in images.items()}, {}, list[Path]()
     picture = arrays.pop("")
     if MATTE[0] in arrays:
         arrays[MATTE[1]] = arrays[MATTE[1]][..., 0]
         layers = {"A": 1 - arrays[MATTE[0]].mean(-1), "Z": arrays[MATTE[1]]}
-    layers |= {part[1:]: array for part, array in arrays.items() if array.ndim == 3}
-    for part, array in arrays.items():
-        path = stem.with_name(f"{stem.name}{part}.npy")
+    layers |= {name[1:]: array for name, array in arrays.items() if array.ndim == 3}
+    for name, array in arrays.items():
+        path = stem.with_name(f"{stem.name}{name}.npy")
         write_array(path, array)
         written.append(path)
         if array.ndim == 3:
             written.append(path.with_suffix(".png"))
-            write_preview(written[-1], previews.get(part, array))
+            write_preview(written[-1], previews.get(name, array))
     written = write_picture(stem, picture, previews.get(""), layers) + written
     return [path.name for path in written]
 
@@ -227,9 +232,9 @@ def write_movie(views: Sequence[View], folder: Path, path: Path, fps: float) -> 
     """
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
-    shown = [image / white for image in images]
-    MOVIES[path.suffix.lower()](path, [srgb.encode_bytes(image) for image in shown], fps)
-    for view, image in zip(views, shown, strict=True):
+    exposed = [image / white for image in images]
+    MOVIES[path.suffix.lower()](path, [srgb.encode_bytes(image) for image in exposed], fps)
+    for view, image in zip(views, exposed, strict=True):
         write_preview(folder / f"{view.name}.png", image)
     preview = f"sRGB of linear radiance: {white:.6g} and more is white"
     return {"movie": {"file": str(path), "white": white}, "preview": preview}
@@ -301,8 +306,9 @@ def _images(
         reduced = picture - single - multiple
         matte = view_matte(light_field, scene, view.camera)
         depth = matte.depth.expand_as(picture)
-        shown = reduced + single + multiple, reduced, single, multiple, matte.transmittance, depth
-        images = dict(zip(("", *COMPONENTS, *MATTE), shown, strict=True))
+        total, through = reduced + single + multiple, matte.transmittance
+        layers = total, reduced, single, multiple, through, depth
+        images = dict(zip(("", *COMPONENTS, *MATTE), layers, strict=True))
     pairs = {name: forward_ad.unpack_dual(image) for name, image in images.items()}
     plain = {name: pair.primal for name, pair in pairs.items()}
     derived = {

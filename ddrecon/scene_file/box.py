@@ -11,7 +11,7 @@ from statistics import mean
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import pixel_width
+from ddrecon.cameras import CELL, pixel_width
 from ddrecon.errors import DataWarning
 from ddrecon.hull import HullError, bound_smoke, find_shown
 from ddrecon.scene import View
@@ -22,8 +22,6 @@ from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import Bounds
 from ddrecon.settings import AUTO, ParameterSettings
 
-CELL = 2.0
-"""How many pixels wide a cell is."""
 MANY_CELLS = 2**22
 """More cells than these take hours."""
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ddrecon.cameras import Camera, cast_rays, pixel_width
+from ddrecon.cameras import CELL, Camera, cast_rays, cell_width
 from ddrecon.grid import Grid
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct import tuning
@@ -42,10 +42,9 @@ def test_pixels_are_averaged_where_cells_are_many_of_them_wide(ball_scene, times
     image = view.image.repeat_interleave(times, 1).repeat_interleave(times, 2)
     large = replace(view, image=image, camera=replace(view.camera, size=tuple(image.shape[1:])))
     (averaged,) = scene_at_level(replace(ball_scene, views=[large]), 1).views
-    middle = view.camera.pose.new_tensor(grid.center_xyz)
-    before, after = (min(grid.spacing) / pixel_width(v.camera, middle) for v in (large, averaged))
+    before, after = (cell_width(grid, v.camera) for v in (large, averaged))
     assert averaged.image.shape[1:] == averaged.camera.size
-    assert averaged is large if before < 2 * tuning.CELL else tuning.CELL <= after < 3.5
+    assert averaged is large if before < 2 * CELL else CELL <= after < 3.5
     assert torch.allclose(averaged.image.mean(), view.image.mean(), rtol=1e-3)
 
 

@@ -187,7 +187,7 @@ class Tree:
         tiles, roots = stream.unpack("<II")
         layout = [
             ("corner", "<i4", 3),
-            ("value", self.coding.single, self.coding.components),
+            ("value", self.coding.single, (self.coding.components,)),
             ("is_active", "u1"),
         ]
         table = stream.array(np.dtype(layout), tiles)
