@@ -28,6 +28,8 @@ FINER, FINER_FLAT, MOST_CELLS, LONG = 1.5, 0.75, 2**20, 8.0
 (`FINER_FLAT` in a flat medium), unless that makes more than `MOST_CELLS` cells. Measured on blocks,
 half-spaces and merged balls (docs/accuracy.md). If it does, axes stay undivided along which nothing
 varies and the box is `LONG` times as long as along another, up to three numbers for each cell."""
+PARTS = 3
+"""Cells that stay thick receive the light of suns in parts so many times as narrow (E5.10)."""
 SOFT = 3.0
 """Where no face is dense and a cell has more optical depths, there is one round: later ones darken
 soft edges. Measured on merged balls (docs/accuracy.md)."""
@@ -47,7 +49,8 @@ def choose_diffusion(
     The phase function counts; where it is `optimized` it may become any, and counts as `OPTIMIZED`
     at least. The thickest cell and dense faces count where density is not optimized.
     """
-    left_out = None in (settings.transport_rounds, settings.degree, settings.refine)
+    choices = settings.transport_rounds, settings.degree, settings.refine, settings.receive
+    left_out = None in choices
     if not settings.rounds or not left_out:
         return settings, ""
     left = float(volume.phase.moments(3)[:, 2].abs().max())
@@ -65,14 +68,15 @@ def choose_diffusion(
     reasons += causes
     if settings.transport_tolerance is not None:
         rounds = MOST_ROUNDS
-    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times}
+    receive = PARTS if depth / times > thin else 1
+    chosen = {"transport_rounds": rounds, "degree": degree, "refine": times, "receive": receive}
     added: dict[str, Any] = {
         key: value for key, value in chosen.items() if getattr(settings, key) is None
     }
     if settings.refine is None and times > 1 and along != settings.refine_along:
         reasons.append("too many cells to divide all")
         added["refine_along"] = along
-    words = ", ".join(f"{key} {value}" for key, value in added.items())
+    words = ", ".join(f"{k} {value}" for k, value in added.items() if (k, value) != ("receive", 1))
     return replace(settings, **added), f"{words}: {', '.join(reasons)}"
 
 

@@ -164,7 +164,7 @@ def _scatter_light(
     """
     name_kernels(medium.extinction.field)
     # Q0 and Q1 are the first-collision source; skies' mean enters through the faces (E2.6).
-    received = receive_light(cells, lights, cells.degree)
+    received = receive_in_parts(medium, cells, lights, settings)
     sky = sum_unscattered_sky(cells, lights, cells.degree)
     unscattered = unscattered if sky is None else [sky, *unscattered]
     scattering = (weigh(light, remaining_moments(cells)) for light in unscattered)
@@ -185,6 +185,15 @@ def _scatter_light(
         turned=received.turned,
         at_faces=FaceLight(outside, received_there) if settings.rounds else None,
     )
+
+
+def receive_in_parts(
+    medium: Medium, cells: Medium, lights: Sequence[Source], settings: DiffusionSettings
+) -> Received:
+    """What `cells`, the means of `medium`, receive of `lights`, in parts by `settings` (E5.10)."""
+    parts = refine_medium(medium, settings.receive or 1)
+    narrow = None if parts is medium else average_cells(parts)
+    return receive_light(cells, lights, cells.degree, narrow)
 
 
 def _follow_light(

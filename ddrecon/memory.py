@@ -81,6 +81,9 @@ def numbers_in_cell(
         rendered += 12
     elif settings.rounds:
         rendered += 13 + 1.2 * moments
+    if settings.receive:
+        # Before, cells receive suns in parts.
+        rendered = max(rendered, 10 * settings.receive**3)
     return colors * rendered * (2 if varied else 1) + 38 * varied
 
 

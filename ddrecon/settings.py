@@ -64,6 +64,8 @@ class DiffusionSettings:
         single round 18 for 1, 26 for 3. Left out: by the medium.
     refine: How many times narrower cells of light are than the medium's. Left out: by the medium.
     refine_along: The axes along which cells are divided.
+    receive: How many times narrower still cells are that receive light of suns. Left out: by the
+        medium.
     """
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
@@ -77,6 +79,7 @@ class DiffusionSettings:
     degree: int | None = one_of(None, (1, 3, 5, 7))
     refine: int | None = one_of(None, (1, 3, 9), expert=True)
     refine_along: str = one_of("xyz", ("x", "y", "z", "xy", "xz", "yz", "xyz"), expert=True)
+    receive: int | None = one_of(None, (1, 3), expert=True)
 
     @property
     def is_conservative_p1(self) -> bool:

@@ -159,6 +159,8 @@ def _round_terms(medium: Medium, scene: Scene) -> Iterator[str]:
         finer = scene.volume.grid.refine(settings.times, settings.refine_along)
         along = "" if settings.refine_along == "xyz" else f" along {settings.refine_along}"
         yield f"light in {_cells(finer)}, {settings.times} times as narrow{along}"
+    if (settings.receive or 1) > 1:
+        yield f"light of suns in {settings.receive}^3 parts of each cell"
     if scene.reason:
         yield f"by default {scene.reason}"
     sources = decompose_lights(scene.lights)

@@ -97,7 +97,7 @@ def make_scene(
     lights += [AmbientLight(tensor(ambient))] if ambient else []
     camera = camera or make_camera(dtype=density.dtype)
     tolerance = 1e-13 if density.dtype == torch.float64 else 1e-6
-    plain = {"transport_rounds": 0, "degree": 3, "refine": 1}
+    plain = {"transport_rounds": 0, "degree": 3, "refine": 1, "receive": 1}
     diffusion = {"tolerance": tolerance} | plain | diffusion
     volume = Volume(grid, density, sigma_a, sigma_s, tensor(g), emission=emission)
     settings = RenderSettings(steps_per_voxel=1), DiffusionSettings(**diffusion)

@@ -24,13 +24,15 @@ SHAPE = (5, 6, 7)
 CELLS = {"sigma_a": random_values(3, *SHAPE, seed=1), "sigma_s": random_values(3, *SHAPE, seed=2)}
 GLOW = half_empty(3, *SHAPE, seed=4)
 """Emission, also in empty cells."""
+GRAY = {"sigma_a": (1.0,), "sigma_s": (6.0,)}
 CASES: dict[str, dict[str, Any]] = {
-    "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (2.0,), "transport_rounds": 1},
-    "glowing": {"emission": GLOW, "sigma_a": (1.0,), "sigma_s": (6.0,), "transport_rounds": 2},
+    "gray, parts": {**GRAY, "directional": (2.0,), "transport_rounds": 1, "receive": 3},
+    "glowing": {"emission": GLOW, **GRAY, "transport_rounds": 2},
     "glowing alone": {"emission": GLOW[:1], "sigma_s": (0.5,), "directional": None},
     "forward, degree 1": {"g": 0.4, "degree": 1, "transport_rounds": 2},
     "forward, degree 3": {"g": 0.4, "degree": 3, "transport_rounds": 2, "closure": "smooth"},
     "backward, degree 3": {"g": -0.6, "degree": 3, "transport_rounds": 2, "ambient": (0.3,)},
+    "backward, parts": {"g": -0.6, "transport_rounds": 2, "receive": 3},
     "cells": {"g": 0.3, "transport_rounds": 1, "ambient": (0.3,), "emission": GLOW[:1], **CELLS},
 }
 EVERY_LIGHT = "cells", "forward, degree 1"

@@ -240,6 +240,7 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "gray": {"g": -0.5, **GRAY},
     "no model": {"model": "none", "g": 0.4, **BOTH},
     "finer cells": {"shape": (2, 2, 3), "g": 0.4, "refine": 3, **ROUNDS, **BOTH},
+    "cells in parts": {"shape": (2, 2, 3), "g": 0.4, "receive": 3, **ROUNDS, **BOTH},
 }
 
 

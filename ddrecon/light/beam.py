@@ -9,12 +9,13 @@ from functools import reduce
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
 
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import by_harmonic, weigh
 from ddrecon.light.shear import sum_masses
-from ddrecon.medium.coefficients import Medium, along_colors
+from ddrecon.medium.coefficients import Medium, along_colors, mean_width
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -26,6 +27,8 @@ MOST_NUMBERS = 1 << 23
 """Numbers of masses held at once, or a quarter of the moments' where that is more: cells then
 receive the light of several beams in one pass. torch's operations hold more of each.
 """
+HAZE = 0.03
+"""Optical depths of a cell from which on its parts count by what they take from a beam (E5.10)."""
 MOST_BEAMS = 48
 """Beams that kernels receive at once, at most."""
 
@@ -74,18 +77,41 @@ def follow_beams(medium: Medium, lights: Sequence[DirectionalLight]) -> list[Bea
     ]
 
 
-def receive_beams(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Tensor:
+def receive_beams(
+    cells: Medium, lights: Sequence[DirectionalLight], degree: int, narrow: Medium | None = None
+) -> Tensor:
     """phi up to `degree` of what `cells` scatter of the beams of `lights` (E2.2, E2.8).
 
-    These moments are the sum of p_l Y_k(w) E tau / (4 pi).
+    These moments are the sum of p_l Y_k(w) E tau / (4 pi). tau is that of the parts of `narrow`
+    cells, where there are any (E5.10).
     """
     directions, *_ = unit_directions(*(light.direction for light in lights))
     weights = _beam_weights(directions, degree, *(light.irradiance for light in lights))
     factors = remaining_moments(cells)
-    if cells.is_cellwise:
-        return weigh(attenuate(cells, directions, weights, is_kept=True), factors)
-    weights = weights * by_harmonic(factors, degree).flatten(1)
-    return attenuate(cells, directions, weights, is_kept=True)
+    if not cells.is_cellwise:
+        weights = weights * by_harmonic(factors, degree).flatten(1)
+    if narrow is None:
+        light = attenuate(cells, directions, weights, is_kept=True)
+    else:
+        even = torch.ones_like(narrow.extinction.scale).view(1, 1, -1)
+        one_by_one = split_directions(directions, 1)
+        beams = (attenuate_few(narrow, travel, even, True) for travel in one_by_one)
+        tau = [average_parts(cells, narrow, *beam) for beam in beams]
+        light = torch.einsum("lkc,lczyx->kczyx", weights, torch.stack(tau))
+    return weigh(light, factors) if cells.is_cellwise else light
+
+
+def average_parts(cells: Medium, narrow: Medium, light: Tensor) -> Tensor:
+    """`light` [C, z, y, x] of `narrow` cells as `cells` receive it (E5.10)."""
+
+    def pool(field: Tensor) -> Tensor:
+        return adaptive_avg_pool3d(field, cells.grid.shape)
+
+    field, mean = narrow.extinction.field, pool(light)
+    per_field = mean_width(cells.grid) * narrow.extinction.scale
+    depth = per_field * pool(field)
+    lost = per_field * pool(field * light) - depth * mean
+    return mean + lost * depth / (depth**2 + HAZE**2)
 
 
 @remember

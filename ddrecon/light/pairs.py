@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.beam import unit_directions
+from ddrecon.light.beam import average_parts, unit_directions
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import add, beam_moments, weigh
 from ddrecon.light.shear import Shear, sum_masses
@@ -70,8 +70,9 @@ class BeamPair:
         )
 
 
-def follow_pair(medium: Medium, light: DirectionalLight) -> BeamPair:
-    """The pair that the beam of `light` becomes in `medium`."""
+def follow_pair(cells: Medium, light: DirectionalLight, narrow: Medium | None = None) -> BeamPair:
+    """The pair that the beam of `light` becomes in `cells`, or in their `narrow` parts (E5.10)."""
+    medium = narrow or cells
     extinction = medium.extinction
     directions, direction = unit_directions(light.direction)
     crossing = extinction.field, medium.grid, directions, extinction.mass_bound
@@ -86,7 +87,10 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> BeamPair:
         return tau, tau * period.crop(along), tau * period.crop(against)
 
     irradiance = along_colors(light.irradiance) / (4 * math.pi)
-    received, along, against = (irradiance * share for share in recompute(find_shares))
+    shares = recompute(find_shares)
+    if narrow is not None:
+        shares = tuple(average_parts(cells, narrow, share) for share in shares)
+    received, along, against = (irradiance * share for share in shares)
     return BeamPair(direction, received, along, against)
 
 

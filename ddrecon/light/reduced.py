@@ -80,17 +80,20 @@ def _sort_lights(
     return even, confined, [light for light in lights if isinstance(light, PointLight)]
 
 
-def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Received:
+def receive_light(
+    cells: Medium, lights: Sequence[Source], degree: int, narrow: Medium | None = None
+) -> Received:
     """What `cells` receive of directional, point and beam `lights`.
 
     The source of lights that go along w is the sum of p_l Y_k(w) E tau / (4 pi), with the moments
     p_l of the scattering that remains (E2.8), for k up to `degree`: Q0, and Q1 with 3 g'. What
-    backward peaks turn back belongs to the beams of parallel light (E8.11).
+    backward peaks turn back belongs to the beams of parallel light (E8.11). Parallel light
+    is that of the parts of `narrow` cells, where there are any (E5.10).
     """
     even, confined, points = _sort_lights(cells, lights)
-    lit = [_receive_parallel(cells, even, degree)] if even else []
+    lit = [_receive_parallel(cells, even, degree, narrow)] if even else []
     for beam in confined:
-        lit.append(_receive_parallel(cells, [beam.light], degree).across(beam.profile))
+        lit.append(_receive_parallel(cells, [beam.light], degree, narrow).across(beam.profile))
     for light in points:
         phi = receive_point_light(cells, light, degree)
         lit.append(Received(weigh(phi, remaining_moments(cells)), phi[0]))
@@ -98,11 +101,13 @@ def receive_light(cells: Medium, lights: Sequence[Source], degree: int) -> Recei
     return reduce(Received.plus, lit) if lit else Received(dark[None], dark)
 
 
-def _receive_parallel(cells: Medium, lights: Sequence[DirectionalLight], degree: int) -> Received:
+def _receive_parallel(
+    cells: Medium, lights: Sequence[DirectionalLight], degree: int, narrow: Medium | None = None
+) -> Received:
     if not has_backward_peak(cells):
-        source = receive_beams(cells, lights, degree)
+        source = receive_beams(cells, lights, degree, narrow)
         return Received(source, source[0])
-    pairs = [follow_pair(cells, light) for light in lights]
+    pairs = [follow_pair(cells, light, narrow) for light in lights]
     lit = (Received(pair.source(cells), pair.along + pair.against, pair.turned) for pair in pairs)
     return reduce(Received.plus, lit)
 

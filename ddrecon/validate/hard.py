@@ -25,8 +25,9 @@ from ddrecon.errors import SolveError
 from ddrecon.grid import Grid, Triple
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.light.moments import cut
-from ddrecon.light.reduced import ambient_radiance, receive_light
+from ddrecon.light.reduced import ambient_radiance
 from ddrecon.light.sky import decompose_lights
+from ddrecon.light_field import receive_in_parts
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import render
@@ -299,22 +300,23 @@ class Balance:
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
     grid, settings = scene.volume.grid, scene.diffusion
-    medium = average_cells(scale_medium(scene.volume, settings.angles))
+    medium = scale_medium(scene.volume, settings.angles)
+    cells = average_cells(medium)
     lights = decompose_lights(scene.lights)
     problem = DiffusionProblem(
-        medium,
+        cells,
         Closure(settings.closure, grid, settings.floor),
-        cut(receive_light(medium, lights, medium.degree).source)[0],
+        cut(receive_in_parts(medium, cells, lights, settings).source)[0],
         ambient_radiance(lights, solution),
-        medium.degree > 0,
+        cells.degree > 0,
     )
     operator, right = problem.system
     if not right.any():
         return Balance()
     escape = boundary_loss(problem.diffusion, grid)
-    injected = medium.remaining_scattering * problem.source[0] + escape * problem.outside
+    injected = cells.remaining_scattering * problem.source[0] + escape * problem.outside
     # b sums to what is injected less what Q1 drives out of the box; between cells Q1 only moves.
-    lost = (medium.absorption.value.double() + escape.double()) * solution.double()
+    lost = (cells.absorption.value.double() + escape.double()) * solution.double()
     energy = float((right.double() - lost).sum().abs() / injected.double().sum())
     scale = operator.diagonal.rsqrt()
     size = (scale * right).norm()

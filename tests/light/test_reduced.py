@@ -7,11 +7,13 @@ import torch
 from media import box_grid, random_values, tensor
 from torch import Tensor
 
+from ddrecon.diffusion.cells import average_cells
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.reduced import ambient_sky, receive_light, sum_unscattered_sky
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.medium.levels import refine_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 
@@ -41,6 +43,37 @@ def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float
     lost = (4 * math.pi * kappa * source[0]).sum(1) * grid.spacing[0]
     depth = kappa.sum(1) * grid.spacing[0]
     torch.testing.assert_close(lost, 2.0 * -torch.expm1(-depth), rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("g", [0.4, -0.4])
+def test_in_even_columns_parts_of_cells_receive_what_cells_do(g: float):
+    """Of a backward peak they receive pairs of beams."""
+    grid, density = box_grid((4, 3, 2)), torch.full((4, 3, 2), 5.0, dtype=torch.float64)
+    medium = scale_medium(Volume(grid, density, tensor(0.5, 1), tensor(3, 2), tensor(g)[0]), 3)
+    lights = [DirectionalLight(tensor(0, 0, -2), tensor(2, 1))]
+    lights += [DirectionalLight(tensor(0, 3, 0), tensor(1, 1))]
+    narrow = average_cells(refine_medium(medium, 3))
+    whole, parts = (receive_light(medium, lights, 1, cells).source for cells in (None, narrow))
+    torch.testing.assert_close(parts, whole, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("zenith", [10.0, 60.0, 75.0])
+def test_a_thick_uneven_layer_receives_all_light_of_a_slanted_sun(zenith: float):
+    """Cells are 5 times as wide as high, and up to 18 optical depths wide; nothing gets through."""
+    grid = Grid((24, 6, 8), (0, 0, 0), (0.48, 0.6, 0.8), periodic=(1, 2))
+    z, y, x = (center / 0.2 for center in grid.centers(tensor(0)))
+    density = (1 + 0.8 * (math.pi / 2 * x).sin() * (2 * math.pi / 3 * y).cos()) * (z < 1.9)
+    medium = medium_in(grid, density, g=0.0, sigma=([5.0], [95.0]))
+    angle = math.radians(zenith)
+    light = DirectionalLight(tensor(math.sin(angle), 0, -math.cos(angle)), tensor(1))
+    cells, narrow = average_cells(medium), average_cells(refine_medium(medium, 3))
+    taken = [
+        float((cells.extinction.value * receive_light(cells, [light], 0, parts).source).mean())
+        * (4 * math.pi * grid.extent[0] / math.cos(angle))
+        for parts in (None, narrow)
+    ]
+    off = [abs(share - 1) for share in taken]
+    assert off[1] < 0.002 and off[1] < off[0] / 2, taken
 
 
 def test_the_flux_of_a_beam_is_its_mean_times_its_direction():

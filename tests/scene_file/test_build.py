@@ -73,7 +73,10 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_the_medium(
     scene = load_scene(write(text))
     found = scene.diffusion
     assert (found.rounds, found.angles, found.times) == expected
-    assert f"refine {found.times}: a second moment of {g * g:.2g}" in scene.reason
+    is_thick = depth / found.times > (0.75 if is_flat else 1.5)
+    assert found.receive == (3 if is_thick else 1)
+    parts = ", receive 3" * is_thick
+    assert f"refine {found.times}{parts}: a second moment of {g * g:.2g}" in scene.reason
     chosen = load_scene(write(text), overrides=("diffusion.degree=5",)).diffusion
     assert (chosen.rounds, chosen.angles) == (expected[0], 5)
     glowing = load_scene(write(text), overrides=("volume.emission=1",)).diffusion
@@ -89,7 +92,7 @@ def test_cells_too_many_to_divide_stay_as_they_are_along_even_long_axes(
     monkeypatch.setattr(defaults, "MOST_CELLS", 300)
     bounds = {"min": [0, 0, 0], "max": [9, 1, 9]}
     scene = load_scene(write(volume(bounds=bounds, resolution=[9, 3, 3], density=50)))
-    assert "refine 3, refine_along y: " in scene.reason
+    assert "refine 3, receive 3, refine_along y: " in scene.reason
 
 
 def test_every_tensor_has_the_type_asked_for(write: Write):
