@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 
+import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
@@ -50,11 +51,13 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
     """`field` [..., z, y, x] on `grid`, which spans the same box.
 
     It is averaged where `grid` is coarser, trilinearly interpolated where it is finer, and around
-    along periodic axes.
+    along periodic axes. Of what is true or false, cells are true that have any of it.
     """
     shape = field.shape[-3:]
     if tuple(shape) == grid.shape:
         return field
+    if field.dtype == torch.bool:
+        return resample(field.float(), grid) > 0
     colors = field.reshape(1, -1, *shape)
     if shape.numel() > grid.cells:
         resampled = adaptive_avg_pool3d(colors, grid.shape)

@@ -33,6 +33,15 @@ def test_a_finer_medium_has_the_same_values_everywhere(times: int, along: str):
         torch.testing.assert_close(seen(getattr(finer, name)), seen(getattr(medium, name)))
 
 
+def test_a_finer_medium_is_as_empty_beyond_its_support():
+    support = random_values(*SHAPE, seed=3) > 0.5
+    scene = make_scene(random_values(*SHAPE), grid=GRID)
+    within = replace(scene.volume, support=support)
+    emptied = replace(scene.volume, density=scene.volume.density * support)
+    finer, same = (refine_medium(scale_medium(volume), 3) for volume in (within, emptied))
+    torch.testing.assert_close(finer.extinction.value, same.extinction.value)
+
+
 def test_a_finer_medium_that_repeats_has_no_seam():
     grid = replace(GRID, periodic=(2,))
     scene = make_scene(random_values(*SHAPE), grid=grid)
