@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ddrecon.grid import Triple
+from ddrecon.light.ground import Ground
 from ddrecon.march.samplers import greatest_depth
-from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.coefficients import Volume, for_cells
 from ddrecon.settings import DiffusionSettings
 
 MOST_ROUNDS = 16
@@ -146,6 +148,32 @@ def _varies(field: Tensor, axis: int) -> bool:
     if not field.stride(axis - 3):
         return False
     return not bool((field == field.narrow(axis - 3, 0, 1)).all())
+
+
+def find_occupied(
+    volume: Volume, media: Sequence[Volume], ground: Ground, optimized: Collection[str]
+) -> tuple[Triple, Triple]:
+    """Where the part of the box of `volume` begins and ends (z, y, x) that has any of `media`.
+
+    Or that glows; 0 to 1 is all of the box. All of it counts along periodic axes and those of a map
+    of the albedo of `ground`, where density is `optimized`, and where there is none.
+    """
+    grid, filled = volume.grid, volume.density.new_zeros(volume.grid.shape)
+    for medium in media:
+        filled = filled + medium.density * (medium.sigma_a.sum(0) + medium.sigma_s.sum(0))
+    filled = filled if volume.emission is None else filled + for_cells(volume.emission).sum(0)
+    places = filled.nonzero()
+    is_open = len(places) > 0 and not any(name.endswith("density") for name in optimized)
+
+    def ends(axis: int) -> tuple[float, float]:
+        is_mapped = ground.albedo.ndim > 1 and axis != ground.plane.axis
+        if not is_open or is_mapped or axis in grid.periodic:
+            return 0.0, 1.0
+        first, last = int(places[:, axis].min()), int(places[:, axis].max())
+        return first / grid.shape[axis], (last + 1) / grid.shape[axis]
+
+    z, y, x = ends(0), ends(1), ends(2)
+    return (z[0], y[0], x[0]), (z[1], y[1], x[1])
 
 
 def _is_flat(media: Iterable[Volume]) -> bool:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Triple = tuple[float, float, float]
+Cells = tuple[slice, slice, slice]
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,15 @@ class Grid:
             for cells, low, step in zip(self.shape, self.lower, self.spacing, strict=True)
         ]
         return [lines[0].view(-1, 1, 1), lines[1].view(1, -1, 1), lines[2].view(1, 1, -1)]
+
+    def cut(self, cells: Cells) -> Grid:
+        """The grid of these `cells` along z, y and x; periodic as this one is."""
+        axes = zip(self.lower, self.spacing, cells, strict=True)
+        ends = [(low + step * at.start, low + step * at.stop) for low, step, at in axes]
+        z, y, x = (at.stop - at.start for at in cells)
+        if (z, y, x) == self.shape:
+            return self
+        return Grid((z, y, x), *zip(*ends, strict=True), periodic=self.periodic)
 
     def refine(self, times: int, along: str = "xyz") -> Grid:
         """The same box with so many times as many cells `along` axes that have more than one."""

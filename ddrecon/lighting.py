@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.diffusion.cells import average_cells, sharpen
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.grid import Grid
+from ddrecon.grid import Cells, Grid
 from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.moments import fill, floored
 from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towards, sum_turned
@@ -32,6 +32,8 @@ from ddrecon.supported import require_supported
 
 MOST_CELLS = 32
 """Cells along the longest side, at most, where light goes to and fro between volume and ground."""
+BESIDE = 1
+"""Cells of the volume's grid beyond its medium, where light does so."""
 EXCHANGES = 4
 """How often it does where the volume repeats, and so little of it leaves sideways."""
 
@@ -48,10 +50,10 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     if ground is None:
         return find_light(medium, sources, settings, memory)
     plane, sources = ground.plane, stay_above(sources, ground.plane)
-    coarse = volume_at_level(scene.volume, exchange_grid(scene.volume.grid))
-    thin = medium_of(coarse, settings)
+    grid, cells = exchange_grid(scene)
+    thin = medium_of(volume_at_level(scene.volume, grid, cells), settings)
     ambient = ambient_radiance(sources, thin.g).flatten()
-    from_below = light_from_below(average_cells(thin), plane, ambient)
+    from_below = light_from_below(average_cells(thin), plane, ambient, grid)
     lit = light_evenly(ground, sources, thin.grid, ambient)
     for _ in range(EXCHANGES if thin.grid.periodic else 1):
         up = from_below(*reflect(lit, thin, scene.render))
@@ -59,13 +61,28 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         down = partial(send_down, first, plane, multiply_scatters(thin, settings))
         lit = light_texels(lit, sources, thin, down, scene.render)
     sent = reflect(lit, thin, scene.render)
+    if grid != medium.grid:
+        from_below = light_from_below(average_cells(medium), plane, ambient, grid)
     light_field = find_light(medium, sources, settings, memory, from_below(*sent))
     return replace(light_field, ground=replace(lit, sent=sent))
 
 
-def exchange_grid(grid: Grid) -> Grid:
-    """The coarser grid of a volume on which it and a ground light each other (E5.4)."""
-    return grid.coarsen(max(1.0, max(grid.shape) / MOST_CELLS))
+def exchange_grid(scene: Scene) -> tuple[Grid, Cells]:
+    """The coarser grid on which the volume of `scene` and its ground light each other (E5.4).
+
+    And the cells of the volume's grid along z, y and x that it spans: those around its medium.
+    """
+    grid = scene.volume.grid
+    occupied = scene.occupied or ((0.0,) * 3, (1.0,) * 3)
+
+    def span(axis: int) -> slice:
+        count = grid.shape[axis]
+        first, last = (round(place[axis] * count) for place in occupied)
+        return slice(max(first - BESIDE, 0), min(last + BESIDE, count))
+
+    cells = span(0), span(1), span(2)
+    part = grid.cut(cells)
+    return part.coarsen(max(1.0, max(part.shape) / MOST_CELLS)), cells
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:

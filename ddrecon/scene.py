@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera
-from ddrecon.defaults import choose_diffusion
+from ddrecon.defaults import choose_diffusion, find_occupied
 from ddrecon.errors import UsageError
+from ddrecon.grid import Triple
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import Light
 from ddrecon.march.samplers import choose_steps
@@ -62,8 +63,10 @@ class Scene:
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from; `ground` lies under the volume, where there is any. What
     `render` and `diffusion` leave out is chosen by the medium when the scene is made, and stays
-    when the medium changes. `reason`: which settings of `diffusion` these are, and why. `up`: which
-    of x, y, z (0, 1, 2) points up; None where cameras tell.
+    when the medium changes. So does `occupied`, where there is a ground: where the part of the box
+    begins and ends, along z, y and x from 0 to 1, that has any medium. `reason`: which settings of
+    `diffusion` these are, and why. `up`: which of x, y, z (0, 1, 2) points up; None where cameras
+    tell.
     """
 
     volume: Volume
@@ -77,6 +80,7 @@ class Scene:
     ground: Ground | None = None
     reason: str = ""
     up: int | None = None
+    occupied: tuple[Triple, Triple] | None = None
 
     def __post_init__(self) -> None:
         self.settle()
@@ -88,6 +92,8 @@ class Scene:
         volume, optimized = self.volume, self.optimize.parameters if self.optimize else ()
         media = [*volume.media.values()] if volume.media else [volume]
         with torch.no_grad():
+            if self.ground is not None and self.occupied is None:
+                self.occupied = find_occupied(volume, media, self.ground, optimized)
             self.diffusion, reason = choose_diffusion(self.diffusion, volume, media, optimized)
             if self.render.steps_per_voxel is None:
                 steps = choose_steps(volume, self.diffusion.times)

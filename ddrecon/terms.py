@@ -125,7 +125,7 @@ def _ground_terms(scene: Scene) -> Iterator[str]:
     yield (
         f"ground at {'zyx'[ground.plane.axis]} = {ground.plane.height:g}, albedo {albedo}: direct "
         f"light ray by ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
-        f"to and fro in {_cells(exchange_grid(scene.volume.grid))}"
+        f"to and fro in {_cells(exchange_grid(scene)[0])}"
     )
 
 

@@ -87,9 +87,10 @@ def follow_pair(cells: Medium, light: DirectionalLight, narrow: Medium | None = 
         return tau, tau * period.crop(along), tau * period.crop(against)
 
     irradiance = along_colors(light.irradiance) / (4 * math.pi)
-    shares = recompute(find_shares)
-    if narrow is not None:
-        shares = tuple(average_parts(cells, narrow, share) for share in shares)
+    shares = [
+        share if narrow is None else average_parts(cells, narrow, share)
+        for share in recompute(find_shares)
+    ]
     received, along, against = (irradiance * share for share in shares)
     return BeamPair(direction, received, along, against)
 

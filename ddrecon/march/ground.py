@@ -43,11 +43,12 @@ class LitGround:
     """A `ground`, and the light that falls on it.
 
     Direct light is that of `lights`, which shine from above. The irradiance of all other light is
-    `even` [C] where no medium is near, and as much more as `texels` [C, rows, columns] say. `sent`
-    is what it sends into the medium, as of `reflect`, once that is known.
+    `even` [C] where no medium is near, and as much more as `texels` [C, rows, columns] say, which
+    lie under `grid`. `sent` is what it sends into the medium, as of `reflect`, once that is known.
     """
 
     ground: Ground
+    grid: Grid
     lights: tuple[Beamed, ...]
     even: Tensor
     texels: Tensor
@@ -62,7 +63,7 @@ def light_evenly(ground: Ground, sources: Sequence[Source], grid: Grid, like: Te
         if isinstance(sky, Sky):
             even = even - sky.vector[:, ground.plane.axis].sum(0)
     rows, columns, _ = texel_centers(grid, ground.plane, like).shape
-    return LitGround(ground, lights, even, even.new_zeros(len(even), rows, columns))
+    return LitGround(ground, grid, lights, even, even.new_zeros(len(even), rows, columns))
 
 
 def light_texels(
@@ -189,9 +190,7 @@ def see_ground(
         return seen
     rays = rays.select(hit)
     points = plane.meet(rays.origin, rays.direction)
-    more = look_up_texels(
-        lit.texels, medium.grid, plane, *(points[:, axis] for axis in plane.across)
-    )
+    more = look_up_texels(lit.texels, lit.grid, plane, *(points[:, axis] for axis in plane.across))
     direct = _direct_irradiance(lit, medium, points, max(medium.grid.spacing), settings)
     irradiance = lit.even[:, None] + more + direct
     radiance = lit.ground.albedo_at(medium.grid, points) / math.pi * irradiance

@@ -11,14 +11,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
-from ddrecon.grid import Grid
+from ddrecon.grid import Cells, Grid
 from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume
 from ddrecon.medium.mixture import remix
 from ddrecon.numerics.periods import Unrolled
 
 
-def volume_at_level(volume: Volume, grid: Grid) -> Volume:
-    """`volume` on a coarser `grid`, each medium by itself."""
+def volume_at_level(volume: Volume, grid: Grid, cells: Cells | None = None) -> Volume:
+    """`volume` on a coarser `grid`, each medium by itself; that may span some `cells` alone."""
+
+    def put(field: Tensor) -> Tensor:
+        return resample(field if cells is None else field[..., cells[0], cells[1], cells[2]], grid)
+
     support, volume = volume.support, copy(volume)
     if support is not None:
         volume.support = None
@@ -31,11 +35,11 @@ def volume_at_level(volume: Volume, grid: Grid) -> Volume:
                 name: replace(medium, density=medium.density * support)
                 for name, medium in volume.media.items()
             }
-    coarse = put_volume(volume, grid, partial(resample, grid=grid))
+    coarse = put_volume(volume, grid, put)
     if volume.media is None:
         return coarse
     media = volume.media.items()
-    return remix(coarse, {name: volume_at_level(medium, grid) for name, medium in media})
+    return remix(coarse, {name: volume_at_level(medium, grid, cells) for name, medium in media})
 
 
 def refine_medium(medium: Medium, times: int, along: str = "xyz") -> Medium:

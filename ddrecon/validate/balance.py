@@ -217,7 +217,8 @@ class _Box:
             if ambient is not None and self.lit and self.lit.sent:
                 plane, (even, texels) = self.lit.ground.plane, self.lit.sent
                 met = plane.meet(points, travel)
-                more = look_up_texels(texels, grid, plane, *(met[:, a] for a in plane.across))
+                places = (met[:, across] for across in plane.across)
+                more = look_up_texels(texels, self.lit.grid, plane, *places)
                 irradiance = irradiance * ((even - ambient)[:, None] + more)
             out = self.areas[axis] / len(points) * (2 * side - 1)
             power = irradiance * (out * travel[:, axis]).clamp(min=0)
