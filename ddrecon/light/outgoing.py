@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.light.moments import radiance_along, weigh
+from ddrecon.light.moments import floored, radiance_along, weigh
 from ddrecon.light.pairs import ReversedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
@@ -49,8 +49,10 @@ def scatter_towards(
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)
 
     def scatter() -> Tensor:
-        towards = rays.towards_eye(medium.grid)
-        return radiance_along(scatter_once_more(medium, light), towards, more)
+        sent = scatter_once_more(medium, light)
+        if len(sent) == 1:
+            return floored(sent[0] if more is None else sent[0] + more, sent[0], is_directed=False)
+        return radiance_along(sent, rays.towards_eye(medium.grid), more)
 
     return recompute(scatter)
 

@@ -17,12 +17,12 @@ enum Kind {
 // A pass, as `fused/passes.py` lists it: its kind, its items and their width; the grid, with a bit
 // for each axis that is periodic; the axis along which cells become pairs, and how many there were;
 // the number of colors of faces and of cells; the number of a relaxation; places in `work` of
-// vectors, of a factor for each color, and of an item's sum, or 0; and addresses of an operator's
+// vectors, of the five numbers of each color, and of an item's sum, or 0; and addresses of an operator's
 // arrays, of a level's, of a coarsening's weights, and of what a preparation writes. The grid of
 // pairs is the number of cells before an axis, along it and behind it.
 template <class F> struct Pass {
     Size kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-    Size u, source, out, factor, sums;
+    Size u, source, out, numbers, sums;
     const F *c[3], *loss, *inverse, *coupling, *below, *above;
     F* results[6];
 };
@@ -155,13 +155,22 @@ template <class F> INLINE void relax(const Pass<F>& p, F* work, F first, F secon
         if (p.sums) work[p.sums + item] = sum;
     }
 }
+// The numbers of `TensorSteps`, and a ratio of two of them.
+enum Number { POWER, PREVIOUS, CURVATURE, SQUARE, LEAST };
+template <class F> INLINE F ratio(F above, F below) {
+    const F tiny = F(sizeof(F) == 8 ? 0x1p-1022 : 0x1p-126);
+    return (above > tiny ? above : tiny) / (below > tiny ? below : tiny);
+}
 // Steps of conjugate gradients, of directions d and residuals r, with sums of products.
 template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, Size item) {
     const Cells<F> cells(p, item);
     const F* const loss = p.loss + cells.at(cells.cell_color);
     const F* const inverse = p.inverse + cells.at(cells.cell_color);
     const F* const in = work + p.source + cells.at(cells.color);
-    const F step = work[p.factor + cells.color];
+    const F* const number = work + p.numbers + 5 * cells.color;
+    const F step = p.kind == TURN ? ratio(number[POWER], number[PREVIOUS])
+                   : number[SQUARE] > number[LEAST] ? ratio(number[POWER], number[CURVATURE])
+                                                    : F(0);
     F* const d = work + p.u + cells.at(cells.color);
     F* const out = work + p.out + cells.at(cells.color);
     F* const u = solution + cells.at(cells.color);

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes, pair_cells
 from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solve import TensorSteps
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
 from ddrecon.numerics.reads import may_read
@@ -32,7 +33,7 @@ Kind = IntEnum(
 """What a pass does, as `passes.h` has it."""
 PASS = """
 long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-long u, source, out, factor, sums;
+long u, source, out, numbers, sums;
 F *c[3], *loss, *inverse, *coupling, *below, *above, *results[6]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
@@ -299,24 +300,24 @@ class KernelGrids:
             operator, passes = self.operator, KernelPasses(self.operator.loss, colors)
             grid = operator.loss.shape[1:]
             direction, residual = (passes.new_vector(grid) for _ in range(2))
-            factor = passes.new_vector((1, 1, 1))
+            numbers = passes.new_vector((1, 1, KernelSteps.NUMBERS))
             sums = passes.new_vector(grid if operator.loss.is_cuda else grid[:1])
             preconditioned = self.hierarchy.cycle(passes, residual)
             product = Vector(preconditioned.twin, grid)
             turn = len(passes.rows)
             passes.rows[-1]["sums"] = sums.place
-            values: dict[str, Any] = {"u": direction, "factor": factor, "sums": sums}
+            values: dict[str, Any] = {"u": direction, "numbers": numbers, "sums": sums}
             values["inverse"], shape = self.hierarchy.inverse_diagonal, (colors, *grid)
             passes.add("TURN", shape, operator, **values, source=preconditioned)
             passes.add("PRODUCT", shape, operator, **values, out=product)
             passes.add("ADVANCE", shape, operator, **values, source=product, out=residual)
-            vectors = [direction, residual, preconditioned, product, factor, sums]
+            vectors = [direction, residual, preconditioned, product, numbers, sums]
             self.programs[colors] = Program(passes, "iterate", (0, turn, turn + 2)), vectors
         return self.programs[colors]
 
 
-class KernelSteps:
-    """As `TensorSteps`, by kernels."""
+class KernelSteps(TensorSteps):
+    """The same by kernels."""
 
     def __init__(self, operator: Operator, source: Tensor):
         grids, colors = operator.once(KernelGrids), len(source)
@@ -329,24 +330,26 @@ class KernelSteps:
             self.residual,
             self.preconditioned,
             self.product,
-            self._factor,
+            numbers,
             self._sums,
         ) = (
             work[vector.place :][: colors * math.prod(vector.shape)].view(colors, *vector.shape)
             for vector in vectors
         )
+        self.residual.copy_(source)
+        self.direction.zero_()
+        self._keep(numbers.flatten(1).fill_(1))
 
-    def precondition(self) -> Tensor:
-        return self._run(0)
+    def precondition(self) -> None:
+        self.previous.copy_(self.power)
+        self._run(0, self.power)
 
-    def turn(self, factor: Tensor) -> Tensor:
-        self._factor.copy_(factor)
-        return self._run(1)
+    def turn(self) -> None:
+        self._run(1, self.curvature)
 
-    def advance(self, factor: Tensor) -> Tensor:
-        self._factor.copy_(factor)
-        return self._run(2)
+    def advance(self) -> None:
+        self._run(2, self.square)
 
-    def _run(self, step: int) -> Tensor:
+    def _run(self, step: int, total: Tensor) -> None:
         self._program.run(self._bound, step)
-        return self._sums.flatten(1).sum(1).view(-1, 1, 1, 1)
+        torch.sum(self._sums.flatten(1), 1, out=total.view(-1))
