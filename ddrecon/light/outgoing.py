@@ -57,20 +57,6 @@ def scatter_towards(
     return recompute(scatter)
 
 
-def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
-    """The part [C, rows, columns] of even light from outside of each face of the box that its
-    outermost cells scatter into `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the
-    rays (E2.17).
-    """
-    towards = -torch.nn.functional.normalize(rays.direction.sum(0), dim=0)
-    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
-    return [
-        (0.5 - 0.75 * normal * towards[axis] * p_1.select(1 + axis, last)).clamp(min=0)
-        for axis in range(3)
-        for normal, last in ((-1, 0), (1, -1))
-    ]
-
-
 def sum_turned(medium: Medium, rays: Rays, turned: Sequence[ReversedBeam]) -> Tensor:
     """What light of all `turned` beams scatters towards the camera of `rays`."""
     towards = rays.towards_eye(medium.grid)
