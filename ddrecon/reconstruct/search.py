@@ -168,7 +168,7 @@ class Search:
         weights = list[Tensor]()
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))
-            residual = _add(residual, change, -weights[-1], free)
+            residual = _add(residual, change, -weights[-1])
         # The last change goes along: for a GPU two vectors are as many launches as one.
         vectors = [residual, *(change for _, change, _ in pairs[-1:])]
         result, *promised = self.space.metric(self.values, free)(vectors)
@@ -177,8 +177,8 @@ class Search:
         groups = {name: self.space.group(name) for name in result}
         result = {name: value * self.scales.get(groups[name], 1) for name, value in result.items()}
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
-            result = _add(result, move, weight - inverse * _dot(change, result), free)
-        return {name: -value for name, value in result.items()}
+            result = _add(result, move, weight - inverse * _dot(change, result))
+        return {name: -free[name] * value for name, value in result.items()}
 
     def _measure(self, move: Values, change: Values, promised: Values) -> None:
         """Takes from a `move`, and from the one `promised` for its `change`, the metric's length.
@@ -234,6 +234,6 @@ def _combine(first: Values, second: Values, weight: float) -> Values:
     }
 
 
-def _add(total: Values, addend: Values, weight: Tensor, free: Values) -> Values:
-    """The sum of `total` and `weight` times `addend`, of what is `free`."""
-    return {n: v + weight.to(v) * addend[n] * free[n] for n, v in total.items()}
+def _add(total: Values, addend: Values, weight: Tensor) -> Values:
+    """The sum of `total` and `weight` times `addend`."""
+    return {n: torch.addcmul(v, addend[n], weight.to(v)) for n, v in total.items()}
