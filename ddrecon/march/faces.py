@@ -251,7 +251,7 @@ def scatter_back(medium: Medium, rays: Rays) -> Tensor:
     towards, grid = _look_back(rays.direction), medium.grid
     p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
     p_1 = cells_at_faces(grid, p_1) if medium.is_cellwise else p_1.flatten(1)
-    outward = towards @ _outward(grid, towards.dtype, towards.device)
+    outward = towards[None] @ _outward(grid, towards.dtype, towards.device)
     return (0.5 - 0.75 * outward * p_1).clamp(min=0)
 
 
