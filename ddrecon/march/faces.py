@@ -41,7 +41,7 @@ FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order of what differs from face to face."""
 _Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Along an axis, for each place: of two cells, which and how much of it."""
-_Entries = tuple[Tensor, Tensor, Tensor]
+_Entries = Sequence[Tensor]
 """Rows, columns and weights of a sparse matrix."""
 
 
@@ -113,10 +113,11 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, d_values: Tensor | None, d_within: Tensor | None) -> Tensor:
         def change(d_values: Tensor | None, d_within: Tensor | None) -> Tensor:
+            (like, *_) = (tensor for tensor in (d_values, d_within) if tensor is not None)
             if d_values is None:
-                d_values = d_within.new_zeros(len(d_within), ctx.width)
-            elif ctx.shape is not None and d_within is None:
-                d_within = d_values.new_zeros(len(d_values), *ctx.shape)
+                d_values = like.new_zeros(len(like), ctx.width)
+            if ctx.shape is not None and d_within is None:
+                d_within = like.new_zeros(len(like), *ctx.shape)
             return _Product.forward(ctx.pair, d_values, d_within)
 
         tangent: Tensor = run_plainly(change, d_values, d_within)
@@ -165,8 +166,10 @@ def _extend_light(outgoing: OutgoingLight, shell: _Shell, name: str, field: Tens
     nearest, line, beyond = shell.lines.times(field.flatten(1)).chunk(3, 1)
     if name != "diffuse":
         beam = outgoing.beams[int(name.split()[1])]
-        is_point = isinstance(beam, PointBeam)
-        dark = _find_dark(grid, beam.position if is_point else beam.direction, is_point)
+        if isinstance(beam, PointBeam):
+            dark = _find_dark(grid, beam.position, True)
+        else:
+            dark = _find_dark(grid, beam.direction, False)
         on_faces = _limit(nearest, line, dark, extinction.mass_bound)
         return shell.around.times(torch.cat([on_faces, beyond], 1), field)
     matter = shell.nearest.times(extinction.field[: len(field)].flatten(1))

@@ -1,5 +1,6 @@
 """Multigrid's passes as kernels compute what PyTorch's operations compute, as often as those."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -64,9 +65,11 @@ def test_an_item_may_be_a_cell_in_any_order(order: str, wraps: bool):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_grids_are_those_of_torch(form: str):
-    """The same axes are coarsened on every level, also where cells are not cubes."""
+    """The same axes are coarsened on every level, also where cells are not cubes, and on a GPU."""
     shape, sides = FORMS[form]
-    assert_steps_agree(uneven(shape, sides), random_values(2, *shape, seed=4) - 0.5)
+    for place in (nullcontext(), as_on_a_gpu()):
+        with place:
+            assert_steps_agree(uneven(shape, sides), random_values(2, *shape, seed=4) - 0.5)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)

@@ -27,14 +27,15 @@ from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
-    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT SOLVE TURN PRODUCT ADVANCE",
+    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT DESCEND ASCEND SOLVE TURN PRODUCT "
+    "ADVANCE",
     start=0,
 )
 """What a pass does, as `passes.h` has it."""
 PASS = """
 long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-long u, source, out, numbers, sums;
-F *c[3], *loss, *inverse, *coupling, *below, *above, *results[6]
+long u, source, out, numbers, sums, steps, axes[3];
+F *c[3], *loss, *inverse, *coupling, *below, *above, *belows[3], *aboves[3], *results[6]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
@@ -115,6 +116,11 @@ class KernelPasses(Passes):
         return out
 
     def restrict(self, level: Level, residual: Vector) -> Vector:
+        if self.like.is_cuda:
+            shape = level.coarsenings[-1].below.shape[1:]
+            out = self.new_vector(shape)
+            self._add_steps("DESCEND", level, shape, source=residual, out=out)
+            return out
         for coarsening in level.coarsenings:
             vectors = {"source": residual, "out": self.new_vector(coarsening.below.shape[1:])}
             self._add_pairs("RESTRICT", coarsening, level.operator, self.colors, **vectors)
@@ -128,6 +134,9 @@ class KernelPasses(Passes):
         return out
 
     def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
+        if self.like.is_cuda:
+            self._add_steps("ASCEND", level, u.shape, source=coarse, out=u)
+            return u
         for number, coarsening in reversed([*enumerate(level.coarsenings)]):
             shape = [*coarse.shape]
             shape[coarsening.axis - 1] = coarsening.cells
@@ -137,6 +146,14 @@ class KernelPasses(Passes):
             self._add_pairs("CORRECT", coarsening, level.operator, self.colors, **values)
             coarse = out
         return u
+
+    def _add_steps(self, kind: str, level: Level, shape: Sequence[int], **values: Any) -> None:
+        """Lists a pass through all coarsenings of a `level`, to the grid of this `shape`."""
+        steps = level.coarsenings
+        values |= {"steps": len(steps), "axes": [step.axis - 1 for step in steps]}
+        values |= {"coupling": level.coupling, "belows": [step.below for step in steps]}
+        values |= {"aboves": [step.above for step in steps], "n": level.operator.loss.shape[1:]}
+        self.add(kind, (self.colors, *shape), level.operator, **values)
 
     def _add_pairs(
         self, kind: str, coarsening: Coarsening, operator: Operator, colors: int, **values: Any
