@@ -251,7 +251,7 @@ def pair_cells(
 
 def matrix_of(operator: Operator) -> Tensor:
     """The matrix [C, n, n] of few cells, in double: else differences are not exact enough."""
-    faces = torch.cat([c.double().flatten(1) for c in operator.conductances], 1)
+    faces = torch.cat([c.flatten(1) for c in operator.conductances], 1).double()
     differences = _differences(operator.loss.shape[1:], operator.loss.device)
     loss = operator.loss.double().flatten(1).diag_embed()
     return loss + differences.T @ (faces[..., None] * differences)

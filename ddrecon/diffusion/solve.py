@@ -93,7 +93,6 @@ class TensorSteps:
     def precondition(self) -> None:
         """z becomes roughly A^-1 r of the residual r."""
         self.preconditioned = self._hierarchy.cycle(Passes(), self.residual)
-        self.previous.copy_(self.power)
         self.power.copy_(sum_cells(self.residual * self.preconditioned))
 
     def turn(self) -> None:
@@ -112,6 +111,7 @@ class TensorSteps:
         self.solution.addcmul_(factor, self.direction)
         self.residual.addcmul_(factor, self.product, value=-1)
         self.square.copy_(sum_cells(self.residual.square().mul_(self.inverse)))
+        self.previous.copy_(self.power)
 
     def _ratio(self, above: Tensor, below: Tensor) -> Tensor:
         tiny = torch.finfo(above.dtype).tiny
@@ -142,9 +142,9 @@ def _iterate(
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
     steps, iteration = _steps_of(operator, source), 0
-    source_square = sum_cells(torch.mul(source, source, out=steps.product).mul_(steps.inverse))
-    steps.square.copy_(source_square)
-    at_least = source_square.clamp(min=torch.finfo(source.dtype).tiny)
+    torch.mul(source, source, out=steps.product).mul_(steps.inverse)
+    torch.sum(steps.product, (1, 2, 3), keepdim=True, out=steps.square)
+    at_least = steps.square.clamp(min=torch.finfo(source.dtype).tiny)
     # A little less: a color is left as it is when that is no matter of rounding.
     torch.mul(at_least, (1 - 1e-6) * tolerance**2, out=steps.least)
     if guess is not None and guess.shape == source.shape:
@@ -154,11 +154,11 @@ def _iterate(
         steps.advance()
         # A guess that is worse than zero is not used.
         helps = steps.square <= at_least
-        torch.where(helps, steps.square, source_square, out=steps.square)
+        torch.where(helps, steps.square, at_least, out=steps.square)
         torch.where(helps, steps.residual, source, out=steps.residual)
         steps.solution.masked_fill_(~helps, 0)
         steps.direction.zero_()
-        steps.power.fill_(1)
+        steps.previous.fill_(1)
     while iteration != count:
         if count is None:
             worst = float((steps.square / at_least).max())

@@ -59,16 +59,17 @@ class _Table(NamedTuple):
     filled: Tensor
     starts: Tensor
 
-    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
-        """`total` [C, height], to which the product with `values` [C, width] is added in place.
+    def times(self, values: Tensor, total: Tensor | None = None) -> Tensor:
+        """The product [C, height] with `values` [C, width], added to a `total` in place if any.
 
         Kernels sum in a fixed order.
         """
         if is_fused():
             from ddrecon.march.fused.faces import add_product
 
-            return add_product(self, total, values)
+            return add_product(self, values, total)
         products = values.index_select(1, self.columns) * self.weights
+        total = values.new_zeros(len(values), self.height) if total is None else total
         return total.index_add_(1, self.rows, products)
 
 
@@ -92,9 +93,8 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def forward(pair: _Pair, values: Tensor, within: Tensor | None) -> Tensor:
-        size = len(values), pair.table.height
-        total = values.new_zeros(size) if within is None else pad(within, [1] * 6).flatten(1)
-        return pair.table.add_to(total, values)
+        total = None if within is None else pad(within, [1] * 6).flatten(1)
+        return pair.table.times(values, total)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -104,7 +104,7 @@ class _Product(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
-        values_bar = ctx.pair.transposed.add_to(bar.new_zeros(len(bar), ctx.width), bar)
+        values_bar = ctx.pair.transposed.times(bar)
         if ctx.shape is None:
             return None, values_bar, None
         wide = bar.view(-1, *(count + 2 for count in ctx.shape))

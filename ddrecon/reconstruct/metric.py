@@ -73,10 +73,11 @@ class FieldMetric:
     def __init__(
         self, parameter: Parameter, value: Tensor, diagonal: Tensor, weight: float, free: Tensor
     ):
-        grid, unit, factor = parameter.grid, parameter.unit, weight * parameter.tv
-        faces, slope = face_stiffness(value / unit, grid, parameter.knee)
+        grid, unit = parameter.grid, parameter.unit
+        factor = weight * parameter.tv / unit**2
+        faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
         self._slope, self._free = torch.ones_like(value) if slope is None else slope, free
-        z, y, x = (_with_colors(face * (factor / unit**2)) for face in faces)
+        z, y, x = map(_with_colors, faces)
         held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)
         loss = _with_colors(diagonal / self._slope**2 + held)
         periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)

@@ -168,7 +168,7 @@ class Search:
         weights = list[Tensor]()
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))
-            residual = _add(residual, change, -weights[-1])
+            residual = _add(residual, change, weights[-1], -1)
         # The last change goes along: for a GPU two vectors are as many launches as one.
         vectors = [residual, *(change for _, change, _ in pairs[-1:])]
         result, *promised = self.space.metric(self.values, free)(vectors)
@@ -234,6 +234,6 @@ def _combine(first: Values, second: Values, weight: float) -> Values:
     }
 
 
-def _add(total: Values, addend: Values, weight: Tensor) -> Values:
-    """The sum of `total` and `weight` times `addend`."""
-    return {n: torch.addcmul(v, addend[n], weight.to(v)) for n, v in total.items()}
+def _add(total: Values, addend: Values, weight: Tensor, sign: int = 1) -> Values:
+    """The sum of `total` and `weight` times `addend`, or their difference."""
+    return {n: torch.addcmul(v, addend[n], weight, value=sign) for n, v in total.items()}

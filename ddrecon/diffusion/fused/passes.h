@@ -168,7 +168,7 @@ template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, S
     const F* const loss = p.loss + cells.at(cells.cell_color);
     const F* const inverse = p.inverse + cells.at(cells.cell_color);
     const F* const in = work + p.source + cells.at(cells.color);
-    const F* const number = work + p.numbers + 5 * cells.color;
+    F* const number = work + p.numbers + 5 * cells.color;
     const F step = p.kind == TURN                   ? ratio(number[POWER], number[PREVIOUS])
                    : number[SQUARE] > number[LEAST] ? ratio(number[POWER], number[CURVATURE])
                                                     : F(0);
@@ -189,6 +189,7 @@ template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, S
         });
     if (p.kind == ADVANCE) {
         REORDERED
+        if (cells.start == 0) number[PREVIOUS] = number[POWER];  // which nobody reads meanwhile
         INDEPENDENT
         for (int i = 0; i < cells.width; ++i) {
             u[i] += step * d[i];

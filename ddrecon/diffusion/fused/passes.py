@@ -358,7 +358,6 @@ class KernelSteps(TensorSteps):
         self._keep(numbers.flatten(1).fill_(1))
 
     def precondition(self) -> None:
-        self.previous.copy_(self.power)
         self._run(0, self.power)
 
     def turn(self) -> None:
