@@ -4,10 +4,10 @@
 
 Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
 another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full
-resolution.
+resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels.
 
-A call is an operation of torch, views of tensors not counted; on a GPU each costs at least 5
-microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
+A call is an operation of torch, which on a GPU costs at least 5 microseconds; not counted are views
+of tensors, memory without numbers yet, and numbers that are read. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
 depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
 numbers, for which it waits as well. All are counted alike on a machine without a GPU.
 """
@@ -26,10 +26,12 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
+from scaling import start_run
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ddrecon
+from ddrecon.bench.plume import plume_scene
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
@@ -83,10 +85,10 @@ class Operations(TorchDispatchMode):
     def __torch_dispatch__(
         self, function: Any, types: Any, arguments: Any = (), options: Any = None
     ) -> Any:
-        if not is_view(function):
-            self.counts.add("call")
         if is_read(function, arguments):
             self.counts.add("read")
+        if not is_free(function):
+            self.counts.add("call")
         return function(*arguments, **(options or {}))
 
 
@@ -112,11 +114,13 @@ def conversions_counted(counts: Counts) -> Iterator[None]:
         yield
 
 
-def is_view(function: Any) -> bool:
-    """Whether an operation only looks at memory that is there."""
+def is_free(function: Any) -> bool:
+    """Whether an operation only looks at memory, or for some: a GPU does nothing for it."""
     marks = [result.alias_info for result in function._schema.returns]
-    is_alias = any(mark is not None and not mark.is_write for mark in marks)
-    return is_alias or function._schema.name == "aten::_unsafe_view"
+    if any(mark is not None and not mark.is_write for mark in marks):
+        return True
+    names = ("empty", "new_empty", "_unsafe_view", "_local_scalar_dense")
+    return function._schema.name.removeprefix("aten::").startswith(names)
 
 
 def is_read(function: Any, arguments: Sequence[Any]) -> bool:
@@ -175,6 +179,15 @@ def launches_counted(counts: Counts) -> Iterator[None]:
         yield
 
 
+def begin_plume(cells: int, pixels: int, rounds: int, device: str) -> Reconstruction:
+    """The gray plume of `bench`, from half its density and its own image: no rounds are the paper's
+    case.
+    """
+    scene = plume_scene(cells, pixels, torch.float32, torch.device(device))
+    settings = replace(scene.diffusion, transport_rounds=rounds)
+    return start_run(replace(scene, diffusion=settings))
+
+
 def load(views: int, rounds: int, device: str) -> Scene:
     """The plume at full resolution, from half its density."""
     overrides = [f"diffusion.transport_rounds={rounds}"]
@@ -185,9 +198,9 @@ def load(views: int, rounds: int, device: str) -> Scene:
     return replace(scene, views=seen, starts={"density": start})
 
 
-def count(scene: Scene) -> Counts:
+def count(run: Reconstruction) -> Counts:
     """What one iteration asks, once all is warm."""
-    run, counts = Reconstruction(scene), Counts()
+    counts = Counts()
     for _ in range(WARM_UP):
         run.step()
     remembered = torch.autograd.set_detect_anomaly(True, check_nan=False)
@@ -234,6 +247,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--engines", nargs="+", default=ENGINES, choices=ENGINES)
     parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
+    parser.add_argument("--plume", action="store_true")
     parser.add_argument("--modules", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)  # so that a kernel is one launch, as on a GPU
@@ -241,7 +255,11 @@ def main() -> None:
     for engine in options.engines:
         use_engine(engine)
         for rounds in options.rounds:
-            found[engine, rounds] = count(load(options.views, rounds, options.device))
+            if options.plume:
+                run = begin_plume(64, 512, rounds, options.device)
+            else:
+                run = Reconstruction(load(options.views, rounds, options.device))
+            found[engine, rounds] = count(run)
     print_totals(found)
     if options.modules:
         print_modules(found)

@@ -36,7 +36,7 @@ from ddrecon.light.reduced import (
     sum_unscattered_sky,
 )
 from ddrecon.light.sky import Sky, Source
-from ddrecon.march.faces import cells_at_faces
+from ddrecon.march.faces import receive_at_faces
 from ddrecon.march.ground import LitGround
 from ddrecon.march.periods import HALO
 from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_medium
@@ -54,8 +54,8 @@ from ddrecon.transport.sweep import DIRECTIONS
 @dataclass(frozen=True)
 class FaceLight:
     """What transport rounds know of light at faces (E2.17): `outside` [C, 1, 1, 1], the radiance
-    that enters there, and `source` [1 or 4, C, S], moments Q0 and Q1 of light from beams, in
-    `cells_at_faces` of the wide grid.
+    that enters there, and `source` [C, S], what `receive_at_faces` of the wide grid finds of Q0 and
+    Q1 of light from beams.
     """
 
     outside: Tensor
@@ -175,7 +175,7 @@ def _scatter_light(
     # L0 and L1: E2.4 to E2.6.
     scattered = solve_diffuse(cells, source, outside, settings, memory)
     period = unroll(medium.grid, HALO)
-    received_there = cells_at_faces(period.wide, period.extend(cut(received.source)[0]))
+    received_there = receive_at_faces(period.wide, period.extend(cut(received.source)[0]))
     # Light of `unscattered` scatters by E2.3 as well; beams by E2.2 on each view ray.
     return LightField(
         medium,

@@ -15,10 +15,11 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Cells, Grid
 from ddrecon.light.ground import Plane, light_from_below, stay_above
 from ddrecon.light.moments import fill, floored
-from ddrecon.light.outgoing import scatter_back, scatter_once_more, scatter_towards, sum_turned
+from ddrecon.light.outgoing import scatter_once_more, scatter_towards, sum_turned
 from ddrecon.light.reduced import ambient_radiance, scatter_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.light_field import LightField, find_light, fluence_of, medium_of, multiply_scatters
+from ddrecon.march.faces import scatter_back
 from ddrecon.march.ground import light_evenly, light_texels, reflect, upwards
 from ddrecon.march.outgoing import Inflow, OutgoingLight, light_up
 from ddrecon.medium.coefficients import Medium
@@ -139,8 +140,7 @@ def _find_inflow(light_field: LightField, rays: Rays) -> Inflow | None:
     if faces is None:
         return None
     # Faces let out and in a part only of what goes through.
-    let_in = transmitted_moments(medium.index)[0]
-    back = [let_in * scattered for scattered in scatter_back(medium, rays)]
+    back = transmitted_moments(medium.index)[0] * scatter_back(medium, rays)
     return Inflow(faces.outside, faces.source, _unpeaked_share(medium), back)
 
 

@@ -166,7 +166,7 @@ def _without_diffuse(light_field: LightField) -> LightField:
     """`light_field` without diffuse light; faces then let in what the medium would emit there."""
     nothing, faces = torch.zeros_like(light_field.diffuse[:1]), light_field.at_faces
     if faces is not None and light_field.medium.emission is not None:
-        faces = FaceLight(torch.zeros_like(faces.outside), torch.zeros_like(faces.source[:1]))
+        faces = FaceLight(torch.zeros_like(faces.outside), torch.zeros_like(faces.source))
     else:
         faces = None
     leaving = None if light_field.leaving is None else nothing

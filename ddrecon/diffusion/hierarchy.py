@@ -19,6 +19,7 @@ doi:10.1137/0902035).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -250,12 +251,15 @@ def pair_cells(
 
 def matrix_of(operator: Operator) -> Tensor:
     """The matrix [C, n, n] of few cells, in double: else differences are not exact enough."""
-    colors, *shape = operator.loss.shape
-    unit = torch.eye(math.prod(shape), dtype=torch.float64, device=operator.loss.device)
-    # Each color comes as often as there are unit vectors.
-    tensors = (
-        tensor.double().expand(colors, *shape).repeat_interleave(len(unit), 0)
-        for tensor in (operator.loss, *operator.conductances)
-    )
-    columns = unit.repeat(colors, 1).view(-1, *shape)
-    return Operator.of((), (1, 1, 1), {}, *tensors).apply(columns).view(colors, *unit.shape)
+    faces = torch.cat([c.flatten(1) for c in operator.conductances], 1).double()
+    differences = _differences(operator.loss.shape[1:], operator.loss.device)
+    loss = operator.loss.double().flatten(1).diag_embed()
+    return loss + differences.T @ (faces[..., None] * differences)
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _differences(shape: Sequence[int], device: torch.device) -> Tensor:
+    """G [3 n, n] of all axes: `difference` of a grid of n cells of this `shape`."""
+    unit = torch.eye(math.prod(shape), dtype=torch.float64, device=device).view(-1, *shape)
+    return torch.cat([difference(unit, axis).flatten(1) for axis in AXES], 1).T.contiguous()

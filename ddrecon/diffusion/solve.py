@@ -67,34 +67,55 @@ def name_kernels(like: Tensor) -> None:
 
 
 class TensorSteps:
-    """The steps of an iteration by torch's operations: each returns a sum over cells [C, 1, 1, 1].
+    """The steps of an iteration by torch's operations.
 
-    Vectors are as `source`; the `solution` begins as zero. `inverse`: 1 / diagonal.
+    Vectors are as `source`, and begin as zero but for the `residual`. `inverse`: 1 / diagonal.
+    `numbers` are products of vectors, [C, 1, 1, 1]: of the residual and z, the `power`, and its
+    `previous` value; the `curvature`, of d and A d; the `square` norm of the residual, and the
+    `least` down to which a color is advanced.
     """
+
+    NUMBERS = 5
 
     def __init__(self, operator: Operator, source: Tensor):
         self._operator, self._hierarchy = operator, operator.once(prepare)
         self.inverse = self._hierarchy.inverse_diagonal
-        self.solution, self.direction = (torch.zeros_like(source) for _ in range(2))
-        vectors = (torch.empty_like(source) for _ in range(3))
-        self.residual, self.preconditioned, self.product = vectors
+        self.residual = source.clone()
+        vectors = (torch.zeros_like(source) for _ in range(4))
+        self.solution, self.direction, self.preconditioned, self.product = vectors
+        self._keep(source.new_ones(len(source), self.NUMBERS))
 
-    def precondition(self) -> Tensor:
-        """z, roughly A^-1 r of the residual r; its product with that."""
+    def _keep(self, numbers: Tensor) -> None:
+        self.numbers = numbers
+        each = numbers.view(-1, self.NUMBERS, 1, 1, 1).unbind(1)
+        self.power, self.previous, self.curvature, self.square, self.least = each
+
+    def precondition(self) -> None:
+        """z becomes roughly A^-1 r of the residual r."""
         self.preconditioned = self._hierarchy.cycle(Passes(), self.residual)
-        return sum_cells(self.residual * self.preconditioned)
+        self.power.copy_(sum_cells(self.residual * self.preconditioned))
 
-    def turn(self, factor: Tensor) -> Tensor:
-        """The direction d becomes z + `factor` d, and the product A d; the product with that."""
+    def turn(self) -> None:
+        """The direction d becomes z + power / previous d."""
+        factor = self._ratio(self.power, self.previous)
         torch.addcmul(self.preconditioned, self.direction, factor, out=self.direction)
         self.product = self._operator.apply(self.direction)
-        return sum_cells(self.direction * self.product)
+        self.curvature.copy_(sum_cells(self.direction * self.product))
 
-    def advance(self, factor: Tensor) -> Tensor:
-        """The solution gains `factor` d, the residual loses `factor` A d; its square norm."""
+    def advance(self) -> None:
+        """The solution gains power / curvature d, the residual loses as much A d.
+
+        A color that is exact enough is left as it is, whatever the others need.
+        """
+        factor = (self.square > self.least) * self._ratio(self.power, self.curvature)
         self.solution.addcmul_(factor, self.direction)
         self.residual.addcmul_(factor, self.product, value=-1)
-        return sum_cells(self.residual.square().mul_(self.inverse))
+        self.square.copy_(sum_cells(self.residual.square().mul_(self.inverse)))
+        self.previous.copy_(self.power)
+
+    def _ratio(self, above: Tensor, below: Tensor) -> Tensor:
+        tiny = torch.finfo(above.dtype).tiny
+        return above.clamp(min=tiny) / below.clamp(min=tiny)
 
 
 def prepare(operator: Operator) -> Hierarchy:
@@ -120,36 +141,34 @@ def _iterate(
     count: int | None,
 ) -> Solution:
     """The solution after `count` or at most `MAX_ITERATIONS`, which may not reach `tolerance`."""
-    steps, tiny, iteration = _steps_of(operator, source), torch.finfo(source.dtype).tiny, 0
-    own_square = sum_cells(torch.mul(source, source, out=steps.product).mul_(steps.inverse))
-    square, source_square = own_square, own_square.clamp(min=tiny)
-    steps.residual.copy_(source)
-    steps.direction.zero_()
-    power = torch.ones_like(square)
+    steps, iteration = _steps_of(operator, source), 0
+    torch.mul(source, source, out=steps.product).mul_(steps.inverse)
+    torch.sum(steps.product, (1, 2, 3), keepdim=True, out=steps.square)
+    at_least = steps.square.clamp(min=torch.finfo(source.dtype).tiny)
+    # A little less: a color is left as it is when that is no matter of rounding.
+    torch.mul(at_least, (1 - 1e-6) * tolerance**2, out=steps.least)
     if guess is not None and guess.shape == source.shape:
         steps.preconditioned.copy_(guess)
-        steps.turn(power)
-        square = steps.advance(power)
+        steps.turn()
+        steps.power.copy_(steps.curvature)
+        steps.advance()
         # A guess that is worse than zero is not used.
-        helps = square <= source_square
-        square = torch.where(helps, square, own_square)
-        steps.solution.masked_fill_(~helps, 0)
+        helps = steps.square <= at_least
+        torch.where(helps, steps.square, at_least, out=steps.square)
         torch.where(helps, steps.residual, source, out=steps.residual)
+        steps.solution.masked_fill_(~helps, 0)
         steps.direction.zero_()
-    while True:
-        relative = (square / source_square).double()
-        if iteration == count:
-            return Solution(steps.solution, iteration, relative.max().sqrt())
+        steps.previous.fill_(1)
+    while iteration != count:
         if count is None:
-            worst = float(relative.max())
+            worst = float((steps.square / at_least).max())
             if not worst > tolerance**2 or iteration == MAX_ITERATIONS:
                 return Solution(steps.solution, iteration, math.sqrt(worst))
-        previous, power = power, steps.precondition().clamp_(min=tiny)
-        curvature = steps.turn(power / previous).clamp_(min=tiny)
-        # A color that is exact enough is left as it is, whatever the others need.
-        is_open = relative > tolerance**2
-        square = steps.advance(is_open * power / curvature)
+        steps.precondition()
+        steps.turn()
+        steps.advance()
         iteration += 1
+    return Solution(steps.solution, iteration, (steps.square / at_least).max().sqrt())
 
 
 def sum_cells(u: Tensor) -> Tensor:

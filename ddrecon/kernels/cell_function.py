@@ -121,7 +121,10 @@ class _Applied(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
         field_bars, sums = ctx.function.run("cotangents", numbers, fields, bars=_one_by_one(bars))
-        numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
+        numbers_bar = None
+        if ctx.needs_input_grad[1]:
+            totals = sums.view(*numbers.shape, -1).sum(-1, dtype=torch.float64)
+            numbers_bar = totals.to(numbers)
         field_bars = (
             _sum_colors(bar, field.shape[-4]) for bar, field in zip(field_bars, fields, strict=True)
         )

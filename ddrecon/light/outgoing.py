@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.light.moments import radiance_along, weigh
+from ddrecon.light.moments import floored, radiance_along, weigh
 from ddrecon.light.pairs import ReversedBeam
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
@@ -49,24 +49,12 @@ def scatter_towards(
         return scatter_fused(medium.grid, light, _factors(medium), rays, more)
 
     def scatter() -> Tensor:
-        towards = rays.towards_eye(medium.grid)
-        return radiance_along(scatter_once_more(medium, light), towards, more)
+        sent = scatter_once_more(medium, light)
+        if len(sent) == 1:
+            return floored(sent[0] if more is None else sent[0] + more, sent[0], is_directed=False)
+        return radiance_along(sent, rays.towards_eye(medium.grid), more)
 
     return recompute(scatter)
-
-
-def scatter_back(medium: Medium, rays: Rays) -> list[Tensor]:
-    """The part [C, rows, columns] of even light from outside of each face of the box that its
-    outermost cells scatter into `rays`: 1/2 - 3/4 p_1 n · w, at least 0, against the sum of the
-    rays (E2.17).
-    """
-    towards = -torch.nn.functional.normalize(rays.direction.sum(0), dim=0)
-    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
-    return [
-        (0.5 - 0.75 * normal * towards[axis] * p_1.select(1 + axis, last)).clamp(min=0)
-        for axis in range(3)
-        for normal, last in ((-1, 0), (1, -1))
-    ]
 
 
 def sum_turned(medium: Medium, rays: Rays, turned: Sequence[ReversedBeam]) -> Tensor:

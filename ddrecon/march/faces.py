@@ -11,18 +11,20 @@ import functools
 import math
 from collections.abc import Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.light.beam import Beam
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.outgoing import Inflow, OutgoingLight
-from ddrecon.medium.coefficients import for_channels, thinness
+from ddrecon.medium.coefficients import Medium, for_channels, mean_width, thinness
+from ddrecon.medium.remaining import remaining_moments
+from ddrecon.numerics.autodiff import differentiate_once, is_fused, run_plainly
 from ddrecon.numerics.remember import remember
 
 GRAZING = 0.1
@@ -39,41 +41,106 @@ FACES = tuple(product(range(3), range(2)))
 """Axis and side, 0 the lower one, in the order of what differs from face to face."""
 _Along = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Along an axis, for each place: of two cells, which and how much of it."""
-_Entries = tuple[Tensor, Tensor, Tensor]
+_Entries = Sequence[Tensor]
 """Rows, columns and weights of a sparse matrix."""
 
 
 class _Table(NamedTuple):
-    """A sparse matrix: `weights` [E] in its `rows` [E] and `columns` [E]."""
+    """A sparse matrix of so many rows, its `height`.
 
+    Entries [E] have `rows`, which do not fall, `columns` and `weights`. The R rows that have any
+    are `filled` [R], and `starts` [R + 1] says where their entries begin.
+    """
+
+    height: int
     rows: Tensor
     columns: Tensor
     weights: Tensor
+    filled: Tensor
+    starts: Tensor
 
-    def add_to(self, total: Tensor, values: Tensor) -> Tensor:
-        """`total` [C, rows], to which the product with `values` [C, columns] is added in place."""
-        return total.index_add_(1, self.rows, values.index_select(1, self.columns) * self.weights)
+    def times(self, values: Tensor, total: Tensor | None = None) -> Tensor:
+        """The product [C, height] with `values` [C, width], added to a `total` in place if any.
+
+        Kernels sum in a fixed order.
+        """
+        if is_fused():
+            from ddrecon.march.fused.faces import add_product
+
+            return add_product(self, values, total)
+        products = values.index_select(1, self.columns) * self.weights
+        total = values.new_zeros(len(values), self.height) if total is None else total
+        return total.index_add_(1, self.rows, products)
+
+
+class _Pair(NamedTuple):
+    """A sparse matrix and its transpose."""
+
+    table: _Table
+    transposed: _Table
+
+    def times(self, values: Tensor, within: Tensor | None = None) -> Tensor:
+        """The product [C, height] with `values` [C, width].
+
+        It is added to the field `within` [C, z, y, x] with a layer of 0 on each side, if any.
+        """
+        product: Tensor = _Product.apply(self, values, within)
+        return product
+
+
+class _Product(torch.autograd.Function):
+    """`_Pair.times`, differentiable in both modes."""
+
+    @staticmethod
+    def forward(pair: _Pair, values: Tensor, within: Tensor | None) -> Tensor:
+        total = None if within is None else pad(within, [1] * 6).flatten(1)
+        return pair.table.times(values, total)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.pair, values, within = inputs
+        ctx.width, ctx.shape = values.shape[1], None if within is None else within.shape[1:]
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
+        values_bar = ctx.pair.transposed.times(bar)
+        if ctx.shape is None:
+            return None, values_bar, None
+        wide = bar.view(-1, *(count + 2 for count in ctx.shape))
+        return None, values_bar, wide[:, 1:-1, 1:-1, 1:-1]
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, d_values: Tensor | None, d_within: Tensor | None) -> Tensor:
+        def change(d_values: Tensor | None, d_within: Tensor | None) -> Tensor:
+            (like, *_) = (tensor for tensor in (d_values, d_within) if tensor is not None)
+            if d_values is None:
+                d_values = like.new_zeros(len(like), ctx.width)
+            if ctx.shape is not None and d_within is None:
+                d_within = like.new_zeros(len(like), *ctx.shape)
+            return _Product.forward(ctx.pair, d_values, d_within)
+
+        tangent: Tensor = run_plainly(change, d_values, d_within)
+        return tangent
 
 
 class _Shell(NamedTuple):
-    """The M places of the layer around a box, and the S places on those faces where lines end.
+    """The M places of the layer around a box, and the S cells on those faces where lines end.
 
-    `nearest` [M]: the cell nearest to each place. `line` [M, cells]: light on faces, on the line
-    through the two outermost centers. `faces` [3, M]: beyond which of `FACES` a place lies, by
-    axis; 6 for none. `inner` [M, cells] and `around` [places of an extended field, M]: what stands
-    beyond faces, less what `inner` makes of cells, is `around` times light on faces; `places` [M]
-    says where. `lacking` [places of an extended field, S]: what that changes by where light lacks
-    on faces. The cells there have this `width`, and normals `outward` [3, S].
+    Of cells are made, [M, cells], `nearest`, what stands in the nearest one; and, [3 M, cells],
+    `lines`: that, light on faces, on the line through the two outermost centers, and what of light
+    beyond faces is not `around` [places of an extended field, 2 M] times light on faces, and the
+    last. `evenly` [places of an extended field, cells] makes those beyond as the nearest ones.
+    `lacking` [places of an extended field, 2 M + S]: as `around`, and what that changes by where
+    light lacks on faces, of cells with this `width`, over `UNEVEN`.
     """
 
-    nearest: Tensor
-    line: _Table
-    faces: Tensor
-    inner: _Table
-    around: _Table
-    lacking: _Table
+    nearest: _Pair
+    lines: _Pair
+    evenly: _Pair
+    around: _Pair
+    lacking: _Pair
     width: Tensor
-    outward: Tensor
 
 
 def extend_fields(outgoing: OutgoingLight, axis: int | None) -> dict[str, Tensor]:
@@ -86,57 +153,115 @@ def extend_fields(outgoing: OutgoingLight, axis: int | None) -> dict[str, Tensor
     shell, extended = _surround(grid, axis, field.dtype, field.device), dict[str, Tensor]()
     for name, field in outgoing.fields.items():
         if name == "diffuse" or name.startswith("mass "):
-            extended[name] = _extend_light(outgoing, shell, name, field)
+            longer = _extend_light(outgoing, shell, name, field)
         else:
-            extended[name] = pad(field[None], [1] * 6, mode="replicate")[0]
+            longer = shell.evenly.times(field.flatten(1), field)
+        extended[name] = longer.view(-1, *(count + 2 for count in grid.shape))
     return extended
 
 
 def _extend_light(outgoing: OutgoingLight, shell: _Shell, name: str, field: Tensor) -> Tensor:
-    """The `field` of diffuse light or of a mass [channels, z, y, x], extended."""
-    grid, extinction, cells = outgoing.grid, outgoing.extinction, field.flatten(1)
-    nearest = cells.index_select(1, shell.nearest)
-    line = shell.line.add_to(torch.zeros_like(nearest), cells)
-    if name == "diffuse":
-        matter = extinction.field[: len(field)].flatten(1).index_select(1, shell.nearest)
-        share = thinness(grid, extinction.scale[: len(field)].view(-1, 1) * matter, OPAQUE)
-        on_faces = torch.lerp(nearest, line, for_channels(share, len(field)))
-    else:
-        lit = shine_through(outgoing.beams[int(name.split()[1])], grid)
-        z, y, x = pad(1 - lit, (0, 1), value=1.0).index_select(0, shell.faces.flatten()).chunk(3)
-        on_faces = z * y * x * _limit(nearest, line, extinction.mass_bound)
-    beyond = shell.inner.add_to(torch.zeros_like(nearest), cells)
-    values = torch.cat([on_faces.to(field), beyond], 1)
-    longer = shell.around.add_to(pad(field, [1] * 6).flatten(1), values)
-    if name == "diffuse" and outgoing.inflow is not None and len(shell.width):
-        lacks = _find_lacks(outgoing, outgoing.inflow, shell)
-        longer = shell.lacking.add_to(longer, lacks.expand(len(field), -1))
-    return longer.view(-1, *(count + 2 for count in grid.shape))
+    """The `field` of diffuse light or of a mass [channels, z, y, x], extended and flat."""
+    grid, extinction = outgoing.grid, outgoing.extinction
+    nearest, line, beyond = shell.lines.times(field.flatten(1)).chunk(3, 1)
+    if name != "diffuse":
+        beam = outgoing.beams[int(name.split()[1])]
+        if isinstance(beam, PointBeam):
+            dark = _find_dark(grid, beam.position, True)
+        else:
+            dark = _find_dark(grid, beam.direction, False)
+        on_faces = _limit(nearest, line, dark, extinction.mass_bound)
+        return shell.around.times(torch.cat([on_faces, beyond], 1), field)
+    matter = shell.nearest.times(extinction.field[: len(field)].flatten(1))
+    sigma = extinction.scale[: len(field)].view(-1, 1)
+    values = [_go_on(grid, nearest, line, matter, sigma), beyond]
+    if outgoing.inflow is None or not len(shell.width):
+        return shell.around.times(torch.cat(values, 1), field)
+    lacks = _find_lacks(outgoing, outgoing.inflow, shell.width)
+    values.append(lacks.expand(len(field), -1))
+    return shell.lacking.times(torch.cat(values, 1), field)
 
 
-def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, shell: _Shell) -> Tensor:
+def _go_on(grid: Grid, nearest: Tensor, line: Tensor, matter: Tensor, sigma: Tensor) -> Tensor:
+    """Diffuse light on faces, [C, M]: the `line`, but `nearest` where cells are opaque."""
+    if is_fused():
+        return _apply("GoesOn", mean_width(grid) / OPAQUE * sigma, nearest, line, matter)
+    share = thinness(grid, sigma * matter, OPAQUE)
+    return torch.lerp(nearest, line, for_channels(share, len(nearest)))
+
+
+def _limit(nearest: Tensor, line: Tensor, dark: Tensor, bound: Tensor) -> Tensor:
+    """A mass on faces, [K, M]: the `line`, less than `nearest` by 1 over `bound` at most.
+
+    Where it is not `dark`, mass is less.
+    """
+    if is_fused():
+        return _apply("Limited", bound.view(1, 1), nearest, line, dark)
+    fall = (line - nearest).clamp(max=0)
+    # squared, which must not overflow
+    return dark * (line + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1))
+
+
+def _apply(name: str, numbers: Tensor, *fields: Tensor) -> Tensor:
+    """What the function `name` of `fused/faces.h` makes of `fields` [C, M] and `numbers` [C, N]."""
+    from ddrecon.kernels.cell_function import apply_cell
+
+    colors = max(map(len, fields))
+    if len(numbers) > 1:
+        numbers = for_channels(numbers, colors)
+    cells = (field[:, None, None] for field in fields)
+    (result,) = apply_cell("march/fused/faces.h", name, 1, numbers.T, *cells)
+    return result.flatten(1)
+
+
+def _find_lacks(outgoing: OutgoingLight, inflow: Inflow, width: Tensor) -> Tensor:
     """By how much diffuse light on faces is less than on the line to there (E2.17), [C, S]."""
     extinction, diffusing, emitted = outgoing.extinction, outgoing.diffusing, outgoing.emitted
     beside = functools.partial(cells_at_faces, outgoing.grid)
-    received, *first = inflow.received.unbind()
-    if first:
-        flux = torch.stack(flux_along_axes(first))
-        received = received - 0.5 * (shell.outward[:, None] * flux).sum(0)
-    unpeaked, scale = inflow.unpeaked.view(-1, 1), diffusing.scale.view(-1, 1)
-    light = beside(outgoing.diffuse) + unpeaked * received
-    lost = extinction.scale.view(-1, 1) * beside(extinction.field)
-    scattered = scale * beside(diffusing.field)
-    sent = scattered * light - lost * inflow.outside.view(-1, 1)
-    if emitted is not None:
-        sent = sent + beside(emitted)
-    backward = [
-        faces.expand(-1, *_layer_of(outgoing.grid, axis)).flatten(1)
-        for faces, (axis, _) in zip(inflow.backward, FACES, strict=True)
-        if outgoing.grid.shape[axis] > 1
-    ]
-    weight = shell.width * unpeaked * torch.cat(backward, 1)
-    lack = weight * sent / (UNEVEN + shell.width * lost + weight * scattered)
-    return lack if emitted is None else scale * lack
+    matter = beside(extinction.field)
+    scatters = matter if diffusing.field is extinction.field else beside(diffusing.field)
+    more = [] if emitted is None else [beside(emitted)]
+    fields = beside(outgoing.diffuse), matter, scatters, inflow.received, inflow.backward
+    numbers = extinction.scale, diffusing.scale, inflow.unpeaked, inflow.outside
+    sigma, scale, unpeaked, outside = (number.view(-1, 1) for number in numbers)
+    if is_fused():
+        rows = torch.broadcast_tensors(sigma, scale, unpeaked, outside)
+        name = f"Lacks<{'true' if more else 'false'}>"
+        return _apply(name, torch.cat(rows, 1), *fields, width[None], *more)
+    diffuse, matter, scatters, received, backward = fields
+    scattered, weight = scale * scatters, width * unpeaked * backward
+    sent = scattered * (diffuse + unpeaked * received) - sigma * matter * outside
+    lack = weight * sum(more, sent) / (1 + width * sigma * matter + weight * scattered)
+    return scale * lack if more else lack
+
+
+def receive_at_faces(grid: Grid, moments: Tensor) -> Tensor:
+    """What `cells_at_faces` receive of light with these `moments` [1 or 4, C, z, y, x], [C, S].
+
+    Half of its flux outwards is taken off (E2.17).
+    """
+    mean, *first = cells_at_faces(grid, moments).unbind()
+    if not first:
+        return mean
+    flux = torch.stack(flux_along_axes(first))
+    return mean - 0.5 * (_outward(grid, mean.dtype, mean.device)[:, None] * flux).sum(0)
+
+
+def scatter_back(medium: Medium, rays: Rays) -> Tensor:
+    """The part [C, S] of even light from outside that `cells_at_faces` scatter into `rays`: 1/2 -
+    3/4 p_1 n · w, at least 0, against the sum of the rays (E2.17).
+    """
+    towards, grid = _look_back(rays.direction), medium.grid
+    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
+    p_1 = cells_at_faces(grid, p_1) if medium.is_cellwise else p_1.flatten(1)
+    outward = towards[None] @ _outward(grid, towards.dtype, towards.device)
+    return (0.5 - 0.75 * outward * p_1).clamp(min=0)
+
+
+@remember
+def _look_back(direction: Tensor) -> Tensor:
+    """The unit vector against the sum of all `direction` [R, 3]."""
+    return -torch.nn.functional.normalize(direction.sum(0), dim=0)
 
 
 def cells_at_faces(grid: Grid, field: Tensor) -> Tensor:
@@ -144,60 +269,70 @@ def cells_at_faces(grid: Grid, field: Tensor) -> Tensor:
 
     Faces across an axis of a single cell are left out.
     """
+    beside = _beside(grid, field.dtype, field.device)
     # Moments beside colors: along a third axis torch takes entries one by one.
-    cells = field.reshape(-1, grid.cells).index_select(1, _cells_at_faces(grid, field.device))
-    return cells.view(*field.shape[:-3], -1)
+    return beside.times(field.reshape(-1, grid.cells)).view(*field.shape[:-3], -1)
 
 
 @remember
-def _cells_at_faces(grid: Grid, device: torch.device) -> Tensor:
-    """The numbers of those cells."""
+def _beside(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
+    """Those cells of all, [S, cells]."""
     number, none = torch.arange(grid.cells).view(grid.shape), torch.zeros(0, dtype=torch.long)
-    faces = ((axis, side) for axis, side in FACES if grid.shape[axis] > 1)
-    layers = (number.select(axis, -side).flatten() for axis, side in faces)
-    return torch.cat([none, *layers]).to(device)
+    layers = (number.select(axis, -side).flatten() for axis, side in _faces_of(grid))
+    cells = torch.cat([none, *layers])
+    one_each = torch.arange(len(cells)), cells, torch.ones(len(cells))
+    return _pair(len(cells), grid.cells, one_each, dtype, device)
 
 
-def _layer_of(grid: Grid, axis: int) -> tuple[int, ...]:
-    """The shape of a layer of cells across `axis`."""
-    return tuple(count for across, count in enumerate(grid.shape) if across != axis)
+@remember
+def _outward(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The normals [3, S] of the faces of `cells_at_faces`, which point outwards."""
+    normals = [torch.zeros(3, 0, dtype=dtype)]
+    for axis, side in _faces_of(grid):
+        normal = torch.zeros(3, grid.cells // grid.shape[axis], dtype=dtype)
+        normal[axis] = 2 * side - 1
+        normals.append(normal)
+    return torch.cat(normals, 1).to(device)
 
 
-def shine_through(beam: Beam | PointBeam, grid: Grid) -> Tensor:
-    """How far `beam` shines through each of `FACES` from outside, 0 to 1: [6].
+def _faces_of(grid: Grid) -> list[tuple[int, int]]:
+    """Those of `FACES` that are not across an axis of a single cell."""
+    return [(axis, side) for axis, side in FACES if grid.shape[axis] > 1]
 
-    A point light does so fully if it is at least a cell away from the face.
+
+@remember
+def _find_dark(grid: Grid, place: Tensor, is_point: bool) -> Tensor:
+    """The part of mass to a light, 0 to 1, that it has at places around the box, [1, M]."""
+    lit = pad(1 - shine_through(grid, place, is_point), (0, 1), value=1.0)
+    z, y, x = _beyond(grid, place.dtype, place.device).times(lit[None]).chunk(3, 1)
+    return z * y * x
+
+
+def shine_through(grid: Grid, place: Tensor, is_point: bool) -> Tensor:
+    """How far light shines through each of `FACES` from outside, 0 to 1: [6].
+
+    It comes along the unit vector `place` [3], or from there. A point light shines fully if it is
+    at least a cell away from the face.
     """
-    if isinstance(beam, Beam):
-        lit = torch.stack([beam.direction, -beam.direction], 1) / GRAZING
+    if is_point:
+        low, high, cell = map(place.new_tensor, (grid.lower, grid.upper, grid.spacing))
+        lit = torch.stack([low - place, place - high], 1) / cell[:, None]
     else:
-        low, high, cell = map(beam.position.new_tensor, (grid.lower, grid.upper, grid.spacing))
-        lit = torch.stack([low - beam.position, beam.position - high], 1) / cell[:, None]
+        lit = torch.stack([place, -place], 1) / GRAZING
     lit = lit.clamp(0, 1)
     return (lit * lit * (3 - 2 * lit)).flatten()
-
-
-def _limit(layer: Tensor, goal: Tensor, bound: Tensor) -> Tensor:
-    """`goal`, less than `layer` by 1 over `bound` at most."""
-    fall = (goal - layer).clamp(max=0)
-    # squared, which must not overflow
-    return goal + fall * ((1 + (bound * fall).clamp(min=-1e6) ** 2).rsqrt() - 1)
 
 
 @remember
 def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.device) -> _Shell:
     """The places around the box of `grid`; across `axis` those that are extended are on faces."""
     wide = tuple(count + 2 for count in grid.shape)
-    cells = torch.arange(grid.cells).view(1, *grid.shape)
-    nearest = pad(cells.double()[None], [1] * 6, mode="replicate").long()[0, 0]
-    is_outside = torch.ones(wide, dtype=torch.bool)
-    is_outside[1:-1, 1:-1, 1:-1] = False
-    places = is_outside.flatten().nonzero()[:, 0]
-    number = torch.zeros(math.prod(wide), dtype=torch.long)
+    nearest, places, size = _nearest_cells(grid), _places_around(wide), math.prod(wide)
+    number = torch.full((size,), -1)
     number[places] = torch.arange(len(places))
 
     # Along an axis, places and where each goes on from: value + share (value - value before).
-    on_line, beyond, faces = list[_Along](), list[_Along](), list[Tensor]()
+    on_line, beyond = list[_Along](), list[_Along]()
     for along, count in enumerate(grid.shape):
         place = torch.arange(count + 2)
         cell, low, high = (place - 1).clamp(0, count - 1), place == 0, place == count + 1
@@ -206,36 +341,84 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         on_line.append(((cell, 1 + share / 2), (before, -share / 2)))
         share = share * (along != axis)
         beyond.append(((place, 1 + share), (place.clamp(1, count), -share)))
-        face = torch.where(low, 2 * along, 2 * along + 1)
-        faces.append(torch.where((low | high) & (count > 1), face, len(FACES)))
-    line = _multiply(on_line, grid.shape, places)
-    rows, columns, weights = _multiply(beyond, wide, places)
-    is_inner = ~is_outside.flatten()[columns]
-    inner = rows[is_inner], nearest.flatten()[columns[is_inner]], weights[is_inner]
+    one = torch.ones(len(places), dtype=torch.float64)
+    each, (rows, columns, weights) = torch.arange(len(places)), _multiply(beyond, wide, places)
+    is_inner = number[columns] < 0
+    same = each, nearest[places], one
+    inner = rows[is_inner], nearest[columns[is_inner]], weights[is_inner]
     rows, columns, weights = (column[~is_inner] for column in (rows, columns, weights))
     # Light on faces, then what is made of cells.
-    around = (
-        torch.cat([places[rows], places]),
-        torch.cat([number[columns], len(places) + torch.arange(len(places))]),
-        torch.cat([weights, torch.ones(len(places), dtype=torch.float64)]),
-    )
-    by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)[:, places]
-    lacking, width, outward = _find_layers(grid, axis, nearest)
+    around = [
+        (places[rows], number[columns], weights),
+        (places, len(places) + each, one),
+    ]
+    lacking, width = _find_layers(grid, axis, nearest.view(wide))
 
-    def on_device(entries: _Entries) -> _Table:
-        rows, columns, weights = (column.to(device) for column in entries)
-        return _Table(rows, columns, weights.to(dtype))
+    def pair(height: int, columns: int, *blocks: _Entries) -> _Pair:
+        entries = (torch.cat(many) for many in zip(*blocks, strict=True))
+        return _pair(height, columns, tuple(entries), dtype, device)
 
+    count = len(places)
+    lines = [
+        (rows + number * count, *rest)
+        for number, (rows, *rest) in enumerate(
+            [same, _multiply(on_line, grid.shape, places), inner]
+        )
+    ]
+    shifted = lacking[0], 2 * count + lacking[1], lacking[2]
     return _Shell(
-        nearest.flatten()[places].to(device),
-        on_device(line),
-        by_axis.to(device),
-        on_device(inner),
-        on_device(around),
-        on_device(lacking),
-        width.to(device, dtype),
-        outward.to(device, dtype),
+        pair(count, grid.cells, same),
+        pair(3 * count, grid.cells, *lines),
+        pair(size, grid.cells, (places, nearest[places], one)),
+        pair(size, 2 * count, *around),
+        pair(size, 2 * count + len(width), *around, shifted),
+        width.to(device, dtype) / UNEVEN,
     )
+
+
+def _nearest_cells(grid: Grid) -> Tensor:
+    """The number of the cell nearest to each place of an extended field."""
+    cells = torch.arange(grid.cells).view(1, *grid.shape)
+    return pad(cells.double()[None], [1] * 6, mode="replicate").long().flatten()
+
+
+def _places_around(wide: Sequence[int]) -> Tensor:
+    """The places [M] of the layer around a box, among those of an extended field."""
+    is_outside = torch.ones(*wide, dtype=torch.bool)
+    is_outside[1:-1, 1:-1, 1:-1] = False
+    return is_outside.flatten().nonzero()[:, 0]
+
+
+@remember
+def _beyond(grid: Grid, dtype: torch.dtype, device: torch.device) -> _Pair:
+    """Beyond which of `FACES` each of M places lies, by axis, [3 M, 7]; 6 for none."""
+    faces = list[Tensor]()
+    for along, count in enumerate(grid.shape):
+        face = torch.full((count + 2,), len(FACES))
+        if count > 1:
+            face[0], face[-1] = 2 * along, 2 * along + 1
+        faces.append(face)
+    by_axis = torch.stack(torch.meshgrid(*faces, indexing="ij")).flatten(1)
+    columns = by_axis[:, _places_around([count + 2 for count in grid.shape])].flatten()
+    one_each = torch.arange(len(columns)), columns, torch.ones(len(columns))
+    return _pair(len(columns), len(FACES) + 1, one_each, dtype, device)
+
+
+def _pair(
+    height: int, width: int, entries: _Entries, dtype: torch.dtype, device: torch.device
+) -> _Pair:
+    """The matrix [height, width] that has these `entries`, and its transpose."""
+
+    def table(size: int, rows: Tensor, columns: Tensor, weights: Tensor) -> _Table:
+        rows, order = rows.sort(stable=True)
+        filled, counts = rows.unique_consecutive(return_counts=True)
+        starts = pad(counts.cumsum(0), (1, 0))
+        integers = (t.to(device, torch.int32) for t in (rows, columns[order], filled, starts))
+        rows, columns, filled, starts = integers
+        return _Table(size, rows, columns, weights[order].to(device, dtype), filled, starts)
+
+    rows, columns, weights = entries
+    return _Pair(table(height, rows, columns, weights), table(width, columns, rows, weights))
 
 
 def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _Entries:
@@ -254,18 +437,16 @@ def _multiply(axes: Sequence[_Along], size: Sequence[int], places: Tensor) -> _E
     return torch.cat(rows), torch.cat(columns), torch.cat(weights)
 
 
-def _find_layers(grid: Grid, axis: int | None, nearest: Tensor) -> tuple[_Entries, Tensor, Tensor]:
-    """`lacking`, `width` and `outward` of a `_Shell`.
+def _find_layers(grid: Grid, axis: int | None, nearest: Tensor) -> tuple[_Entries, Tensor]:
+    """What of `lacking` light lacks, with columns of its own; and the width of those cells [u].
 
     `nearest` [z + 2, y + 2, x + 2]: the cell nearest to each place.
     """
     place, count = torch.arange(nearest.numel()).view(nearest.shape), 0
     number = torch.zeros(grid.cells, dtype=torch.long)
     none = torch.zeros(0, dtype=torch.long)
-    layers = [(none, none, none.double(), none.double(), none.double().view(3, 0))]
-    for along, side in FACES:
-        if grid.shape[along] == 1:
-            continue
+    layers = [(none, none, none.double(), none.double())]
+    for along, side in _faces_of(grid):
         outer, last = (place.select(along, -1 - k if side else k) for k in range(2))
         last = last[1:-1, 1:-1].flatten()
         rows, cells = torch.cat([outer.flatten(), last]), nearest.flatten()[last]
@@ -275,10 +456,6 @@ def _find_layers(grid: Grid, axis: int | None, nearest: Tensor) -> tuple[_Entrie
         less = -1.0 if along == axis else -2.0 - RAISED
         weights = torch.tensor([less] * outer.numel() + [RAISED] * len(cells), dtype=torch.float64)
         width = torch.full((len(cells),), grid.spacing[along], dtype=torch.float64)
-        outward = torch.zeros(3, len(cells), dtype=torch.float64)
-        outward[along] = 2 * side - 1
-        layers.append((rows, number[nearest.flatten()[rows]], weights, width, outward))
-    rows, columns, weights, width, outward = (
-        torch.cat(many, -1) for many in zip(*layers, strict=True)
-    )
-    return (rows, columns, weights), width, outward
+        layers.append((rows, number[nearest.flatten()[rows]], weights, width))
+    rows, columns, weights, width = (torch.cat(many) for many in zip(*layers, strict=True))
+    return (rows, columns, weights), width

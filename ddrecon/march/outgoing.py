@@ -22,16 +22,15 @@ from ddrecon.numerics.third_order import ThirdOrder
 class Inflow:
     """What comes in through faces of the box, where a medium that went on would send light (E2.17).
 
-    `outside` [C, 1, 1, 1] is that; `received` are moments [1 or 4, C, S] of what `cells_at_faces`
-    receive of beams, of which the share `unpeaked` counts as `diffuse` light does. `backward` are,
-    by face, the parts [C, rows, columns] of light from there that are scattered into the camera's
-    rays.
+    `outside` [C, 1, 1, 1] is that; `received` [C, S] is what of beams is received there
+    (`receive_at_faces`), of which the share `unpeaked` counts as `diffuse` light does. `backward`
+    [C, S] are the parts of light from there that are scattered into the camera's rays.
     """
 
     outside: Tensor
     received: Tensor
     unpeaked: Tensor
-    backward: Sequence[Tensor]
+    backward: Tensor
 
 
 @dataclass(frozen=True)

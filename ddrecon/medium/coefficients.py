@@ -89,7 +89,7 @@ class Coefficient:
 
         That is half an optical depth, in the mean over colors.
         """
-        return 2 * self.scale.mean()
+        return _twice_mean(self.scale)
 
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
@@ -98,6 +98,11 @@ class Coefficient:
         the light's path through the cell [u], scalar or [z, y, x].
         """
         return torch.exp(-self.scale * entered) * decay_mean(self.scale * (self.field * step))
+
+
+@remember
+def _twice_mean(scale: Tensor) -> Tensor:
+    return 2 * scale.mean()
 
 
 @dataclass(frozen=True)

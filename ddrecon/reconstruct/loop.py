@@ -255,12 +255,16 @@ class Together:
             if p.tv and p.name not in waiting:
                 metrics[key] = FieldMetric(p, values[key], self.diagonals[key], weight, free[key])
 
-        def precondition(residual: Values) -> Values:
-            result = dict[str, Tensor]()
+        def precondition(vectors: Sequence[Values]) -> list[Values]:
+            fields = dict[str, Tensor]()
             for key, diagonal in self.diagonals.items():
-                bar = residual[key] * free[key]
-                result[key] = metrics[key].solve(bar) if key in metrics else bar / diagonal
-            return result | self.numbers.precondition(residual, free)
+                bars = torch.stack([vector[key] for vector in vectors]) * free[key]
+                fields[key] = metrics[key].solve(bars) if key in metrics else bars / diagonal
+            return [
+                {key: bars[n] for key, bars in fields.items()}
+                | self.numbers.precondition(vector, free)
+                for n, vector in enumerate(vectors)
+            ]
 
         return precondition
 

@@ -73,17 +73,18 @@ class FieldMetric:
     def __init__(
         self, parameter: Parameter, value: Tensor, diagonal: Tensor, weight: float, free: Tensor
     ):
-        grid, unit, factor = parameter.grid, parameter.unit, weight * parameter.tv
-        faces, slope = face_stiffness(value / unit, grid, parameter.knee)
+        grid, unit = parameter.grid, parameter.unit
+        factor = weight * parameter.tv / unit**2
+        faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
         self._slope, self._free = torch.ones_like(value) if slope is None else slope, free
-        z, y, x = (_with_colors(face * (factor / unit**2)) for face in faces)
-        held = tuning.HELD * max(face.max() for face in (z, y, x)) * (1 - free)
+        z, y, x = map(_with_colors, faces)
+        held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)
         loss = _with_colors(diagonal / self._slope**2 + held)
         periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
         self._operator = Operator((z, y, x), loss, periodic, grid.spacing)
 
     def solve(self, residual: Tensor) -> Tensor:
-        """The inverse metric times `residual`, of what is free."""
+        """The inverse metric times `residual` [..., z, y, x], one or several, of what is free."""
         right = _with_colors(residual * self._free / self._slope)
         solution = solve_by_multigrid(self._operator, right, None, 0.0, tuning.CYCLES).value
         return solution.view_as(residual) * self._free / self._slope

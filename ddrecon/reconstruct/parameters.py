@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -66,8 +67,9 @@ class Parameter:
 
     def free(self, value: Tensor, gradient: Tensor) -> Tensor:
         """1 where an entry of `value` may move against its `gradient`, else 0."""
-        at_low, at_high = value <= self.low, value >= self.high
-        is_free = ~((at_low & (gradient > 0)) | (at_high & (gradient < 0)))
+        is_free = (value > self.low) | (gradient <= 0)
+        if self.high < math.inf:
+            is_free &= (value < self.high) | (gradient >= 0)
         return is_free.to(value) if self.support is None else is_free * self.support
 
     def keep_start(self, fraction: float) -> None:

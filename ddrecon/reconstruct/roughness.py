@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 
@@ -39,16 +40,17 @@ def total_variation(field: Tensor, grid: Grid, knee: float | None = None) -> Ten
 
 
 def face_stiffness(
-    field: Tensor, grid: Grid, knee: float | None = None
+    field: Tensor, grid: Grid, knee: float | None = None, weight: float = 1.0
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | None]:
     """R (E11.2) of `total_variation` at `field` [..., z, y, x], as D^T V D between S on both sides.
 
-    It returns D^T V D by the stiffness of each face above a cell along z, y, x, shaped as `field`,
-    and S, the slope of the compression: None without a `knee`.
+    It returns `weight` D^T V D by the stiffness of each face above a cell along z, y, x, shaped as
+    `field`, and S, the slope of the compression: None without a `knee`.
     """
-    stiffness, faces = 1 / (field.numel() * _find_length(field, grid, knee)), list[Tensor]()
+    inverse, faces = _find_length(field, grid, knee).reciprocal_(), list[Tensor]()
     for axis, spacing in zip(AXES, grid.spacing, strict=True):
-        face, count = stiffness * (min(grid.extent) / spacing) ** 2, field.shape[axis]
+        face = inverse * (weight / field.numel() * (min(grid.extent) / spacing) ** 2)
+        count = field.shape[axis]
         if count == 1 or axis % 3 not in grid.periodic:
             face.narrow(axis, count - 1, 1).zero_()
         faces.append(face)
@@ -58,10 +60,11 @@ def face_stiffness(
 
 def _find_length(field: Tensor, grid: Grid, knee: float | None) -> Tensor:
     """The length of the gradient of `field`, compressed where there is a `knee`, rounded at 0."""
-    seen = field if knee is None else torch.log1p(field / knee) / 3
+    seen, times = (field, 1.0) if knee is None else (torch.log1p(field / knee), 1 / 3)
     square = torch.full_like(field, ROUNDING**2)
     for axis, spacing in zip(AXES, grid.spacing, strict=True):
-        square = square + (_rise_to_next(seen, axis, grid) * (min(grid.extent) / spacing)) ** 2
+        scale = (times * min(grid.extent) / spacing) ** 2
+        square = torch.add(square, _rise_to_next(seen, axis, grid).square(), alpha=scale)
     return square.sqrt()
 
 
@@ -72,4 +75,4 @@ def _rise_to_next(field: Tensor, axis: int, grid: Grid) -> Tensor:
     """
     if axis % 3 in grid.periodic:
         return field.roll(-1, axis) - field
-    return torch.cat([field.diff(dim=axis), torch.zeros_like(field.narrow(axis, 0, 1))], axis)
+    return pad(field.diff(dim=axis), [0, 0] * (-1 - axis) + [0, 1])

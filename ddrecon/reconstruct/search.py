@@ -10,7 +10,7 @@ else the step is shortened.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
@@ -23,8 +23,8 @@ from ddrecon.reconstruct import tuning
 
 Values = dict[str, Tensor]
 """Tensors by the name of their parameter."""
-Inverse = Callable[[Values], Values]
-"""The inverse of a metric, as a function."""
+Inverse = Callable[[Sequence[Values]], list[Values]]
+"""The inverse of a metric, as a function of several vectors."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Space:
 
     `project` brings values back within bounds, `free` is 1 where an entry may move at values and
     their derivative, and `metric` is taken at values and what is free there: its inverse, of that,
-    is a function of a derivative. It mixes no values of one `group` with those of another.
+    is a function of derivatives. It mixes no values of one `group` with those of another.
     """
 
     project: Callable[[Values], Values]
@@ -168,17 +168,17 @@ class Search:
         weights = list[Tensor]()
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))
-            residual = _add(residual, change, -weights[-1], free)
-        precondition = self.space.metric(self.values, free)
-        result = precondition(residual)
-        if pairs:
-            move, change, _ = pairs[-1]
-            self._measure(move, change, precondition(change))
+            residual = _add(residual, change, weights[-1], -1)
+        # The last change goes along: for a GPU two vectors are as many launches as one.
+        vectors = [residual, *(change for _, change, _ in pairs[-1:])]
+        result, *promised = self.space.metric(self.values, free)(vectors)
+        if promised:
+            self._measure(*pairs[-1][:2], *promised)
         groups = {name: self.space.group(name) for name in result}
         result = {name: value * self.scales.get(groups[name], 1) for name, value in result.items()}
         for (move, change, inverse), weight in zip(pairs, reversed(weights), strict=True):
-            result = _add(result, move, weight - inverse * _dot(change, result), free)
-        return {name: -value for name, value in result.items()}
+            result = _add(result, move, weight - inverse * _dot(change, result))
+        return {name: -free[name] * value for name, value in result.items()}
 
     def _measure(self, move: Values, change: Values, promised: Values) -> None:
         """Takes from a `move`, and from the one `promised` for its `change`, the metric's length.
@@ -234,6 +234,6 @@ def _combine(first: Values, second: Values, weight: float) -> Values:
     }
 
 
-def _add(total: Values, addend: Values, weight: Tensor, free: Values) -> Values:
-    """The sum of `total` and `weight` times `addend`, of what is `free`."""
-    return {n: v + weight.to(v) * addend[n] * free[n] for n, v in total.items()}
+def _add(total: Values, addend: Values, weight: Tensor, sign: int = 1) -> Values:
+    """The sum of `total` and `weight` times `addend`, or their difference."""
+    return {n: torch.addcmul(v, addend[n], weight, value=sign) for n, v in total.items()}

@@ -13,7 +13,7 @@ from ddrecon.engine import use_engine
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
-from ddrecon.march.faces import cells_at_faces, extend_fields, shine_through
+from ddrecon.march.faces import cells_at_faces, extend_fields, receive_at_faces, shine_through
 from ddrecon.march.outgoing import Inflow, OutgoingLight
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.settings import RenderSettings
@@ -84,28 +84,29 @@ def test_masses_are_zero_where_light_enters_and_others_go_on(axis: int | None):
 
 def test_light_through_a_face_begins_smoothly():
     """A direction, or a place, a little to the one side and to the other."""
-    one = torch.ones(1, dtype=torch.float64)
     for way in (-1e-6, 0.0, 1e-6):
-        along = Beam(one, torch.tensor([way, 1.0, 0.0]), one)
-        beyond = PointBeam(one, torch.tensor([-way + GRID.lower[0], 0.0, 0.0]), one, 0.1)
-        for beam in (along, beyond):
-            assert float(shine_through(beam, GRID)[0]) <= 1e-8
+        along = torch.tensor([way, 1.0, 0.0])
+        beyond = torch.tensor([-way + GRID.lower[0], 0.0, 0.0])
+        for place, is_point in ((along, False), (beyond, True)):
+            assert float(shine_through(GRID, place, is_point)[0]) <= 1e-8
 
 
+@pytest.mark.parametrize("engine", ["torch", pytest.param("warp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
-def test_extended_fields_have_both_derivatives(axis: int | None):
+def test_extended_fields_have_both_derivatives(axis: int | None, engine: str):
     """By light, by masses, and by where it comes from; some of what goes on would be negative.
 
     And by what thick cells receive, of which less comes in than goes out.
     """
+    use_engine(engine)
     diffuse, *masses, got = (random_values(1, *GRID.shape, seed=k).pow(4) for k in range(4))
-    backward = random_values(6, 1, 1, 1, seed=5)
+    backward = random_values(1, cells_at_faces(GRID, got).shape[-1], seed=5)
     direction, position = TRAVEL + 0.05, torch.tensor([-0.6, 0.1, 0.2], dtype=torch.float64)
 
     def extend(diffuse: Tensor, *rest: Tensor) -> tuple[Tensor, ...]:
         masses, places, depth = rest[:2], rest[2:], rest[4].view(1, 1, 1, 1)
         outgoing = emission_of(diffuse, *masses)
-        received = cells_at_faces(GRID, rest[5].expand(4, -1, -1, -1, -1))
+        received = receive_at_faces(GRID, rest[5].expand(4, -1, -1, -1, -1))
         coming = Inflow(0.2 * depth, received, 0.9 * depth, backward)
         matter = replace(outgoing.extinction, scale=depth)
         outgoing = replace(outgoing, extinction=matter, scattering=matter, inflow=coming)

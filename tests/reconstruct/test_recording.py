@@ -10,7 +10,7 @@ from tape import record
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.engine import use_engine
+from ddrecon.engine import LOG, use_engine
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.objective import Comparison
@@ -88,6 +88,7 @@ def test_what_cannot_be_recorded_runs_plainly(
     scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A camera that is sought looks at other rays in each iteration."""
+    caplog.set_level("WARNING", LOG)  # a quiet command before this would have no warnings
     memory, values = SolveMemory(), leaves_of(scene)
     name = "views.one.camera"
     values[name] = value_of(scene, name).clone().requires_grad_()

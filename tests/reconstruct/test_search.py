@@ -42,7 +42,7 @@ def space_of(metric: Tensor, low: float) -> Space:
     return Space(
         lambda values: {n: v.clamp(min=low) for n, v in values.items()},
         free,
-        lambda values, free: lambda residual: {"x": residual["x"] * free["x"] / metric},
+        lambda values, free: lambda many: [{"x": one["x"] * free["x"] / metric} for one in many],
     )
 
 

@@ -17,6 +17,7 @@ struct Line3 {
     // To a result along an axis is added what an `Around` weighs there, or its transpose.
     template <class Around, bool IS_BACK, int AXIS, class F>
     INLINE void add(const F* field, F* result) const {
+        if (Around::ONLY >= 0 && Around::ONLY != AXIS) return;
         const int n = count[AXIS];
         const auto add_cell = [&](int i, bool inner) HERE {
             const int k = first[AXIS] + (AXIS == 2 ? i : 0);
@@ -27,7 +28,7 @@ struct Line3 {
                 const int weight =
                     IS_BACK ? Around::weight(k + side, n, -side) : Around::weight(k, n, side);
                 sum +=
-                    F(inside ? weight : 0) * F(0.5) * field[i + (inside ? side * step[AXIS] : 0)];
+                    F(inside ? weight : 0) * F(0.125) * field[i + (inside ? side * step[AXIS] : 0)];
             }
             result[i] = sum;
         };
@@ -43,21 +44,28 @@ struct Line3 {
     }
 };
 
-// For cell k of n, twice the weight of the cell on one `side` along an axis or the other, or its
-// own. Half the difference of both neighbors; at the faces of the box, that to the one.
+// For cell k of n, eight times the weight of the cell on one `side` along an axis or the other, or
+// its own. Half the difference of both neighbors; at the faces of the box, that to the one.
 struct Rises {
-    static constexpr int OUTS = 3;
+    static constexpr int OUTS = 3, ONLY = -1;
     INLINE static int weight(int k, int n, int side) {
         const int below = k > 0, above = k < n - 1;
         const int sign = side < 0 ? -below : side > 0 ? above : below - above;
-        return below + above == 2 ? sign : 2 * sign;
+        return below + above == 2 ? 4 * sign : 8 * sign;
     }
 };
 // The second difference; 0 at the ends of an axis.
 struct Bends {
-    static constexpr int OUTS = 1;
+    static constexpr int OUTS = 1, ONLY = -1;
     INLINE static int weight(int k, int n, int side) {
-        return k > 0 && k < n - 1 ? (side ? 2 : -4) : 0;
+        return k > 0 && k < n - 1 ? (side ? 8 : -16) : 0;
+    }
+};
+// The mean along an axis of what is linear between centers, and even beyond the outermost.
+template <int AXIS> struct Means {
+    static constexpr int OUTS = 1, ONLY = AXIS;
+    INLINE static int weight(int k, int n, int side) {
+        return side ? 1 : 8 - (k > 0) - (k < n - 1);
     }
 };
 

@@ -10,20 +10,21 @@ typedef long long Size;
 
 // clang-format off
 enum Kind {
-    SCALE, WEIGH, STIFFEN, SMOOTH, RESIDUAL, RELAX, RESTRICT, CORRECT, SOLVE, TURN, PRODUCT, ADVANCE
+    SCALE, WEIGH, STIFFEN, SMOOTH, RESIDUAL, RELAX, RESTRICT, CORRECT, DESCEND, ASCEND, SOLVE, TURN,
+    PRODUCT, ADVANCE
 };
 // clang-format on
 
 // A pass, as `fused/passes.py` lists it: its kind, its items and their width; the grid, with a bit
 // for each axis that is periodic; the axis along which cells become pairs, and how many there were;
 // the number of colors of faces and of cells; the number of a relaxation; places in `work` of
-// vectors, of a factor for each color, and of an item's sum, or 0; and addresses of an operator's
-// arrays, of a level's, of a coarsening's weights, and of what a preparation writes. The grid of
-// pairs is the number of cells before an axis, along it and behind it.
+// vectors, of the five numbers of each color, and of an item's sum, or 0; and addresses of an
+// operator's arrays, of a level's, of a coarsening's weights, and of what a preparation writes. The
+// grid of pairs is the number of cells before an axis, along it and behind it.
 template <class F> struct Pass {
     Size kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-    Size u, source, out, factor, sums;
-    const F *c[3], *loss, *inverse, *coupling, *below, *above;
+    Size u, source, out, numbers, sums, steps, axes[3];
+    const F *c[3], *loss, *inverse, *coupling, *below, *above, *belows[3], *aboves[3];
     F* results[6];
 };
 
@@ -155,13 +156,22 @@ template <class F> INLINE void relax(const Pass<F>& p, F* work, F first, F secon
         if (p.sums) work[p.sums + item] = sum;
     }
 }
+// The numbers of `TensorSteps`, and a ratio of two of them.
+enum Number { POWER, PREVIOUS, CURVATURE, SQUARE, LEAST };
+template <class F> INLINE F ratio(F above, F below) {
+    const F tiny = F(sizeof(F) == 8 ? 0x1p-1022 : 0x1p-126);
+    return (above > tiny ? above : tiny) / (below > tiny ? below : tiny);
+}
 // Steps of conjugate gradients, of directions d and residuals r, with sums of products.
 template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, Size item) {
     const Cells<F> cells(p, item);
     const F* const loss = p.loss + cells.at(cells.cell_color);
     const F* const inverse = p.inverse + cells.at(cells.cell_color);
     const F* const in = work + p.source + cells.at(cells.color);
-    const F step = work[p.factor + cells.color];
+    F* const number = work + p.numbers + 5 * cells.color;
+    const F step = p.kind == TURN                   ? ratio(number[POWER], number[PREVIOUS])
+                   : number[SQUARE] > number[LEAST] ? ratio(number[POWER], number[CURVATURE])
+                                                    : F(0);
     F* const d = work + p.u + cells.at(cells.color);
     F* const out = work + p.out + cells.at(cells.color);
     F* const u = solution + cells.at(cells.color);
@@ -179,6 +189,7 @@ template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, S
         });
     if (p.kind == ADVANCE) {
         REORDERED
+        if (cells.start == 0) number[PREVIOUS] = number[POWER];  // which nobody reads meanwhile
         INDEPENDENT
         for (int i = 0; i < cells.width; ++i) {
             u[i] += step * d[i];
@@ -357,6 +368,84 @@ template <bool ALONG_X, class F> INLINE void transfer(const Pass<F>& p, F* work,
     p.coupling ? correct<ALONG_X, true>(p, work, item) : correct<ALONG_X, false>(p, work, item);
 }
 
+// All coarsenings of a level at once, as a GPU does them: a number of a grid of z, y, x is made of
+// those of the grid before or behind it, and so on.
+template <class F> struct Steps {
+    const Pass<F>& p;
+    const F* numbers;
+    int color, face_color;
+
+    // The place of a cell on the grid after so many coarsenings, and of its color.
+    INLINE Size at(int step, int color, const int* cell) const {
+        Size place = color;
+        UNROLLED
+        for (int a = 0; a < 3; ++a) place = place * count(step, a) + cell[a];
+        return place;
+    }
+    INLINE int count(int step, int axis) const {
+        int n = (int)p.n[axis];
+        for (int k = 0; k < step; ++k) n = p.axes[k] == axis ? (n + 1) / 2 : n;
+        return n;
+    }
+    // As `restrict`, of the grid after STEP coarsenings.
+    template <int STEP> INLINE F restricted(const int* cell) const {
+        if constexpr (STEP == 0) {
+            return numbers[at(0, color, cell)];
+        } else {
+            const int axis = (int)p.axes[STEP - 1], n = count(STEP - 1, axis), k = cell[axis];
+            const int last = (n + 1) / 2 - 1, under = k > 0 ? k - 1 : last;
+            const int behind = k < last ? k + 1 : 0;
+            int from[3] = {cell[0], cell[1], cell[2]};
+            const Size here = at(STEP, face_color, from);
+            from[axis] = under;
+            const Size there = at(STEP, face_color, from);
+            const F *const below = p.belows[STEP - 1], *const above = p.aboves[STEP - 1];
+            const int cells[4] = {2 * k, 2 * k + 1, 2 * under + (2 * under + 1 < n), 2 * behind};
+            const F parts[4] = {1 - above[there], 1 - below[here], below[there], above[here]};
+            F sum = 0;
+            for (int i = 0; i < 4; ++i) {
+                from[axis] = cells[i];
+                if (cells[i] < n) sum += parts[i] * restricted<STEP - 1>(from);
+            }
+            return sum;
+        }
+    }
+    // As `correct`, on the grid after STEP coarsenings.
+    template <int STEP> INLINE F prolonged(const int* cell) const {
+        if (STEP == p.steps) return numbers[at(STEP, color, cell)];
+        if constexpr (STEP < 3) {
+            const int axis = (int)p.axes[STEP], last = (count(STEP, axis) + 1) / 2 - 1;
+            int pair[3] = {cell[0], cell[1], cell[2]};
+            const int k = pair[axis] /= 2, is_second = cell[axis] % 2;
+            const F value = prolonged<STEP + 1>(pair);
+            Size face = at(STEP + 1, face_color, pair);
+            pair[axis] = is_second ? (k < last ? k + 1 : 0) : (k > 0 ? k - 1 : last);
+            if (!is_second) face = at(STEP + 1, face_color, pair);
+            const F part = (is_second ? p.belows : p.aboves)[STEP][face];
+            return value + part * (prolonged<STEP + 1>(pair) - value);
+        }
+        return 0;
+    }
+};
+template <class F> INLINE void descend(const Pass<F>& p, F* work, Size item) {
+    Steps<F> steps{p, work + p.source};
+    const int z = steps.count((int)p.steps, 0), y = steps.count((int)p.steps, 1);
+    const int x = steps.count((int)p.steps, 2);
+    steps.color = (int)(item / ((Size)z * y * x));
+    steps.face_color = steps.color % p.face_colors;
+    const int cell[3] = {(int)(item / ((Size)y * x) % z), (int)(item / x % y), (int)(item % x)};
+    work[p.out + item] = p.steps == 1   ? steps.template restricted<1>(cell)
+                         : p.steps == 2 ? steps.template restricted<2>(cell)
+                                        : steps.template restricted<3>(cell);
+}
+template <class F> INLINE void ascend(const Pass<F>& p, F* work, Size item) {
+    const Cells<F> cells(p, item);
+    const int cell[3] = {cells.z, cells.y, cells.x};
+    const Steps<F> steps{p, work + p.source, cells.color, cells.face_color};
+    work[p.out + item] +=
+        p.coupling[cells.at(cells.cell_color)] * steps.template prolonged<0>(cell);
+}
+
 // An item of a pass that prepares a hierarchy, or of one of an iteration.
 template <class F> INLINE void prepare(const Pass<F>& p, F*, F*, F, F, Size item) {
     if (p.kind == SCALE) scale(p, item);
@@ -368,6 +457,10 @@ template <class F> INLINE void prepare(const Pass<F>& p, F*, F*, F, F, Size item
 }
 template <class F>
 INLINE void iterate(const Pass<F>& p, F* work, F* solution, F first, F second, Size item) {
+    if constexpr (IS_GPU) {
+        if (p.kind == DESCEND) return descend(p, work, item);
+        if (p.kind == ASCEND) return ascend(p, work, item);
+    }
     if (p.kind == SOLVE) return solve(p, work, item);
     if (p.kind >= TURN) return advance(p, work, solution, item);
     if (p.kind < RESTRICT) return relax(p, work, first, second, item);

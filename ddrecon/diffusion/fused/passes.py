@@ -20,20 +20,22 @@ from torch import Tensor
 
 from ddrecon.diffusion.hierarchy import STEPS, Coarsening, Hierarchy, Level, Passes, pair_cells
 from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solve import TensorSteps
 from ddrecon.kernels.launch import launch_later, thread_count
 from ddrecon.kernels.text import Bound, TextKernel, declarations
 from ddrecon.numerics.reads import may_read
 
 Kind = IntEnum(
     "Kind",
-    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT SOLVE TURN PRODUCT ADVANCE",
+    "SCALE WEIGH STIFFEN SMOOTH RESIDUAL RELAX RESTRICT CORRECT DESCEND ASCEND SOLVE TURN PRODUCT "
+    "ADVANCE",
     start=0,
 )
 """What a pass does, as `passes.h` has it."""
 PASS = """
 long kind, items, width, n[3], periodic, axis, cells, face_colors, cell_colors, step;
-long u, source, out, factor, sums;
-F *c[3], *loss, *inverse, *coupling, *below, *above, *results[6]
+long u, source, out, numbers, sums, steps, axes[3];
+F *c[3], *loss, *inverse, *coupling, *below, *above, *belows[3], *aboves[3], *results[6]
 """
 """What a pass is given, as `passes.h` declares it: eight bytes each."""
 TOGETHER = 400
@@ -114,6 +116,11 @@ class KernelPasses(Passes):
         return out
 
     def restrict(self, level: Level, residual: Vector) -> Vector:
+        if self.like.is_cuda:
+            shape = level.coarsenings[-1].below.shape[1:]
+            out = self.new_vector(shape)
+            self._add_steps("DESCEND", level, shape, source=residual, out=out)
+            return out
         for coarsening in level.coarsenings:
             vectors = {"source": residual, "out": self.new_vector(coarsening.below.shape[1:])}
             self._add_pairs("RESTRICT", coarsening, level.operator, self.colors, **vectors)
@@ -127,6 +134,9 @@ class KernelPasses(Passes):
         return out
 
     def correct(self, level: Level, u: Vector, coarse: Vector) -> Vector:
+        if self.like.is_cuda:
+            self._add_steps("ASCEND", level, u.shape, source=coarse, out=u)
+            return u
         for number, coarsening in reversed([*enumerate(level.coarsenings)]):
             shape = [*coarse.shape]
             shape[coarsening.axis - 1] = coarsening.cells
@@ -136,6 +146,14 @@ class KernelPasses(Passes):
             self._add_pairs("CORRECT", coarsening, level.operator, self.colors, **values)
             coarse = out
         return u
+
+    def _add_steps(self, kind: str, level: Level, shape: Sequence[int], **values: Any) -> None:
+        """Lists a pass through all coarsenings of a `level`, to the grid of this `shape`."""
+        steps = level.coarsenings
+        values |= {"steps": len(steps), "axes": [step.axis - 1 for step in steps]}
+        values |= {"coupling": level.coupling, "belows": [step.below for step in steps]}
+        values |= {"aboves": [step.above for step in steps], "n": level.operator.loss.shape[1:]}
+        self.add(kind, (self.colors, *shape), level.operator, **values)
 
     def _add_pairs(
         self, kind: str, coarsening: Coarsening, operator: Operator, colors: int, **values: Any
@@ -299,24 +317,24 @@ class KernelGrids:
             operator, passes = self.operator, KernelPasses(self.operator.loss, colors)
             grid = operator.loss.shape[1:]
             direction, residual = (passes.new_vector(grid) for _ in range(2))
-            factor = passes.new_vector((1, 1, 1))
+            numbers = passes.new_vector((1, 1, KernelSteps.NUMBERS))
             sums = passes.new_vector(grid if operator.loss.is_cuda else grid[:1])
             preconditioned = self.hierarchy.cycle(passes, residual)
             product = Vector(preconditioned.twin, grid)
             turn = len(passes.rows)
             passes.rows[-1]["sums"] = sums.place
-            values: dict[str, Any] = {"u": direction, "factor": factor, "sums": sums}
+            values: dict[str, Any] = {"u": direction, "numbers": numbers, "sums": sums}
             values["inverse"], shape = self.hierarchy.inverse_diagonal, (colors, *grid)
             passes.add("TURN", shape, operator, **values, source=preconditioned)
             passes.add("PRODUCT", shape, operator, **values, out=product)
             passes.add("ADVANCE", shape, operator, **values, source=product, out=residual)
-            vectors = [direction, residual, preconditioned, product, factor, sums]
+            vectors = [direction, residual, preconditioned, product, numbers, sums]
             self.programs[colors] = Program(passes, "iterate", (0, turn, turn + 2)), vectors
         return self.programs[colors]
 
 
-class KernelSteps:
-    """As `TensorSteps`, by kernels."""
+class KernelSteps(TensorSteps):
+    """The same by kernels."""
 
     def __init__(self, operator: Operator, source: Tensor):
         grids, colors = operator.once(KernelGrids), len(source)
@@ -329,24 +347,25 @@ class KernelSteps:
             self.residual,
             self.preconditioned,
             self.product,
-            self._factor,
+            numbers,
             self._sums,
         ) = (
             work[vector.place :][: colors * math.prod(vector.shape)].view(colors, *vector.shape)
             for vector in vectors
         )
+        self.residual.copy_(source)
+        self.direction.zero_()
+        self._keep(numbers.flatten(1).fill_(1))
 
-    def precondition(self) -> Tensor:
-        return self._run(0)
+    def precondition(self) -> None:
+        self._run(0, self.power)
 
-    def turn(self, factor: Tensor) -> Tensor:
-        self._factor.copy_(factor)
-        return self._run(1)
+    def turn(self) -> None:
+        self._run(1, self.curvature)
 
-    def advance(self, factor: Tensor) -> Tensor:
-        self._factor.copy_(factor)
-        return self._run(2)
+    def advance(self) -> None:
+        self._run(2, self.square)
 
-    def _run(self, step: int) -> Tensor:
+    def _run(self, step: int, total: Tensor) -> None:
         self._program.run(self._bound, step)
-        return self._sums.flatten(1).sum(1).view(-1, 1, 1, 1)
+        torch.sum(self._sums.flatten(1), 1, out=total.view(-1))

@@ -6,6 +6,7 @@ have a cell beyond each face.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -36,13 +37,13 @@ def sweep_fused(
     tables = ordinate_tables(grid, directions, emitted, len(emitted))
     points, *_ = sweep_rule(directions, 1)
     moments, gone = torch.zeros_like(emitted), dict[int, Ends]()
+    # Light of a single chunk is kept for the way back; of several, one at a time is there.
+    run = _sweep_chunk if len(tables.chunks) == 1 else functools.partial(recompute, _sweep_chunk)
     for number, chunk in enumerate(tables.chunks):
         numbers = tables.numbers[chunk.ordinates]
         courses = [Characteristic.of(grid, points[n]) for n in numbers]
         ends = None if mirror is None else [mirror.entering(n) for n in numbers]
-        chunk_moments, leaving = recompute(
-            _sweep_chunk, (grid, directions, number), fields, courses, ends
-        )
+        chunk_moments, leaving = run((grid, directions, number), fields, courses, ends)
         moments = moments + chunk_moments
         gone |= zip(numbers, leaving, strict=bool(leaving))
     if mirror is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -138,6 +138,13 @@ def _team_rows(ordinates: Sequence[Ordinate], pieces: int) -> list[Team]:
     return teams
 
 
+def _share_out(teams: Sequence[Team], together: int) -> Iterator[Sequence[Team]]:
+    """`teams` in chunks of about so many `together`: few left over would be as many launches."""
+    count = max(1, round(len(teams) / together))
+    size = max(1, math.ceil(len(teams) / count))
+    return (teams[n : n + size] for n in range(0, len(teams), size))
+
+
 def ordinate_tables(
     grid: Grid, directions: int, like: Tensor, moments: int, pieces: int | None = None
 ) -> Tables:
@@ -165,7 +172,7 @@ def _make_tables(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tables:
-    """The same, of chunks of so many teams `together`."""
+    """The same, of chunks of about so many teams `together`."""
     points, weights, harmonics = sweep_rule(directions, moments)
     ordinates = [Ordinate.of(grid, number, point) for number, point in enumerate(points)]
     if pieces is None:
@@ -177,9 +184,8 @@ def _make_tables(
     else:
         groups = [_team_rows(ordinates, pieces)]
     order, rows, chunks = list[Ordinate](), list[list[int]](), list[Chunk]()
-    starts = ((teams, n) for teams in groups for n in range(0, len(teams), together))
-    for teams, number in starts:
-        first, several = len(order), teams[number : number + together]
+    for several in (several for teams in groups for several in _share_out(teams, together)):
+        first = len(order)
         for team in several:
             begin, middle = len(order), len(order) + len(team.up)
             order += team.up + team.down
