@@ -4,12 +4,12 @@ import math
 import multiprocessing
 import threading
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
+from twins import assert_same, differentiate, images_of, values_of
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
@@ -21,7 +21,7 @@ from ddrecon.medium.coefficients import scale_medium
 from ddrecon.picture import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.kernels import launch
@@ -52,25 +52,13 @@ def every_light(is_cellwise: bool = False) -> Scene:
     return replace(scene, render=RenderSettings(tolerance=1.0))
 
 
-def differentiate(scene: Scene, values: dict[str, Tensor], **options: Any) -> list[Tensor]:
-    """The image, and the derivatives of a weighted sum of it by `values`."""
-    leaves = {name: value.detach().requires_grad_() for name, value in values.items()}
-    changed = with_values(scene, leaves)
-    (image,) = render_each(changed, changed.views, SolveMemory())
-    total = (image * random_values(*image.shape, seed=9)).sum()
-    return [image.detach(), *torch.autograd.grad(total, list(leaves.values()), **options)]
-
-
 @pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
 def test_layout_in_memory_changes_nothing(is_cellwise: bool):
     scene = every_light(is_cellwise)
-    values = {name: value_of(scene, name).detach() for name in VARIED}
-    use_engine("torch")
-    known = differentiate(scene, values)
-    use_engine("warp")
-    found = differentiate(scene, {name: reorder(value) for name, value in values.items()})
-    for one, other in zip(found, known, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
+    values = values_of(scene, VARIED)
+    known = differentiate("torch", images_of(scene), values)
+    reordered = {name: reorder(value) for name, value in values.items()}
+    assert_same(differentiate("warp", images_of(scene), reordered), known, 1e-12)
 
 
 @pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
@@ -79,19 +67,17 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
 ):
     # However few cells and pixels there are, threads share them.
     monkeypatch.setattr("ddrecon.diffusion.fused.passes.SMALL", 0)
-    use_engine("warp")
     scene, threads, runs = every_light(is_cellwise), torch.get_num_threads(), []
-    values = {name: value_of(scene, name).detach() for name in VARIED}
+    values = values_of(scene, VARIED)
     try:
         for count in (2, 2, 1, 3, 16):
             torch.set_num_threads(count)
-            runs.append(differentiate(scene, values))
+            runs.append(differentiate("warp", images_of(scene), values))
     finally:
         torch.set_num_threads(threads)
-    assert all(map(torch.equal, runs[0], runs[1]))
+    assert_same(runs[1], runs[0], 0.0)
     for other in runs[2:]:
-        for one, known in zip(other, runs[0], strict=True):
-            torch.testing.assert_close(one, known, rtol=0, atol=1e-11 * float(known.norm()))
+        assert_same(other, runs[0], 1e-12)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -100,8 +86,7 @@ def test_second_derivatives_are_refused(engine: str):
     use_engine(engine)
     scene = every_light()
     density = scene.volume.density.clone().requires_grad_()
-    changed = with_values(scene, {"density": density})
-    (image,) = render_each(changed, changed.views, SolveMemory())
+    (image,) = images_of(scene)({"density": density})
     for loss in (image.square().sum(), image.sum()):
         with pytest.raises(NotImplementedError, match="only first derivatives"):
             torch.autograd.grad(loss, density, create_graph=True)
@@ -120,12 +105,11 @@ def test_a_graph_can_be_gone_back_through_twice():
 
 
 def test_what_inference_mode_made_serves_derivatives_later():
-    use_engine("warp")
     scene = every_light()
-    values = {"density": scene.volume.density, "g": scene.volume.g}
+    use_engine("warp")
     with torch.inference_mode():
         render_each(scene, scene.views, SolveMemory())
-    differentiate(scene, values)
+    differentiate("warp", images_of(scene), values_of(scene, ["density", "g"]))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper").glob("*.yaml"))}
 RECONSTRUCTIONS = [name for name in CONFIGS if name != "fig08"]
-"""Fig. 8 is of derivatives, which tests/test_tangents.py checks."""
+"""Fig. 8 is of derivatives, which `tests/variables/test_tangents.py` checks."""
 ITERATIONS = 12
 CHANGES = [f"optimize.iterations={ITERATIONS}", "diffusion.tolerance=1e-3"]
 COARSER = 4
