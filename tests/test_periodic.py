@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,11 +12,9 @@ from media import half_empty, make_scene, tensor
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon import load_scene
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
@@ -210,23 +207,3 @@ def test_units_and_precision_do_not_tell_how_many_cells_a_beam_passes(unit: floa
     direction = torch.nn.functional.normalize(torch.tensor([-0.7, -2, -1], dtype=dtype), dim=0)
     period = unroll_along(Grid(shape, lower, upper, periodic=(1,)), direction)
     assert (period.before, period.after) == ((0, MARGIN, 0), (0, MARGIN + 15, 0))
-
-
-LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
-REFUSED = [
-    ("[x,y,z]", "", "volume.periodic: name one axis or two"),
-    ("[x,x]", "", "volume.periodic: name one axis or two"),
-    ("[w]", "", "volume.periodic.0: expected one of x, y, z"),
-    ("[x]", "diffusion.model=flux_limited", "diffusion: volume.periodic is"),
-    ("[x]", "diffusion.scheme=printed", "diffusion: volume.periodic is"),
-    ("[x]", LAMP, "lights.0: a PointLight does not repeat"),
-    ("[y]", "ground={height: -2, albedo: 0.3}", "ground: lies across y, along which the volume"),
-]
-
-
-@pytest.mark.parametrize(("axes", "change", "problem"), REFUSED)
-def test_what_cannot_repeat_is_said(axes: str, change: str, problem: str):
-    path, changes = Path(__file__).parents[1] / "configs/ball.yaml", [change] if change else []
-    with pytest.raises(SceneError) as caught:
-        load_scene(path, overrides=[f"volume.periodic={axes}", *changes])
-    assert problem in str(caught.value)

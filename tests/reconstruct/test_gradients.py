@@ -68,21 +68,6 @@ def with_derivatives(scene: Scene, kind: str) -> Scene:
     return replace(scene, optimize=OptimizeSettings(parameters, derivatives=kind))
 
 
-def test_single_and_diffusion_derivatives_add_up_to_all(scene: Scene) -> None:
-    """Of a loss that is linear in the image; each is a derivative of the same image."""
-    values, found = leaves_of(scene), []
-    for kind in ("all", "single", "diffusion"):
-        world, memory = with_derivatives(scene, kind), SolveMemory()
-        of_mean = differentiate(world, ["one", "two"], values, lambda _, im: im.mean(), memory)
-        found.append(of_mean)
-        torch.testing.assert_close(of_mean.images[0], found[0].images[0], rtol=1e-12, atol=1e-15)
-    for name in NAMES:
-        whole, single, diffuse = (each.gradients[name] for each in found)
-        close = 1e-11 * float(whole.abs().max())
-        torch.testing.assert_close(single + diffuse, whole, rtol=1e-8, atol=close, msg=name)
-        assert name != "density" or not torch.equal(single, whole)
-
-
 def test_only_the_diffusion_needs_an_adjoint(scene: Scene) -> None:
     memory = SolveMemory()
     differentiate(with_derivatives(scene, "single"), ["one"], leaves_of(scene), loss_of, memory)
