@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ddrecon import Scene, load_scene
 from ddrecon.reconstruct.frame import Frame
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction, Together
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
@@ -16,9 +17,10 @@ NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 @pytest.fixture
 def still() -> Scene:
     """The ball, with numbers to find beside its density, in float64; cameras need more pictures."""
-    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=4"]
     sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
-    return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
+    overrides = ["optimize.iterations=4", "diffusion.transport_rounds=0", *sought]
+    scene = load_scene("configs/ball.yaml", overrides=overrides, dtype=torch.float64)
+    return scene_at_level(scene, 2)
 
 
 def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
