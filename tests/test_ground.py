@@ -157,6 +157,7 @@ def test_a_slab_takes_from_the_ground_what_it_takes_from_the_sun() -> None:
     assert float(lost.mean()) * 4 * 2 == pytest.approx(total, rel=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["p1", "coarse", "environment", "map"])
 def test_tangent_adjoint_and_differences_agree(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if kind == "coarse":

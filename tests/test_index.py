@@ -96,6 +96,7 @@ def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
     assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["down", "slanted", "ambient", "beam"])
 def test_no_power_is_lost_or_made(light: str) -> None:
     travel = (0.0, -1.0, 0.0) if light == "down" else (-2.0, -2.1, -1.0)
@@ -127,6 +128,7 @@ def test_layers_reflect_and_transmit_as_by_adding_and_doubling() -> None:
     assert found == pytest.approx([float(one) for one in expected], abs=0.003)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [{}, {"transport_rounds": 2, "degree": 3}], ids=str)
 def test_images_have_tangent_adjoint_and_differences(rounds: dict[str, Any]) -> None:
     near, far = (make_camera((0.9, 1.3, 2.5), is_perspective=is_near) for is_near in (True, False))

@@ -72,6 +72,7 @@ def see(scene: Scene) -> list[Tensor]:
     return [*pictures, fluence_of(light, scene.diffusion)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
@@ -88,6 +89,7 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
         assert_near(one, other, close)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [4, 8])
 def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_begins(
     cells: int, monkeypatch: pytest.MonkeyPatch
@@ -102,6 +104,7 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
     assert_near(fluence(moved), fluence(one).roll(shift, (1, 3)), 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
     """The tangent is along both variables; light is followed through few periods."""
@@ -129,6 +132,7 @@ def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.Monk
         assert_near(one, other, 1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fine angles", "white sky", "backward"])
 def test_the_balance_of_a_period_is_half_of_that_of_two(kind: str) -> None:
     """Nothing leaves by its sides, and by its faces enters what falls on them."""

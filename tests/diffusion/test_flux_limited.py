@@ -89,6 +89,7 @@ def test_dense_media_diffuse_as_without_a_limit(make):
     torch.testing.assert_close(ours, theirs, rtol=0.03, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_each_other_and_differences():
     shape, weights = (2, 3, 2), random_values(1, 2, 3, 2, seed=7)
     inputs = [4 * random_values(1, *shape, seed=seed) for seed in range(3)]

@@ -93,6 +93,7 @@ def diagonal_by(curvature: Curvature, probes: int, monkeypatch: pytest.MonkeyPat
     return find_diagonals(curvature.scene, *arguments)["density"]
 
 
+@pytest.mark.slow
 def test_it_is_the_mean_of_the_true_diagonal_over_neighbors(
     curvature: Curvature, monkeypatch: pytest.MonkeyPatch
 ) -> None:

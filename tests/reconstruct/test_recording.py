@@ -56,6 +56,7 @@ def assert_same(objective: Differentiated, plain: Differentiated) -> None:
         torch.testing.assert_close(bar, plain.gradients[name], rtol=0, atol=close, msg=name)
 
 
+@pytest.mark.slow
 def test_replays_are_plain_iterations(scene: Scene) -> None:
     """Of other values and views than those that were recorded, and after other views."""
     memory = SolveMemory()

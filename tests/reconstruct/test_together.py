@@ -27,6 +27,7 @@ def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
     return {p.name: p.value.detach() for p in run.parameters}
 
 
+@pytest.mark.slow
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
     single, together = Reconstruction(still), Together([still, still])
     while not single.is_done:
@@ -37,6 +38,7 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
         torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
     together = Together([still, other])

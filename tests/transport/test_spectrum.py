@@ -129,6 +129,7 @@ WAVES[0] = 1e-3, 0, 0
 """From cell to cell, along axes and diagonals, and long."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degree", "g"),
     [

@@ -23,7 +23,7 @@ from ddrecon.scene_file.load import MAX_BYTES
 pytestmark = pytest.mark.slow
 
 LEFT_OUT = [HealthCheck.function_scoped_fixture]
-CASES = settings(derandomize=True, database=None, max_examples=200, suppress_health_check=LEFT_OUT)
+CASES = settings(derandomize=True, database=None, max_examples=60, suppress_health_check=LEFT_OUT)
 PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
 """How every line begins: the place in the scene or override, or the path of a data file."""
 
@@ -136,14 +136,14 @@ def test_changed_keys_and_values(folder: Path, text: str) -> None:
     require_taken_or_refused(folder, "check", "scene.yaml")
 
 
-@settings(CASES, max_examples=150)
+@CASES
 @given(data=texts())
 def test_changed_characters(folder: Path, data: bytes) -> None:
     Path("scene.yaml").write_bytes(data)
     require_taken_or_refused(folder, "check", "scene.yaml")
 
 
-@settings(CASES, max_examples=120)
+@CASES
 @given(
     path=st.sampled_from([".".join(map(str, path)) for path in places(SCENE)]) | KEYS,
     value=VALUES,
