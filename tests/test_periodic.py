@@ -10,7 +10,7 @@ import pytest
 import torch
 from media import half_empty, make_scene, tensor
 from torch import Tensor
-from torch.autograd import forward_ad
+from twins import assert_same, assert_transposes, differentiate, images_of, values_of
 
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
@@ -24,7 +24,6 @@ from ddrecon.numerics.periods import MARGIN, unroll_along
 from ddrecon.picture import render, view_image
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
-from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")
 SHAPE, CELL = (6, 5, 7), 0.2
@@ -110,26 +109,13 @@ def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.Monk
     """The tangent is along both variables; light is followed through few periods."""
     for room in ("numerics.periods", "march.box"):
         monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
-    density, settings = half_empty(*SHAPE), KINDS[kind]
-    scene, outcomes = repeated(density, **settings), list[list[Tensor]]()
-    names = ["density", *(["g"] if settings.get("g") else [])]
-    for engine in ENGINES:
-        use_engine(engine)
-        values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-        image = render(with_values(scene, values))
-        weights = half_empty(*image.shape, seed=1) + 0.1
-        bars = torch.autograd.grad((weights * image).sum(), [*values.values()])
-        with forward_ad.dual_level():
-            duals = {
-                name: forward_ad.make_dual(value.detach(), torch.ones_like(value))
-                for name, value in values.items()
-            }
-            tangent = forward_ad.unpack_dual(render(with_values(scene, duals))).tangent
-        known = torch.stack([bar.sum() for bar in bars]).sum()
-        torch.testing.assert_close((weights * tangent).sum(), known, rtol=1e-10, atol=1e-10)
-        outcomes.append([image.detach(), *bars])
-    for one, other in zip(*outcomes, strict=True):
-        assert_near(one, other, 1e-11)
+    scene = repeated(half_empty(*SHAPE), **KINDS[kind])
+    values = values_of(scene, ["density", *(["g"] if KINDS[kind].get("g") else [])])
+    known, found = (
+        differentiate(engine, images_of(scene), values, has_tangent=True) for engine in ENGINES
+    )
+    assert_transposes(known, values)
+    assert_same(found, known, 1e-12)
 
 
 @pytest.mark.slow

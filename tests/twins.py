@@ -65,6 +65,15 @@ def assert_same(found: Tensors, known: Tensors, error: float, least: float = 0.0
         assert apart <= bound * size, f"{name}: {apart:.2e} of {size:.2e}"
 
 
+def assert_transposes(found: Tensors, values: Tensors, error: float = 1e-10) -> None:
+    """Asserts <J v, w> = <v, J^T w> of what `differentiate` found, with a tangent, by `values`."""
+    tangents = [found[f"tangent {k}"] for k in range(sum(name[:7] == "tangent" for name in found))]
+    there = [t * cotangent_of(t, 20 + k) for k, t in enumerate(tangents)]
+    back = [found[f"by {name}"] * change_of(value, name) for name, value in values.items()]
+    sums = [torch.stack([terms.sum() for terms in side]).sum() for side in (there, back)]
+    torch.testing.assert_close(*sums, rtol=error, atol=error)
+
+
 def assert_twins(
     function: Function,
     values: Tensors,
