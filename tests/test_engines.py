@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from media import half_empty, make_camera, make_scene, random_values, tensor
+from scenes import lamp, sky
 from torch import Tensor
 from torch.autograd import forward_ad as forward
 from twins import (
@@ -22,7 +23,7 @@ from twins import (
 
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.layer import VolumeRenderer
-from ddrecon.light.lights import BeamLight, EnvironmentLight, PointLight
+from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -107,13 +108,12 @@ def scenes(draw: Any) -> Scene:
     if lit == "points":
         beam = tensor(0.1, 1.0, 0.05), tensor(-0.2, -1.0, -0.1), tensor(0.5), tensor(0.2)[0]
         scene.lights += [
-            PointLight(tensor(0.9, 0.7, 0.2), tensor(1.0, 2.0, 0.5)),
+            lamp(),
             PointLight(tensor(0.1, 0.05, -0.1), tensor(0.3)),
             BeamLight(*beam),
         ]
     if lit == "sky":
-        sky = random_values(3, 4, 8, seed=seed + 3)
-        scene.lights.append(EnvironmentLight(sky, *tensor(0.5, 20.0), 6))
+        scene.lights.append(sky())
     render = RenderSettings(
         samples_per_pixel=draw(some.sampled_from([1, 2])),
         steps_per_voxel=draw(some.sampled_from([1, 2])),
@@ -160,10 +160,7 @@ def scene_of(case: str) -> Scene:
     camera = make_camera((0.3, 0.4, 3.0), (9, 8))
     scene = make_scene(half_empty(*SHAPE), camera=camera, **CASES[case])
     if case in EVERY_LIGHT:
-        scene.lights += [
-            PointLight(tensor(0.9, 0.7, 0.2137), tensor(1.0, 2.0, 0.5)),
-            EnvironmentLight(random_values(3, 4, 8, seed=3), *tensor(0.5, 20.0), 6),
-        ]
+        scene.lights += [lamp(), sky()]
     return replace(scene, render=RenderSettings(tolerance=1.0))
 
 

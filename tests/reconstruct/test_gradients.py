@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import make_scene, random_values
+from scenes import three_views
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -21,10 +22,7 @@ NAMES += "lights.1.radiance", "views.one.camera"
 
 @pytest.fixture
 def scene() -> Scene:
-    base = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4))
-    eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5), "three": (-1.8, 0.4, -1.5)}
-    image = random_values(3, 4, 5, seed=2)
-    return replace(base, views=[View(n, make_camera(eye), image) for n, eye in eyes.items()])
+    return three_views(make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4)))
 
 
 def loss_of(view: View, image: Tensor) -> Tensor:
