@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from deadline import deadline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_files import files_below
 from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
 
 from ddrecon.cli.commands import main
@@ -105,6 +104,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     os.symlink("front.npy", "link.npy")
     Path("folder.npy").mkdir()
     return tmp_path
+
+
+def files_below(folder: Path) -> set[str]:
+    """Every name below `folder`."""
+    return {
+        os.path.join(where, name)
+        for where, folders, names in os.walk(folder)
+        for name in (*folders, *names)
+    }
 
 
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
