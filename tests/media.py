@@ -1,7 +1,7 @@
 """Small random media, operators, cameras and scenes."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -22,7 +22,7 @@ from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.variables.tangents import varied
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import with_values
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""
@@ -194,21 +194,6 @@ def assert_derivatives(
             for step in (1e-5, -1e-5)
         )
     assert abs(float(up - down) / 2e-5 / len(values) - 1) < error
-
-
-def weights_of(image: Tensor) -> Tensor:
-    """Those of a functional of `image` that asks nothing of its first two rows."""
-    weights = random_values(*image.shape, seed=3).to(image)
-    weights[..., :2, :] = 0
-    return weights
-
-
-def image_gradients(scene: Scene, names: Sequence[str]) -> tuple[Tensor, list[Tensor]]:
-    """The images of `scene`, and the derivatives of a functional of them by variables."""
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    images = render(with_values(scene, leaves))
-    loss = (images * weights_of(images)).sum()
-    return images.detach(), list(torch.autograd.grad(loss, list(leaves.values())))
 
 
 def data_matrix(

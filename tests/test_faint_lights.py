@@ -28,7 +28,7 @@ from ddrecon.medium.phase_blend import Blend
 from ddrecon.picture import view_image
 from ddrecon.scene import Scene
 
-pytestmark = pytest.mark.usefixtures("few_directions")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_directions")]
 SHAPE, FAINT = (3, 4, 3), 1e-12
 MAP = half_empty(1, 4, 8, seed=3)
 MAP[0, 1, 2] = 20.0  # a sun

@@ -84,6 +84,7 @@ SUNLIT = [(DOWN, g, sigma_a) for g in (0.0, 0.8, -0.6) for sigma_a in (WHITE, CO
 BEAMED = [(WIDE, 0.8, COLORED), (WIDE, -0.6, WHITE), (PENCIL, 0.8, WHITE), (PENCIL, -0.6, COLORED)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("light", "g", "sigma_a"), [*SUNLIT, *BEAMED])
 def test_what_enters_is_absorbed_or_leaves(
     light: Light, g: float, sigma_a: tuple[float, ...]
@@ -97,6 +98,7 @@ def test_what_enters_is_absorbed_or_leaves(
     assert bool(torch.tensor(record["absorbed"]).all()) == any(sigma_a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_s", [0.0, 5.0])
 @pytest.mark.parametrize("has_ground", [False, True])
 def test_emission_enters_and_is_absorbed_or_leaves(has_ground: bool, sigma_s: float) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from torch import Tensor
 
 import ddrecon
 from ddrecon.cameras import Pane
-from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import BeamLight
 from ddrecon.medium.fresnel import face_resistance, reflectance, refract, transmitted_moments
@@ -98,6 +96,7 @@ def test_a_sun_is_not_seen_in_the_faces_of_an_empty_box() -> None:
     assert not ddrecon.render(within(1.4, empty, camera=camera, transport_rounds=1, degree=5)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["down", "slanted", "ambient", "beam"])
 def test_no_power_is_lost_or_made(light: str) -> None:
     travel = (0.0, -1.0, 0.0) if light == "down" else (-2.0, -2.1, -1.0)
@@ -129,6 +128,7 @@ def test_layers_reflect_and_transmit_as_by_adding_and_doubling() -> None:
     assert found == pytest.approx([float(one) for one in expected], abs=0.003)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [{}, {"transport_rounds": 2, "degree": 3}], ids=str)
 def test_images_have_tangent_adjoint_and_differences(rounds: dict[str, Any]) -> None:
     near, far = (make_camera((0.9, 1.3, 2.5), is_perspective=is_near) for is_near in (True, False))
@@ -147,34 +147,3 @@ def test_images_have_tangent_adjoint_and_differences(rounds: dict[str, Any]) -> 
         return (weights * ddrecon.render(with_values(world, named))).sum()
 
     assert_derivatives(loss, values)
-
-
-SCENE = """
-volume: {{density: 1, sigma_a: 1, sigma_s: 1, index: 1.4, resolution: [2, 2, 2],
-  bounds: {{min: [-1, -1, -1], max: [1, 1, 1]}}}}
-lights: [{light}]
-{more}
-views: [{{name: v, camera: {{type: perspective, origin: [0, 0, {away}], target: [0, 0, 0], fov: 30,
-  resolution: [4, 4]}}}}]
-"""
-SUN = "{type: directional, direction: [0, -1, 0], irradiance: 1}"
-LAMP = "{type: point, position: [0, 3, 0], intensity: 1}"
-REFUSED = {
-    "a camera inside": (SUN, "", 0.5),
-    "point lights": (LAMP, "", 4),
-    "a ground": (SUN, "ground: {height: -1, albedo: 0.3}", 4),
-    "diffusion.scheme: printed": (SUN, "diffusion: {scheme: printed}", 4),
-    "diffusion.model: flux_limited": (SUN, "diffusion: {model: flux_limited}", 4),
-}
-
-
-@pytest.mark.parametrize("what", REFUSED)
-def test_what_is_not_computed_is_refused_in_one_line(what: str, tmp_path: Path) -> None:
-    light, more, away = REFUSED[what]
-    path = tmp_path / "scene.yaml"
-    path.write_text(SCENE.format(light=light, more=more, away=away))
-    with pytest.raises(SceneError) as caught:
-        ddrecon.load_scene(path)
-    message = str(caught.value)
-    assert message.count("\n") == 0
-    assert "2:" in message and "volume.index" in message and what.split()[-1] in message

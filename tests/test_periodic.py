@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from media import half_empty, make_scene, tensor
 from torch import Tensor
-from torch.autograd import forward_ad
+from twins import assert_same, assert_transposes, differentiate, images_of, values_of
 
-from ddrecon import load_scene
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
-from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import EnvironmentLight
@@ -27,7 +24,6 @@ from ddrecon.numerics.periods import MARGIN, unroll_along
 from ddrecon.picture import render, view_image
 from ddrecon.scene import Scene, View
 from ddrecon.validate.balance import find_balance
-from ddrecon.variables.values import value_of, with_values
 
 pytestmark = pytest.mark.usefixtures("few_directions")
 SHAPE, CELL = (6, 5, 7), 0.2
@@ -75,6 +71,7 @@ def see(scene: Scene) -> list[Tensor]:
     return [*pictures, fluence_of(light, scene.diffusion)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind: str, engine: str):
@@ -91,6 +88,7 @@ def test_it_does_not_matter_how_many_periods_there_are_and_where_they_begin(kind
         assert_near(one, other, close)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [4, 8])
 def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_begins(
     cells: int, monkeypatch: pytest.MonkeyPatch
@@ -105,33 +103,22 @@ def test_over_a_ground_seen_in_fewer_cells_it_does_not_matter_where_a_period_beg
     assert_near(fluence(moved), fluence(one).roll(shift, (1, 3)), 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_engines_tangents_and_adjoints_agree(kind: str, monkeypatch: pytest.MonkeyPatch):
     """The tangent is along both variables; light is followed through few periods."""
     for room in ("numerics.periods", "march.box"):
         monkeypatch.setattr(f"ddrecon.{room}.FARTHEST", 3)
-    density, settings = half_empty(*SHAPE), KINDS[kind]
-    scene, outcomes = repeated(density, **settings), list[list[Tensor]]()
-    names = ["density", *(["g"] if settings.get("g") else [])]
-    for engine in ENGINES:
-        use_engine(engine)
-        values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-        image = render(with_values(scene, values))
-        weights = half_empty(*image.shape, seed=1) + 0.1
-        bars = torch.autograd.grad((weights * image).sum(), [*values.values()])
-        with forward_ad.dual_level():
-            duals = {
-                name: forward_ad.make_dual(value.detach(), torch.ones_like(value))
-                for name, value in values.items()
-            }
-            tangent = forward_ad.unpack_dual(render(with_values(scene, duals))).tangent
-        known = torch.stack([bar.sum() for bar in bars]).sum()
-        torch.testing.assert_close((weights * tangent).sum(), known, rtol=1e-10, atol=1e-10)
-        outcomes.append([image.detach(), *bars])
-    for one, other in zip(*outcomes, strict=True):
-        assert_near(one, other, 1e-11)
+    scene = repeated(half_empty(*SHAPE), **KINDS[kind])
+    values = values_of(scene, ["density", *(["g"] if KINDS[kind].get("g") else [])])
+    known, found = (
+        differentiate(engine, images_of(scene), values, has_tangent=True) for engine in ENGINES
+    )
+    assert_transposes(known, values)
+    assert_same(found, known, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fine angles", "white sky", "backward"])
 def test_the_balance_of_a_period_is_half_of_that_of_two(kind: str) -> None:
     """Nothing leaves by its sides, and by its faces enters what falls on them."""
@@ -210,23 +197,3 @@ def test_units_and_precision_do_not_tell_how_many_cells_a_beam_passes(unit: floa
     direction = torch.nn.functional.normalize(torch.tensor([-0.7, -2, -1], dtype=dtype), dim=0)
     period = unroll_along(Grid(shape, lower, upper, periodic=(1,)), direction)
     assert (period.before, period.after) == ((0, MARGIN, 0), (0, MARGIN + 15, 0))
-
-
-LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
-REFUSED = [
-    ("[x,y,z]", "", "volume.periodic: name one axis or two"),
-    ("[x,x]", "", "volume.periodic: name one axis or two"),
-    ("[w]", "", "volume.periodic.0: expected one of x, y, z"),
-    ("[x]", "diffusion.model=flux_limited", "diffusion: volume.periodic is"),
-    ("[x]", "diffusion.scheme=printed", "diffusion: volume.periodic is"),
-    ("[x]", LAMP, "lights.0: a PointLight does not repeat"),
-    ("[y]", "ground={height: -2, albedo: 0.3}", "ground: lies across y, along which the volume"),
-]
-
-
-@pytest.mark.parametrize(("axes", "change", "problem"), REFUSED)
-def test_what_cannot_repeat_is_said(axes: str, change: str, problem: str):
-    path, changes = Path(__file__).parents[1] / "configs/ball.yaml", [change] if change else []
-    with pytest.raises(SceneError) as caught:
-        load_scene(path, overrides=[f"volume.periodic={axes}", *changes])
-    assert problem in str(caught.value)

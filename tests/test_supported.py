@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import SceneError, UsageError
 from ddrecon.grid import Grid
 from ddrecon.layer import VolumeRenderer, fluence, render
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 SHAPE = (3, 4, 5)
 PERIOD = "volume.periodic is for model p1 with scheme conservative, or none"
@@ -32,6 +34,12 @@ CASES: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"scheme": "printed"}, {"height": -2.0}, "ground: the printed scheme has none"),
     ({"model": "flux_limited", "transport_rounds": 2}, {}, "diffusion.transport_rounds: rounds"),
     ({"scheme": "printed", "transport_rounds": 1}, {}, "diffusion.transport_rounds: rounds"),
+    ({}, {"index": 1.4, "light": POINT}, "volume.index: there is none with point lights"),
+    ({}, {"index": 1.4, "height": -2.0}, "volume.index: there is none with ground"),
+    *(
+        ({key: value}, {"index": 1.4}, f"volume.index: there is none with diffusion.{key}: {value}")
+        for key, value in (("scheme", "printed"), ("model", "flux_limited"))
+    ),
 ]
 
 
@@ -54,6 +62,32 @@ def test_what_a_file_may_not_say_python_may_not(
     for call in (render, fluence, lambda scene: VolumeRenderer(scene)()):
         with pytest.raises(UsageError, match=re.escape(problem)):
             call(scene)
+
+
+BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
+GROUND = "ground={height: -2, albedo: 0.3}"
+LAMP = "lights=[{type: point, position: [0, 2, 0], intensity: 1}]"
+INSIDE = "views.0.camera.origin=[0, 0, 0.2]"
+FILES = [
+    (["volume.periodic=[x,x]"], "volume.periodic: name one axis or two"),
+    (["volume.periodic=[w]"], "volume.periodic.0: expected one of x, y, z"),
+    (["volume.periodic=[x]", "diffusion.scheme=printed"], f"diffusion: {PERIOD}"),
+    (["volume.periodic=[x]", LAMP], "lights.0: a PointLight does not repeat"),
+    (["volume.periodic=[y]", GROUND], "ground: lies across y, along which the volume"),
+    ([GROUND, "ground.height=0"], "ground.height: 0 is above the bottom of the box, -0.5 along y"),
+    ([GROUND, "ground.albedo=1.1"], "ground.albedo: must be at most 1, found 1.1"),
+    ([GROUND, "diffusion.scheme=printed"], "ground: the printed scheme has none"),
+    ([GROUND, "ground.height=-0.55"], "'train_1' is not above it along y"),
+    (["volume.index=1.4", LAMP], "volume.index: there is none with point lights"),
+    (["volume.index=1.4", INSIDE], "volume.index: there is none with a camera inside"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "problem"), FILES)
+def test_what_a_file_says_is_refused_in_one_line(overrides: list[str], problem: str) -> None:
+    with pytest.raises(SceneError, match=re.escape(problem)) as caught:
+        load_scene(BALL, overrides=["optimize=null", *overrides])
+    assert "\n" not in str(caught.value)
 
 
 SETTINGS = [

@@ -57,7 +57,7 @@ def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
 
 def mean_inverse_distance(grid: Grid, points: Tensor, part: float = 1.0) -> Tensor:
     """That of the origin to a cell, `part` of it wide, at `points` [N, 3], by Gauss-Legendre."""
-    nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(20))
+    nodes, weights = (torch.from_numpy(one) for one in np.polynomial.legendre.leggauss(12))
     size = part * torch.tensor(grid.spacing, dtype=torch.float64)
     within = torch.cartesian_prod(nodes, nodes, nodes) / 2 * size
     return (

@@ -1,7 +1,7 @@
 """Derivatives of a solve agree with differences and with each other; solves are remembered."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -44,20 +44,21 @@ def inputs():
     return make
 
 
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_both_derivatives_agree_with_differences(shape: tuple[int, int, int], inputs):
-    arguments = [tensor.requires_grad_(tensor.numel() > 0) for tensor in inputs(shape)]
-    assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
-
-
-@pytest.mark.parametrize("wanted", range(5))
-def test_each_argument_can_be_differentiated_by_itself(wanted: int, inputs):
-    arguments = [tensor.requires_grad_(i == wanted) for i, tensor in enumerate(inputs())]
-    assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
-
-
-def test_a_gray_operator_serves_a_colored_source(inputs):
-    arguments = [tensor.requires_grad_() for tensor in inputs(colors=1)]
+@pytest.mark.parametrize(
+    ("shape", "colors", "varied"),
+    [
+        *((shape, 2, range(5)) for shape in SHAPES),
+        *((SHAPES[0], 2, [one]) for one in range(5)),
+        (SHAPES[0], 1, range(5)),
+    ],
+)
+def test_both_derivatives_agree_with_differences(
+    shape: tuple[int, int, int], colors: int, varied: Sequence[int], inputs
+):
+    """By all arguments or by one; and where a gray operator serves a colored source."""
+    arguments = inputs(shape, colors)
+    for index in varied:
+        arguments[index].requires_grad_()
     assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
 
 

@@ -11,9 +11,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import (
     AXES,
     Operator,
-    accumulate,
     boundary_loss,
-    difference,
     face_fluxes,
 )
 from ddrecon.diffusion.solve import solve_by_multigrid
@@ -51,23 +49,6 @@ def test_the_operator_is_the_matrix_written_with_loops(operator: Operator):
     )
     torch.testing.assert_close(operator.apply(u), expected, rtol=1e-13, atol=1e-13)
     torch.testing.assert_close(operator.diagonal.flatten(1), diagonal, rtol=1e-14, atol=0)
-
-
-def test_the_operator_is_a_positive_definite_m_matrix(operator: Operator):
-    matrix = dense_matrix(operator)
-    off_diagonal = matrix - torch.diag_embed(matrix.diagonal(dim1=1, dim2=2))
-    assert bool((off_diagonal <= 0).all()) and bool((operator.diagonal > 0).all())
-    assert bool((torch.linalg.eigvalsh(matrix) > 0).all())
-    assert bool((torch.linalg.inv(matrix) >= -1e-12 * torch.linalg.inv(matrix).abs().max()).all())
-
-
-def test_accumulate_is_the_transpose_of_difference(grid: Grid):
-    u = random_values(2, *grid.shape) - 0.5
-    for axis in AXES:
-        faces = random_values(2, *grid.shape, seed=axis) - 0.5
-        torch.testing.assert_close(
-            (difference(u, axis) * faces).sum(), (u * accumulate(faces, axis)).sum()
-        )
 
 
 @pytest.mark.parametrize("has_outside", [False, True])
@@ -118,23 +99,3 @@ def test_a_manufactured_solution_is_approached_at_second_order():
     counts = [8, 16, 32]
     errors = [discrete_error(cells) for cells in counts]
     assert convergence_order([1 / cells for cells in counts], errors) >= 1.9, errors
-
-
-def test_the_source_flux_of_a_slab_is_exact():
-    """In one dimension L0 is linear between the faces, and F = D kappa_s Q1 - D L0' constant.
-
-    F = L0 / 2 at the far face, -L0 / 2 at the near one: by antisymmetry L0 = slope (t - L/2) with
-    D (Q - slope) = slope L / 4.
-    """
-    length, flux, coefficient = 2.0, 0.7, 0.3
-    grid = Grid((9, 1, 1), (0.0, 0.0, 0.0), (length, 1e9, 1e9))
-    diffusion = torch.full((1, *grid.shape), coefficient, dtype=torch.float64)
-    faces = face_fluxes(None, torch.full_like(diffusion, flux), diffusion, grid, 1)
-    operator = make_operator(grid, diffusion, torch.zeros_like(diffusion))
-    source = -(faces.diff(dim=1) / grid.spacing[0]).flatten()
-    u, slope = (
-        torch.linalg.solve(dense_matrix(operator)[0], source),
-        flux / (1 + length / 4 / coefficient),
-    )
-    expected = slope * (grid.centers(u)[0].flatten() - length / 2)
-    torch.testing.assert_close(u, expected, rtol=1e-6, atol=1e-8)

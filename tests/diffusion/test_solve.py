@@ -88,21 +88,6 @@ def test_no_source_no_light(system):
     assert solution.iterations == 0 and solution.residual == 0 and not solution.value.any()
 
 
-def test_a_color_without_source_stays_dark_beside_another(system):
-    operator, source = system(torch.float64)
-    source[0] = 0
-    value = solve_by_multigrid(operator, source, None, 1e-10).value
-    assert not value[0].any() and bool((value[1] > 0).all())
-
-
-def test_a_source_makes_light_everywhere(system):
-    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance."""
-    operator, source = system(torch.float64, contrast=10.0)
-    source = torch.zeros_like(source)
-    source[:, 0, 0, 0] = 1
-    assert bool((solve_by_multigrid(operator, source, None, 1e-13).value > 0).all())
-
-
 def test_a_solve_that_does_not_converge_says_so(system, monkeypatch):
     operator, source = system(torch.float64)
     monkeypatch.setattr(solve, "MAX_ITERATIONS", 1)

@@ -3,15 +3,26 @@ give exactly.
 
 I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance E on a plane facing
 the light (Chandrasekhar, Radiative Transfer, 1950, chapter III).
+
+It is one column of cells, 1e9 times as wide as deep, seen from above. Density grows downwards, from
+thousandths of an optical depth a cell to hundreds. The closure's floor is nothing: what is compared
+is P1 itself, or what transport rounds make of it.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from half_spaces import IRRADIANCE, VIEWS, half_space, relative_rms, seen
-from media import convergence_order
+import torch
+from media import convergence_order, make_scene
 from published import PHASES, Layer, h_function, ordinates
+from torch import Tensor
+
+from ddrecon.cameras import Camera, look_at
+from ddrecon.grid import Grid
+from ddrecon.picture import render
+from ddrecon.scene import Scene, View
 
 pytestmark = pytest.mark.slow
 
@@ -21,6 +32,42 @@ SUNS = (1.0, 0.3)
 ERRORS = {0: 0.08, 1: 0.008, 4: 0.004}
 """By rounds, bounds on the relative RMS error; after four, 44 directions have converged."""
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
+VIEWS = (1.0, 0.8, 0.5, 0.25)
+"""Cosines mu of the views."""
+IRRADIANCE = 3.0
+
+
+def half_space(
+    albedo: float, sun: float, cells: int = 192, rounds: int = 0, g: float = 0.0
+) -> Scene:
+    """5,000 optical depths below z = 0, lit from above at cosine `sun`, seen at all of `VIEWS`."""
+    ratio = 1.06 ** (192 / cells)
+    layers = ratio ** torch.arange(cells, dtype=torch.float64)
+    density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)
+    grid = Grid((cells, 1, 1), (0.0, -5e8, -5e8), (1.0, 5e8, 5e8))
+    light = {"directional": (IRRADIANCE,), "travel": (math.sqrt(1 - sun**2), 0.0, sun)}
+    medium = {"sigma_a": (1 - albedo,), "sigma_s": (albedo,), "g": g}
+    settings = {"closure": "smooth", "floor": 1e-6, "transport_rounds": rounds, "degree": 5}
+    scene = make_scene(density, grid=grid, **light, **medium, **settings)
+    return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
+
+
+def looking_down(cosine: float) -> Camera:
+    """One pixel on the surface that looks into the medium at `cosine` with the normal."""
+    target = torch.tensor([0.0, math.sqrt(1 - cosine**2), cosine], dtype=torch.float64)
+    pose = look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0]))
+    return Camera(pose, (1, 1), 1e-6, is_perspective=False)
+
+
+def seen(scene: Scene) -> list[float]:
+    """The radiance that each view of `scene` sees."""
+    image: Tensor = render(scene)
+    return image[:, 0, 0, 0].tolist()
+
+
+def relative_rms(found: list[float], wanted: list[float]) -> float:
+    """The relative root mean square error."""
+    return math.dist(found, wanted) / math.hypot(*wanted)
 
 
 def single(albedo: float, sun: float, view: float) -> float:

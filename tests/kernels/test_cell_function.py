@@ -22,6 +22,7 @@ CELLS = [
 """Header, function, fields, outs, numbers."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("header", "cell", "ins", "outs", "numbers"), CELLS, ids=[cell for _, cell, *_ in CELLS]
 )

@@ -10,9 +10,8 @@ import torch
 from graphics_cards import assert_compiles
 from media import half_empty, make_scene, random_values, tensor
 from torch import Tensor
-from torch.autograd import forward_ad
+from twins import Function, Tensors, assert_twins, differentiate, values_of
 
-from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
@@ -20,7 +19,7 @@ from ddrecon.light.shear import sum_masses
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.scene import Scene
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.kernels import text
@@ -40,22 +39,15 @@ DIRECTIONS = [
 SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
 
 
-def assert_all_near(fused: list[Tensor], known: list[Tensor], error: float) -> None:
-    for value, expected in zip(fused, known, strict=True):
-        scale = max(float(expected.abs().max()), 1e-3)
-        torch.testing.assert_close(value, expected, rtol=0, atol=error * scale)
+def masses_in(grid: Grid) -> Function:
+    """Mass and path of a beam, as a function of field, heading and bound."""
 
+    def find(values: Tensors) -> list[Tensor]:
+        way = torch.nn.functional.normalize(values["heading"], dim=0)
+        (entered,), (step,) = sum_masses(values["field"], grid, way[None], values["bound"])
+        return [entered, step]
 
-def masses(engine: str, grid: Grid, field: Tensor, heading: Tensor, bound: float) -> list[Tensor]:
-    """Mass and path, and the derivatives of a random functional of both by all arguments."""
-    use_engine(engine)
-    direction = torch.nn.functional.normalize(heading, dim=0)
-    leaves = [
-        value.detach().clone().requires_grad_() for value in (field, direction, tensor(bound)[0])
-    ]
-    (entered,), (step,) = sum_masses(leaves[0], grid, leaves[1][None], leaves[2])
-    loss = (entered * random_values(*entered.shape, seed=1).to(entered)).sum() + 0.7 * step
-    return [entered.detach(), step.detach(), *torch.autograd.grad(loss, leaves)]
+    return find
 
 
 @pytest.mark.parametrize("upper", ["cubes", "boxes"])
@@ -64,22 +56,21 @@ def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float,
     """Also where places lie exactly on cells' centers: there the slopes beyond them."""
     for shape, bound in itertools.product(SHAPES, (0.0, 1.7)):
         corner = (1.25, 1.3, 0.9) if upper == "boxes" else tuple(0.2 * cells for cells in shape)
-        beam = Grid(shape, (0, 0, 0), corner), random_values(2, *shape), tensor(*direction), bound
+        values = {"field": random_values(2, *shape), "heading": tensor(*direction)}
+        values["bound"] = tensor(bound)[0]
         # In one slice all cancels, and rounding is left.
-        torch.testing.assert_close(
-            masses("warp", *beam), masses("torch", *beam), rtol=1e-12, atol=5e-13
-        )
+        assert_twins(masses_in(Grid(shape, (0, 0, 0), corner)), values, least=0.5)
 
 
 @pytest.mark.parametrize("along", range(3))
 def test_rows_longer_than_a_block(along: int):
     shape = tuple(262 if axis == along else 3 for axis in range(3))
-    grid = Grid(shape, (0, 0, 0), tuple(0.2 * cells for cells in shape))
     # Slopes that no small fraction is: through a center of a cell derivatives have a kink.
-    direction = [0.2357, -0.3163, 0.4142]
-    direction[along - 1] = 0.8191
-    beam = grid, random_values(1, *shape), tensor(*direction), 0.5
-    assert_all_near(masses("warp", *beam), masses("torch", *beam), 1e-11)
+    heading = [0.2357, -0.3163, 0.4142]
+    heading[along - 1] = 0.8191
+    values = {"field": random_values(1, *shape), "heading": tensor(*heading)}
+    grid = Grid(shape, (0, 0, 0), tuple(0.2 * cells for cells in shape))
+    assert_twins(masses_in(grid), values | {"bound": tensor(0.5)[0]}, 1e-11)
 
 
 def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
@@ -105,42 +96,33 @@ def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
     return scene
 
 
-def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int) -> list[Tensor]:
-    """Masses of beams, and all moments of the light not yet scattered."""
-    use_engine(engine)
-    changed = with_values(scene, values)
-    medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
-    source = receive_light(medium, lights, degree).source
-    sky = sum_unscattered_sky(medium, lights, degree)
-    assert sky is not None
+def light_of(scene: Scene, degree: int) -> Function:
+    """Masses of beams, and all moments of the light not yet scattered, by variables of `scene`."""
 
-    beams = follow_lights(medium, lights)
-    return [*(beam.mass for beam in beams), source, sky]
+    def find(values: Tensors) -> list[Tensor]:
+        changed = with_values(scene, values)
+        medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
+        source = receive_light(medium, lights, degree).source
+        sky = sum_unscattered_sky(medium, lights, degree)
+        assert sky is not None
+        return [*(beam.mass for beam in follow_lights(medium, lights)), source, sky]
 
-
-def gradients(scene: Scene, names: list[str], engine: str, degree: int) -> list[Tensor]:
-    """The light, and the derivatives of a random functional of it by `names`."""
-    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    light = fields_of(scene, leaves, engine, degree)
-    loss = sum((field * random_values(*field.shape, seed=3).to(field)).sum() for field in light)
-    return [*(field.detach() for field in light), *torch.autograd.grad(loss, [*leaves.values()])]
+    return find
 
 
 NUMBERS = ["density", "sigma_a", "sigma_s", "g", "lights.0.direction", "lights.0.irradiance"]
 NUMBERS += ["lights.1.irradiance", "lights.2.radiance", "lights.2.rotation"]
 
 
-def assert_as_torch(scene: Scene, names: list[str], degree: int, error: float) -> None:
-    fused, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
-    assert all(bool(torch.isfinite(value).all()) for value in fused)
-    assert_all_near(fused, known, error)
+def assert_light_twins(scene: Scene, names: list[str], degree: int, error: float = 1e-11) -> None:
+    assert_twins(light_of(scene, degree), values_of(scene, names), error, least=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_light_and_its_derivatives_are_those_of_torch(kind: str, degree: int):
     names = NUMBERS if degree else [name for name in NUMBERS if name != "lights.2.rotation"]
-    assert_as_torch(scene_of(kind), names, degree, 1e-11)
+    assert_light_twins(scene_of(kind), names, degree)
 
 
 POSITIONS = {
@@ -157,18 +139,16 @@ def test_point_lights_are_those_of_torch(kind: str, place: str):
     """Also where ways run through cells' centers, at which interpolation has kinks."""
     scene = scene_of(kind)
     scene.lights = [PointLight(tensor(*POSITIONS[place]), tensor(2.0)), *scene.lights]
-    assert_as_torch(scene, ["density", "sigma_a", "g", "lights.0.intensity"], 1, 1e-11)
+    assert_light_twins(scene, ["density", "sigma_a", "g", "lights.0.intensity"], 1)
 
 
 def test_single_precision():
-    assert_as_torch(scene_of("fields", torch.float32), NUMBERS, 1, 2e-5)
+    assert_light_twins(scene_of("fields", torch.float32), NUMBERS, 1, 2e-5)
 
 
 def test_sums_of_a_part_of_the_cells_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch):
-    scene = scene_of("colors")
-    known = gradients(scene, NUMBERS, "warp", 3)
     monkeypatch.setattr(receive, "MOST_SUMS", 1)
-    assert_all_near(gradients(scene, NUMBERS, "warp", 3), known, 1e-12)
+    assert_light_twins(scene_of("colors"), NUMBERS, 3)
 
 
 def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.MonkeyPatch):
@@ -181,14 +161,10 @@ def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.
 
     monkeypatch.setattr(text, "launch", note)
     scene = scene_of("gray")
-    change = torch.ones_like(scene.volume.density)
-    marches = []
+    values, marches = values_of(scene, ["density", "lights.2.radiance"]), []
     for degree in (1, 3, 5):
         launched.clear()
-        gradients(scene, ["density", "lights.2.radiance"], "warp", degree)
-        with forward_ad.dual_level():
-            density = forward_ad.make_dual(scene.volume.density, change)
-            fields_of(scene, {"density": density}, "warp", degree)
+        differentiate("warp", light_of(scene, degree), values, has_tangent=True)
         marches.append(Counter(name for name in launched if name.startswith("shear")))
     assert marches[0] and marches[0] == marches[1] == marches[2]
 
@@ -197,7 +173,7 @@ def test_opaque_and_empty_media_have_finite_derivatives():
     for factor in (0.0, 1e4):
         scene = scene_of("colors")
         scene.volume.density = factor * scene.volume.density
-        assert_as_torch(scene, NUMBERS, 1, 1e-10)
+        assert_light_twins(scene, NUMBERS, 1, 1e-10)
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):

@@ -9,10 +9,15 @@ from media import make_scene
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
+from ddrecon.light.moments import beam_moments, weigh
 from ddrecon.light.pairs import follow_pair
 from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.remaining import backward_fraction
+from ddrecon.medium.remaining import (
+    backward_fraction,
+    remaining_moments,
+    unturned_moments,
+)
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import balance_of
 
@@ -97,3 +102,16 @@ def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
 
     for empty, thin in zip(pair_at(0.0), pair_at(1e-9), strict=True):
         torch.testing.assert_close(empty, thin, rtol=1e-7, atol=1e-7)
+
+
+def test_what_a_beam_scatters_is_what_turns_back_and_the_rest() -> None:
+    """In every moment: the backward peak is light that goes against the beam (E8.11)."""
+    medium = scale_medium(in_unit_box(torch.ones(2, 1, 1).double(), g=-0.7).volume, 5)
+    way, mean = torch.tensor([0.48, -0.6, 0.64]).double(), torch.ones(1, 2, 1, 1).double()
+    back = backward_fraction(medium) / (1 - medium.forward_fraction)
+    against = back * beam_moments(mean, -way, 5)
+    rest, whole = (
+        weigh(beam_moments(mean, way, 5), moments(medium))
+        for moments in (unturned_moments, remaining_moments)
+    )
+    torch.testing.assert_close(rest + against, whole, rtol=1e-12, atol=1e-12)

@@ -1,5 +1,6 @@
 """What an environment map sheds: power, first moment, suns; agreement with simpler lights."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -109,6 +110,24 @@ def test_a_hot_pixel_is_a_directional_light(place: tuple[int, int, int, int]):
     scene.render = replace(scene.render, background=False)
     images = [render(replace(scene, lights=[light])) for light in (environment, directional)]
     assert relative_error(*images) < 0.02
+
+
+def test_a_sky_is_the_parallel_light_of_each_of_its_pixels():
+    """It comes from where it is seen: bright on one side, a map without suns lights that side."""
+    height, width = 12, 16
+    radiance = banded(height, width).clamp(max=2)
+    scene = make_scene(0.1 * half_empty(*SHAPE), g=0.6, model="none")
+    lights = list[DirectionalLight]()
+    for row, column in itertools.product(range(height), range(width)):
+        _, sun = hot_pixel(height, width, row, column)
+        pixel = tensor(300, 200, 100)
+        lights.append(replace(sun, irradiance=sun.irradiance / pixel * radiance[:, row, column]))
+    settings = replace(scene.render, background=False)
+    scene = replace(scene, render=settings)
+    sky = light_of(radiance, directions=96)
+    assert count_suns(sky)[0] == 0
+    images = [render(replace(scene, lights=each)) for each in ([sky], lights[width:-width])]
+    assert relative_error(*images) < 0.05
 
 
 def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():

@@ -4,17 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.autograd.forward_ad as forward
 from graphics_cards import assert_compiles
-from media import (
-    assert_near,
-    half_empty,
-    image_gradients,
-    make_camera,
-    make_scene,
-    random_values,
-)
+from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
+from twins import assert_render_twins, differentiate, images_of, values_of
 
 from ddrecon.engine import use_engine
 from ddrecon.errors import UsageError
@@ -22,10 +15,8 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.picture import render
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import CASES, run_case
-from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused import kernels
@@ -77,22 +68,6 @@ def phases(density: Tensor) -> dict[str, PhaseFunction]:
     }
 
 
-def gradients(scene: Scene, names: list[str], engine: str) -> tuple[Tensor, list[Tensor]]:
-    use_engine(engine)
-    return image_gradients(scene, names)
-
-
-def tangent(scene: Scene, names: list[str], engine: str) -> Tensor:
-    use_engine(engine)
-    with forward.dual_level():
-        duals = {}
-        for name in names:
-            value = value_of(scene, name).detach()
-            change = random_values(*value.shape, seed=5).to(value)
-            duals[name] = forward.make_dual(value, change)
-        return forward.unpack_dual(render(with_values(scene, duals))[0]).tangent
-
-
 EMISSIONS = [
     ("gray", OUTSIDE, [*LIGHT, "sigma_t", *POSE]),
     ("backward", OUTSIDE, [*LIGHT, "albedo"]),
@@ -110,78 +85,51 @@ EMISSIONS = [
     ("blend by cell", OUTSIDE, ["density"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
-FORWARD = [case for case in EMISSIONS if case[0] == "lobes by color" or "by cell" in case[0]]
-"""Those whose tangents `tests/test_fused_tangents.py` does not try."""
 
 
-def each_of(cases: list[tuple[str, dict, list[str]]]) -> pytest.MarkDecorator:
-    ids = [
-        f"{kind}-{'inside' if view is INSIDE else 'outside'}-{names[-1]}"
-        for kind, view, names in cases
-    ]
-    return pytest.mark.parametrize(("kind", "view", "names"), cases, ids=ids)
-
-
-@each_of(EMISSIONS)
-def test_images_and_gradients_are_those_of_torch(kind: str, view: dict, names: list[str]):
-    scene = scene_of(kind, view)
-    known, by_torch = gradients(scene, names, "torch")
-    image, by_warp = gradients(scene, names, "warp")
-    assert_near(image, known, 1e-12)
-    for name, one, other in zip(names, by_warp, by_torch, strict=True):
-        assert float(other.abs().max()) > 0, name
-        assert_near(one, other, 1e-11)
-
-
-@each_of(FORWARD)
-def test_tangents_are_those_of_torch(kind: str, view: dict, names: list[str]):
-    """By all numbers together; by each alone they are transposes of the adjoint, below."""
-    scene = scene_of(kind, view)
-    assert_near(tangent(scene, names, "warp"), tangent(scene, names, "torch"), 1e-11)
+@pytest.mark.parametrize(
+    ("kind", "view", "names"),
+    EMISSIONS,
+    ids=[
+        f"{kind}-{'in' if view is INSIDE else 'out'}side-{names[-1]}"
+        for kind, view, names in EMISSIONS
+    ],
+)
+def test_images_and_derivatives_are_those_of_torch(kind: str, view: dict, names: list[str]):
+    """With tangents of the media whose tangents `tests/test_engines.py` does not try."""
+    has_tangent = kind == "lobes by color" or "by cell" in kind
+    assert_render_twins(scene_of(kind, view), names, has_tangent=has_tangent)
 
 
 def test_lattices_of_rays_are_marched_as_well():
     """As many pixels as make the renderer interpolate most of them."""
-    scene = scene_of("peaked", OUTSIDE, size=64)
-    (image, one), (known, other) = (gradients(scene, ["density"], e) for e in ("warp", "torch"))
-    assert_near(image, known, 1e-12)
-    assert_near(one[0], other[0], 1e-11)
+    assert_render_twins(scene_of("peaked", OUTSIDE, size=64), ["density"])
 
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 3.0), (3.0, 0.5, 0.2), (0.2, -3.0, -0.4)], ids=str)
 @pytest.mark.parametrize(
-    ("dtype", "half_width"),
-    [(torch.float32, 0.4), (torch.float32, 0.2), (torch.float64, 0.4)],
-    ids=str,
+    ("dtype", "half_width"), [(torch.float32, 0.2), (torch.float64, 0.4)], ids=str
 )
 def test_packets_read_and_write_whole_rows(
     eye: tuple[float, float, float], dtype: torch.dtype, half_width: float
 ):
     """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it."""
     camera = make_camera(size=(24, 33), dtype=dtype, half_width=half_width, eye=eye)
-    density = half_empty(18, 21, 19, dtype=dtype)
-    scene = make_scene(density, g=0.5, camera=camera)
-    names = ["density", "sigma_s"]
-    (image, one), (known, other) = (gradients(scene, names, e) for e in ("warp", "torch"))
-    assert_near(image, known, 1e-5 if dtype is torch.float32 else 1e-12)
-    for found, expected in zip(one, other, strict=True):
-        assert_near(found, expected, 3e-5 if dtype is torch.float32 else 1e-11)
+    scene = make_scene(half_empty(18, 21, 19, dtype=dtype), g=0.5, camera=camera)
+    error = 1e-5 if dtype is torch.float32 else 1e-12
+    assert_render_twins(scene, ["density", "sigma_s"], error)
 
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
 def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
     """There slopes are those beyond centers; from all sides, by packets of rows or columns."""
-    camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=False)
-    if eye[1]:
-        camera = make_camera(size=(9, 7), half_width=0.3, eye=eye)
+    is_slanted = eye[1] != 0
+    camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=is_slanted)
     grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
-    density = half_empty(*grid.shape)
-    scene = make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera, grid=grid)
-    found, known = (gradients(scene, ["density", *POSE], engine)[1] for engine in ("warp", "torch"))
-    for one, other in zip(found, known, strict=True):
-        assert_near(one, other, 1e-11)
-    found, known = (tangent(scene, POSE, engine) for engine in ("warp", "torch"))
-    assert_near(found, known, 1e-11)
+    medium = {"sigma_a": (1.0,), "sigma_s": (6.0,)}
+    scene = make_scene(half_empty(*grid.shape), camera=camera, grid=grid, **medium)
+    assert_render_twins(scene, ["density", *POSE])
+    assert_render_twins(scene, POSE, has_tangent=True)
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if "depth" in name])
@@ -217,6 +165,7 @@ def test_empty_space_and_rays_that_miss():
     """Nothing is seen, and derivatives by the density of empty cells are finite and not zero."""
     scene = scene_of("gray", {"half_width": 0.7})
     scene.volume.density = torch.zeros_like(scene.volume.density)
-    (image, one), (_, other) = (gradients(scene, ["density"], e) for e in ("warp", "torch"))
-    assert not image.any() and bool(torch.isfinite(one[0]).all()) and bool(one[0].any())
-    assert_near(one[0], other[0], 1e-11)
+    assert_render_twins(scene, ["density"])
+    found = differentiate("warp", images_of(scene), values_of(scene, ["density"]))
+    image, bar = found.values()
+    assert not image.any() and bool(torch.isfinite(bar).all()) and bool(bar.any())

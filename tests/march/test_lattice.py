@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, make_camera, make_scene, march_rays, random_values, render_tangent
+from media import (
+    assert_derivatives,
+    box_grid,
+    make_camera,
+    make_scene,
+    march_rays,
+    random_values,
+)
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -126,34 +133,17 @@ def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
     assert torch.equal(*images(scene_of(view)))
 
 
-@pytest.mark.parametrize(
-    ("view", "name"),
-    [
-        ("oblique", "density"),
-        ("oblique", "views.view.camera.rotation_x"),
-        ("orthographic", "views.view.camera.y"),
-    ],
-)
-def test_derivatives_are_those_of_the_interpolated_image(view: str, name: str, scene_of):
-    """In forward mode as by central differences, and in reverse as in forward mode."""
+@pytest.mark.parametrize("view", ["oblique", "orthographic"])
+def test_derivatives_are_those_of_the_interpolated_image(view: str, scene_of):
+    """By density and camera, in both modes as by central differences."""
     scene = replace(scene_of(CAMERAS[view]), render=INTERPOLATED)
-    variable = name if name == "density" else name.rpartition(".")[0]
-    value = value_of(scene, variable)
-    change = torch.ones_like(value)
-    if variable != name:
-        change = torch.eye(6).to(value)[0 if name.endswith("rotation_x") else 4]
-    tangent = render_tangent(scene, name, lambda world: {"view": render(world)})["view"][1]
-    step = 1e-6
-    plus, minus = (
-        render(with_values(scene, {variable: value + way * change})) for way in (step, -step)
-    )
-    difference = (plus - minus) / (2 * step)
-    assert float((tangent - difference).norm()) < 1e-6 * float(difference.norm())
-    leaf = value.clone().requires_grad_()
-    weight = random_values(*tangent.shape)
-    image = render(with_values(scene, {variable: leaf}))
-    (bar,) = torch.autograd.grad((image * weight).sum(), leaf)
-    torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-11, atol=0)
+
+    def total(values: dict[str, Tensor]) -> Tensor:
+        image = render(with_values(scene, values))
+        return (image * random_values(*image.shape)).sum()
+
+    names = "density", "views.view.camera"
+    assert_derivatives(total, {name: value_of(scene, name) for name in names})
 
 
 def test_an_empty_volume_passes_derivatives_to_every_cell(scene_of):

@@ -119,17 +119,6 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
 
-@pytest.mark.parametrize("view", [CAMERAS["oblique"], CAMERAS["inside"]], ids=str)
-def test_radiance_and_transmittance_have_both_derivatives(view: dict):
-    grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
-    density = half_empty(*grid.shape, seed=3).requires_grad_()
-
-    def marched(density: Tensor) -> tuple[Tensor, Tensor]:
-        return march_rays(emission_of(grid, density), bundle, every_ray(1))
-
-    assert torch.autograd.gradcheck(marched, density, atol=1e-8, check_forward_ad=True)
-
-
 THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
 
 

@@ -231,6 +231,7 @@ def test_they_agree_with_finer_cells_whatever_is_interpolated():
 VIEW_OF = dict.fromkeys(LIGHTS, "oblique") | {"two beams": "inside", "a point inside": "inside"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "view"), VIEW_OF.items())
 @pytest.mark.usefixtures("same_fields")
 def test_derivatives_agree_in_the_limit(name: str, view: str):

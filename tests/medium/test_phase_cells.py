@@ -38,6 +38,7 @@ def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [0, 2])
 @pytest.mark.parametrize(
     "phase, is_looked_up",

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import make_scene, random_values
+from scenes import three_views
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -21,10 +22,7 @@ NAMES += "lights.1.radiance", "views.one.camera"
 
 @pytest.fixture
 def scene() -> Scene:
-    base = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4))
-    eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5), "three": (-1.8, 0.4, -1.5)}
-    image = random_values(3, 4, 5, seed=2)
-    return replace(base, views=[View(n, make_camera(eye), image) for n, eye in eyes.items()])
+    return three_views(make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4)))
 
 
 def loss_of(view: View, image: Tensor) -> Tensor:
@@ -66,21 +64,6 @@ def test_a_camera_nobody_looks_through_has_no_derivative(scene: Scene) -> None:
 def with_derivatives(scene: Scene, kind: str) -> Scene:
     parameters = {name: ParameterSettings() for name in NAMES}
     return replace(scene, optimize=OptimizeSettings(parameters, derivatives=kind))
-
-
-def test_single_and_diffusion_derivatives_add_up_to_all(scene: Scene) -> None:
-    """Of a loss that is linear in the image; each is a derivative of the same image."""
-    values, found = leaves_of(scene), []
-    for kind in ("all", "single", "diffusion"):
-        world, memory = with_derivatives(scene, kind), SolveMemory()
-        of_mean = differentiate(world, ["one", "two"], values, lambda _, im: im.mean(), memory)
-        found.append(of_mean)
-        torch.testing.assert_close(of_mean.images[0], found[0].images[0], rtol=1e-12, atol=1e-15)
-    for name in NAMES:
-        whole, single, diffuse = (each.gradients[name] for each in found)
-        close = 1e-11 * float(whole.abs().max())
-        torch.testing.assert_close(single + diffuse, whole, rtol=1e-8, atol=close, msg=name)
-        assert name != "density" or not torch.equal(single, whole)
 
 
 def test_only_the_diffusion_needs_an_adjoint(scene: Scene) -> None:

@@ -82,6 +82,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
         load_checkpoint(tmp_path, {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["loss of view", "derivative of the loss"])
 def test_divergence_keeps_the_last_good_state(
     ball_scene: Scene, flaw: str, monkeypatch: pytest.MonkeyPatch

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import make_camera, make_scene, random_values
+from media import make_scene, random_values
+from scenes import three_views
 from tape import record
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.recording import Recording, Replays
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of
 
 NAMES = "density", "albedo", "lights.0.irradiance"
@@ -24,13 +25,9 @@ NAMES = "density", "albedo", "lights.0.irradiance"
 @pytest.fixture(params=["torch", "warp"])
 def scene(request: pytest.FixtureRequest) -> Scene:
     use_engine(request.param)
-    base = make_scene(
-        random_values(5, 4, 6), ambient=(0.2, 0.3, 0.4), transport_rounds=1, tolerance=1e-12
-    )
-    eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5), "three": (-1.8, 0.4, -1.5)}
-    image = random_values(3, 4, 5, seed=2)
-    views = [View(name, make_camera(eye), image) for name, eye in eyes.items()]
-    return replace(base, views=views, render=replace(base.render, tolerance=0))
+    settings = {"ambient": (0.2, 0.3, 0.4), "transport_rounds": 1, "tolerance": 1e-12}
+    scene = three_views(make_scene(random_values(5, 4, 6), **settings))
+    return replace(scene, render=replace(scene.render, tolerance=0))
 
 
 def leaves_of(scene: Scene, factor: float = 1.0) -> dict[str, Tensor]:
@@ -56,6 +53,7 @@ def assert_same(objective: Differentiated, plain: Differentiated) -> None:
         torch.testing.assert_close(bar, plain.gradients[name], rtol=0, atol=close, msg=name)
 
 
+@pytest.mark.slow
 def test_replays_are_plain_iterations(scene: Scene) -> None:
     """Of other values and views than those that were recorded, and after other views."""
     memory = SolveMemory()

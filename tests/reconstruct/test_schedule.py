@@ -112,6 +112,7 @@ def test_numbers_wait_for_empty_fields_and_what_glows_for_what_is_lit(
     assert find_stages(3, scene, parameters) == [Stage(2)]
 
 
+@pytest.mark.slow
 def test_a_run_rests_within_the_noise_that_is_known(ball_scene: Scene) -> None:
     run = Reconstruction(ball_scene, AUTO)
     while not run.is_done:

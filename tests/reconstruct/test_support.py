@@ -99,6 +99,7 @@ def ball(*overrides: str) -> Scene:
     return load_scene(BALL, overrides=["optimize.iterations=8", *overrides])
 
 
+@pytest.mark.slow
 def test_outside_of_its_support_a_volume_stays_empty(monkeypatch: pytest.MonkeyPatch) -> None:
     """At every level, whatever `min` says, and rays know it; and the ball itself is inside."""
     monkeypatch.setattr(tuning, "FEWEST_CELLS", 6)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ddrecon import Scene, load_scene
 from ddrecon.reconstruct.frame import Frame
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction, Together
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
@@ -16,15 +17,17 @@ NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 @pytest.fixture
 def still() -> Scene:
     """The ball, with numbers to find beside its density, in float64; cameras need more pictures."""
-    sizes = ["volume.resolution=[8, 8, 8]", "optimize.iterations=4"]
     sought = [f"optimize.parameters.{name}={{}}" for name in NUMBERS]
-    return load_scene("configs/ball.yaml", overrides=[*sizes, *sought], dtype=torch.float64)
+    overrides = ["optimize.iterations=4", "diffusion.transport_rounds=0", *sought]
+    scene = load_scene("configs/ball.yaml", overrides=overrides, dtype=torch.float64)
+    return scene_at_level(scene, 2)
 
 
 def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
     return {p.name: p.value.detach() for p in run.parameters}
 
 
+@pytest.mark.slow
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
     single, together = Reconstruction(still), Together([still, still])
     while not single.is_done:
@@ -35,6 +38,7 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
         torch.testing.assert_close(values(run), values(single), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
     together = Together([still, other])

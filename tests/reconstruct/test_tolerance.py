@@ -24,6 +24,7 @@ def differentiated(scene: Scene, targets: dict[str, Tensor], memory: SolveMemory
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("misfit", [1.0, 0.01])
 def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
     """Towards pictures that differ from the images by `misfit` of their size."""
@@ -41,6 +42,7 @@ def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
     assert few < many
 
 
+@pytest.mark.slow
 def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(ball_scene: Scene):
     changes = {"transport_rounds": 1, "tolerance": 1e-6, "warm_start": False}
     scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, **changes))

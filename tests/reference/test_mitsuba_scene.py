@@ -131,17 +131,6 @@ def test_a_beam_is_refused_of_all_colors_and_of_one() -> None:
             described(one)
 
 
-def test_ambient_light_is_part_of_an_environment_map() -> None:
-    scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
-    np.testing.assert_allclose(
-        described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6
-    )
-    alone = replace(
-        scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)]
-    )
-    assert described(alone)["around"] == {"type": "constant", "radiance": (1.5, 2.5, 3.5)}
-
-
 def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
     scene = make_scene(random_values(*SHAPE))
     weight = scene.volume.density.new_tensor([0.7, 0.5, 0.2])
@@ -174,16 +163,6 @@ def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused()
     scene.volume.g = weight
     with pytest.raises(SceneError, match=r"volume.g: differs from cell to cell.*two_lobe"):
         described(scene)
-
-
-def test_a_table_of_values_goes_from_backward_to_forward() -> None:
-    scene = make_scene(random_values(*SHAPE))
-    scene.volume.phase = Tabulated(1 + even_angles(STEPS).cos()[None] ** 2)
-    phase = described(scene)["medium"]["phase"]
-    values = [float(value) for value in phase["values"].split(", ")]
-    cosine = torch.linspace(-1, 1, len(values), dtype=torch.float64)
-    expected = scene.volume.phase.value(cosine)[0]
-    np.testing.assert_allclose(values, expected, rtol=1e-6)
 
 
 def test_two_environment_maps_are_refused() -> None:

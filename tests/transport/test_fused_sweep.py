@@ -8,8 +8,8 @@ import pytest
 import torch
 from media import half_empty, random_values
 from torch import Tensor
+from twins import Function, Tensors, assert_same, assert_twins, differentiate
 
-from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import cut
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
@@ -87,46 +87,28 @@ class Case:
         return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
 
 
-def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> Tensor:
-    use_engine(engine)
-    medium = case.medium(values)
-    lights = cut(values["light"]), cut(values["source"])
-    # What faces reflect has left them in the sweep before.
-    mirror = face_mirror(medium, case.directions)
-    sweeps = [
-        torch.cat(sweep_change(medium, *lights, values.get("inflow"), case.directions, mirror))
-        for _ in range(1 if mirror is None else 2)
-    ]
-    return sum(sweeps[1:], sweeps[0])
+def moments_of(case: Case) -> Function:
+    """The moments of the change that a sweep finds, of all that it depends on."""
+
+    def find(values: Tensors) -> list[Tensor]:
+        medium = case.medium(values)
+        lights = cut(values["light"]), cut(values["source"])
+        # What faces reflect has left them in the sweep before.
+        mirror = face_mirror(medium, case.directions)
+        sweeps = [
+            torch.cat(sweep_change(medium, *lights, values.get("inflow"), case.directions, mirror))
+            for _ in range(1 if mirror is None else 2)
+        ]
+        return [sum(sweeps[1:], sweeps[0])]
+
+    return find
 
 
-def gradients(
-    case: Case, engine: str, varied: list[str] | None = None
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """The moments, and the derivatives of a random functional of them, by name."""
-    leaves = case.values()
-    names = varied or list(leaves)
-    for name in names:
-        leaves[name].requires_grad_()
-    moments = moments_of(case, leaves, engine)
-    total = (moments * random_values(*moments.shape, seed=9).to(moments)).sum()
-    found = torch.autograd.grad(total, [leaves[name] for name in names], materialize_grads=True)
-    return moments.detach(), dict(zip(names, found, strict=True))
+def found_of(case: Case, engine: str = "warp") -> Tensors:
+    return differentiate(engine, moments_of(case), case.values())
 
 
-@functools.cache
-def known_of(case: Case) -> tuple[Tensor, dict[str, Tensor]]:
-    """The `gradients` of `case` as torch has them."""
-    return gradients(case, "torch")
-
-
-def assert_same(one: tuple, other: tuple, error: float) -> None:
-    """Moments agree to `error` of the largest, and derivatives to ten times that."""
-    pairs = [(one[0], other[0], error)]
-    pairs += [(one[1][name], known, 10 * error) for name, known in other[1].items()]
-    for found, known, bound in pairs:
-        assert bool(torch.isfinite(found).all())
-        assert float((found - known).abs().max()) <= bound * float(known.abs().max())
+known_of = functools.cache(functools.partial(found_of, engine="torch"))
 
 
 CASES = {
@@ -161,21 +143,21 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_moments_and_gradients_are_those_of_torch(case: Case):
-    assert_same(gradients(case, "warp"), known_of(case), 1e-12)
+    assert_same(found_of(case), known_of(case), 1e-12)
 
 
 @pytest.mark.parametrize("spacing", [CUBES, FLAT], ids=str)
 def test_single_precision(spacing: tuple[float, float, float]):
     """Beside the same numbers in double precision; rows have two vectors and a rest."""
     case = Case((4, 5, 37), spacing)
-    single = gradients(replace(case, dtype=torch.float32), "warp")
-    assert_same(single, known_of(case), 2e-6)
+    assert_same(found_of(replace(case, dtype=torch.float32)), known_of(case), 2e-6)
 
 
 @pytest.mark.parametrize("varied", [["source"], ["density", "inflow"]], ids=str)
 def test_some_derivatives_are_asked_for(varied: list[str]):
-    one, other = (gradients(Case(), engine, varied) for engine in ("warp", "torch"))
-    assert_same(one, other, 1e-12)
+    values = Case().values()
+    some = {name: values[name] for name in varied}
+    assert_twins(lambda given: moments_of(Case())(values | given), some)
 
 
 @pytest.mark.parametrize("case", [Case(directions=44), Case((5, 6, 7), CUBES, colors=1)], ids=str)
@@ -183,12 +165,12 @@ def test_it_does_not_matter_which_ordinates_go_together(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Few or all in a chunk, in one thread or in pieces of their own in many."""
-    together = gradients(case, "warp")
+    together = found_of(case)
     monkeypatch.setattr(ordinates, "MOST", 3)
     ordinates._make_tables.cache_clear()
-    assert_same(gradients(case, "warp"), together, 1e-13)
+    assert_same(found_of(case), together, 1e-13)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
-    assert_same(gradients(case, "warp"), together, 1e-13)
+    assert_same(found_of(case), together, 1e-13)
     ordinates._make_tables.cache_clear()
 
 
@@ -197,12 +179,12 @@ def test_chunks_by_cells_may_have_any_size(fill: int, monkeypatch: pytest.Monkey
     for name in ("FILL_GPU", "FILL_CACHE"):
         monkeypatch.setattr(ordinates, name, fill)
     case = Case((3, 4, 5), periodic=(0,), directions=18)
-    assert_same(gradients(case, "warp"), known_of(case), 1e-12)
+    assert_same(found_of(case), known_of(case), 1e-12)
 
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("name", ["color", "44", "around-zx", "refracting"])
 def test_cells_of_a_slice_may_be_done_in_any_order(name: str, order: str) -> None:
     with as_on_a_gpu(order):
-        found = gradients(CASES[name], "warp")
+        found = found_of(CASES[name])
     assert_same(found, known_of(CASES[name]), 1e-12)

@@ -70,6 +70,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("g", "thickness"), [(0.0, 1e-8), (0.0, 1.0), (0.0, 1e4), (-0.8, 4.0), (0.8, 8.0)]
 )
@@ -144,6 +145,7 @@ def left_of_noise(
     return [float(run_rounds(problem, high, noise, solve, n, degree).norm()) for n in rounds]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("g", "degree", "thickness"),
     [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.85, 5, 1.5), (0.85, 7, 1.5), (0.95, 5, 1.5), (0.95, 7, 6.0)],

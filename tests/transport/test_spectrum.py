@@ -129,6 +129,7 @@ WAVES[0] = 1e-3, 0, 0
 """From cell to cell, along axes and diagonals, and long."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degree", "g"),
     [
@@ -147,27 +148,3 @@ def test_a_round_shrinks_every_wave(degree: int, g: float):
         eigenvalues = np.linalg.eigvals(matrices)
         left = float(np.abs(eigenvalues).max()), float(growth(eigenvalues, bound).max())
         assert max(left) < 0.999, (spacing, depth, albedo, left)
-
-
-@pytest.mark.parametrize("depth", [0.1, 1.0, 10.0])
-@pytest.mark.parametrize(
-    ("directions", "spacing", "off"),
-    [(18, CUBES, 1e-3), (26, CUBES, 1e-3), (44, CUBES, 0.08), (26, (1.0, 1.0, 2.0), 0.4)],
-)
-def test_long_waves_diffuse_as_they_should(
-    directions: int, spacing: tuple[float, float, float], off: float, depth: float
-):
-    """1 - k^2 / (3 kappa_t^2) of a wave is left, k along the last axis.
-
-    Where cells share light it spreads over them, but for `off`, most in thick ones: without E2.16
-    by up to 1 and 6.
-    """
-    points, weights = (
-        one.numpy() for one in sphere_quadrature(torch.zeros(()).double(), directions)
-    )
-    waves = np.array([[0, 0, 1e-3 * min(1.0, depth)]])
-    one, slope = sweep_of_waves(waves, np.array(spacing), points, depth)
-    lost = 1 - (depth * (one + slope) @ weights).real
-    assert lost[0] == pytest.approx(
-        (waves[0, 2] / spacing[2] / depth) ** 2 / 3, rel=off * min(depth, 1)
-    )

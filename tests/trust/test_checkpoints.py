@@ -12,7 +12,6 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning, UsageError
-from ddrecon.reconstruct.search import Search
 from ddrecon.run.checkpoint import (
     LAST,
     MOST_CHANGES,
@@ -109,19 +108,6 @@ def test_a_log_with_lost_rows_is_told(run: Run) -> None:
             "warning: out/loss.csv: has 3 of the 4 iterations made\n"
         )
         assert iterations() == [2, 3, 4]
-
-
-def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    run(*OPTIMIZE, "--iterations", "3")
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt("at once")
-
-    before = Path("out/checkpoints/last.pt").read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(Search, "judge", interrupted)
-        assert run(*RESUME, "--iterations", "5").exit_code == 130
-    assert Path("out/checkpoints/last.pt").read_bytes() == before
 
 
 CHANGES = {

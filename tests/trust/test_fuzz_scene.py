@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from deadline import deadline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_files import files_below
 from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
 
 from ddrecon.cli.commands import main
@@ -23,7 +22,7 @@ from ddrecon.scene_file.load import MAX_BYTES
 pytestmark = pytest.mark.slow
 
 LEFT_OUT = [HealthCheck.function_scoped_fixture]
-CASES = settings(derandomize=True, database=None, max_examples=200, suppress_health_check=LEFT_OUT)
+CASES = settings(derandomize=True, database=None, max_examples=60, suppress_health_check=LEFT_OUT)
 PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
 """How every line begins: the place in the scene or override, or the path of a data file."""
 
@@ -107,6 +106,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def files_below(folder: Path) -> set[str]:
+    """Every name below `folder`."""
+    return {
+        os.path.join(where, name)
+        for where, folders, names in os.walk(folder)
+        for name in (*folders, *names)
+    }
+
+
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
     """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
     before = files_below(folder)
@@ -136,14 +144,14 @@ def test_changed_keys_and_values(folder: Path, text: str) -> None:
     require_taken_or_refused(folder, "check", "scene.yaml")
 
 
-@settings(CASES, max_examples=150)
+@CASES
 @given(data=texts())
 def test_changed_characters(folder: Path, data: bytes) -> None:
     Path("scene.yaml").write_bytes(data)
     require_taken_or_refused(folder, "check", "scene.yaml")
 
 
-@settings(CASES, max_examples=120)
+@CASES
 @given(
     path=st.sampled_from([".".join(map(str, path)) for path in places(SCENE)]) | KEYS,
     value=VALUES,

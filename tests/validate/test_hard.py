@@ -28,6 +28,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_hard_case_keeps_its_bounds(name: str):
     result = run_case(name, CASES[name], CPU)

@@ -61,6 +61,7 @@ def test_phase_g_is_g_where_there_is_but_one(scenes: dict[str, Scene]) -> None:
     assert value_of(changed, "g") == value_of(changed, "phase.g") == 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_directions")
 @pytest.mark.parametrize("pattern", KINDS)
 def test_a_kind_is_settable_and_differentiable(scene: Scene, pattern: str) -> None:

@@ -12,7 +12,7 @@ from ddrecon.picture import render
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CAMERA = "type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28"
 TRACED = [
     f"volume.density={{file: {ROOT}/data/plume/density.npz}}",

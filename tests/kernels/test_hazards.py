@@ -3,25 +3,24 @@
 import math
 import multiprocessing
 import threading
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 import torch
-from media import half_empty, make_camera, make_scene, random_values
+from media import half_empty, make_scene
+from scenes import cloud, mixture
 from torch import Tensor
+from twins import assert_same, differentiate, images_of, values_of
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SolveError
-from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.light.reduced import follow_lights, receive_light, sum_unscattered_sky
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.picture import render_each
 from ddrecon.scene import Scene
-from ddrecon.settings import RenderSettings
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.kernels import launch
@@ -29,7 +28,7 @@ from ddrecon.kernels import launch
 pytestmark = pytest.mark.slow
 
 SHAPE = (5, 7, 9)
-VARIED = "density", "sigma_a", "sigma_s", "g"
+VARIED = "density", "sigma_a", "sigma_s", "phase.g"
 
 
 def reorder(tensor: Tensor) -> Tensor:
@@ -38,70 +37,41 @@ def reorder(tensor: Tensor) -> Tensor:
     return tensor.permute(axes).contiguous().permute(axes)
 
 
-def every_light(is_cellwise: bool = False) -> Scene:
-    """A scene that needs all kernels: peaked scattering, a round, beam, point light and sky."""
-    density, sigma_s = 2 * half_empty(*SHAPE), random_values(3, *SHAPE, seed=1)
-    camera = make_camera((1.1, 0.5, 0.9), (12, 14), 0.9)
-    sections = {"sigma_s": 6 * sigma_s, "sigma_a": sigma_s.flip(0)} if is_cellwise else {}
-    scene = make_scene(density, g=0.4, camera=camera, transport_rounds=1, **sections)
-    tensor = density.new_tensor
-    scene.lights += [
-        PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
-        EnvironmentLight(random_values(3, 4, 8, seed=3), tensor(0.5), tensor(20.0), 6),
-    ]
-    return replace(scene, render=RenderSettings(tolerance=1.0))
+@pytest.mark.parametrize("make", [cloud, mixture])
+def test_layout_in_memory_changes_nothing(make: Callable[[], Scene]):
+    scene = make()
+    values = values_of(scene, VARIED)
+    known = differentiate("torch", images_of(scene), values)
+    reordered = {name: reorder(value) for name, value in values.items()}
+    assert_same(differentiate("warp", images_of(scene), reordered), known, 1e-12)
 
 
-def differentiate(scene: Scene, values: dict[str, Tensor], **options: Any) -> list[Tensor]:
-    """The image, and the derivatives of a weighted sum of it by `values`."""
-    leaves = {name: value.detach().requires_grad_() for name, value in values.items()}
-    changed = with_values(scene, leaves)
-    (image,) = render_each(changed, changed.views, SolveMemory())
-    total = (image * random_values(*image.shape, seed=9)).sum()
-    return [image.detach(), *torch.autograd.grad(total, list(leaves.values()), **options)]
-
-
-@pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
-def test_layout_in_memory_changes_nothing(is_cellwise: bool):
-    scene = every_light(is_cellwise)
-    values = {name: value_of(scene, name).detach() for name in VARIED}
-    use_engine("torch")
-    known = differentiate(scene, values)
-    use_engine("warp")
-    found = differentiate(scene, {name: reorder(value) for name, value in values.items()})
-    for one, other in zip(found, known, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
-
-
-@pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
+@pytest.mark.parametrize("make", [cloud, mixture])
 def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers(
-    is_cellwise: bool, monkeypatch: pytest.MonkeyPatch
+    make: Callable[[], Scene], monkeypatch: pytest.MonkeyPatch
 ):
     # However few cells and pixels there are, threads share them.
     monkeypatch.setattr("ddrecon.diffusion.fused.passes.SMALL", 0)
-    use_engine("warp")
-    scene, threads, runs = every_light(is_cellwise), torch.get_num_threads(), []
-    values = {name: value_of(scene, name).detach() for name in VARIED}
+    scene, threads, runs = make(), torch.get_num_threads(), []
+    values = values_of(scene, VARIED)
     try:
         for count in (2, 2, 1, 3, 16):
             torch.set_num_threads(count)
-            runs.append(differentiate(scene, values))
+            runs.append(differentiate("warp", images_of(scene), values))
     finally:
         torch.set_num_threads(threads)
-    assert all(map(torch.equal, runs[0], runs[1]))
+    assert_same(runs[1], runs[0], 0.0)
     for other in runs[2:]:
-        for one, known in zip(other, runs[0], strict=True):
-            torch.testing.assert_close(one, known, rtol=0, atol=1e-11 * float(known.norm()))
+        assert_same(other, runs[0], 1e-12)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_second_derivatives_are_refused(engine: str):
     """Rather than that parts of them are missing, whether the cotangent varies or not."""
     use_engine(engine)
-    scene = every_light()
+    scene = cloud()
     density = scene.volume.density.clone().requires_grad_()
-    changed = with_values(scene, {"density": density})
-    (image,) = render_each(changed, changed.views, SolveMemory())
+    (image,) = images_of(scene)({"density": density})
     for loss in (image.square().sum(), image.sum()):
         with pytest.raises(NotImplementedError, match="only first derivatives"):
             torch.autograd.grad(loss, density, create_graph=True)
@@ -109,7 +79,7 @@ def test_second_derivatives_are_refused(engine: str):
 
 def test_a_graph_can_be_gone_back_through_twice():
     use_engine("warp")
-    scene = every_light()
+    scene = cloud()
     density = scene.volume.density.clone().requires_grad_()
     changed = with_values(scene, {"density": density})
     (image,) = render_each(changed, changed.views, SolveMemory(is_warm=False))
@@ -120,12 +90,11 @@ def test_a_graph_can_be_gone_back_through_twice():
 
 
 def test_what_inference_mode_made_serves_derivatives_later():
+    scene = cloud()
     use_engine("warp")
-    scene = every_light()
-    values = {"density": scene.volume.density, "g": scene.volume.g}
     with torch.inference_mode():
         render_each(scene, scene.views, SolveMemory())
-    differentiate(scene, values)
+    differentiate("warp", images_of(scene), values_of(scene, VARIED))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -148,7 +117,7 @@ def test_a_density_that_is_no_number_is_seen(engine: str, model: str):
 def test_light_through_what_is_no_number_is_none(engine: str):
     """Where the mass up to a cell is not a number, no kernel makes one of the light there."""
     use_engine(engine)
-    scene = every_light()
+    scene = cloud()
     scene.volume.density[1, 2, 3] = torch.nan
     medium, lights = scale_medium(scene.volume), decompose_lights(scene.lights)
     source = receive_light(medium, lights, degree=1).source
