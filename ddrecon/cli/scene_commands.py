@@ -18,6 +18,7 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, FiniteRange, in_session
 from ddrecon.errors import DataWarning, UsageError
+from ddrecon.settings import MOST_AROUND
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 MOST_SIDE = 2**15
 """Pixels along a side, at most."""
-MOST_AROUND = 10000
-"""Views of a ring, at most, as of `views.ring` in a scene file."""
 EXPORTED = click.Choice(["vdb", "npz"])
 
 
@@ -154,6 +153,8 @@ def render(
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
     if options["exported"] and not options["has_fluence"]:
         raise click.UsageError("--export is for the fluence: say --fluence as well")
+    if options["count"] is not None and len(options["names"]) > 1:
+        raise click.UsageError("--ring goes around from one view: say --view once")
     if cameras is not None:
         typed, path = f"--cameras {cameras}", json.dumps(str(cameras))
         session = session.with_override(f"views={{transforms: {path}}}", typed)

@@ -219,8 +219,9 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
         raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
     if path.is_dir():
         raise UsageError(f"--movie {path}: is a folder")
-    if path.resolve() in {(folder / f"{view.name}.png").resolve() for view in views}:
-        raise UsageError(f"--movie {path}: is the preview of a view; choose another name")
+    is_inside, names = path.resolve().parent == folder.resolve(), [f"{v.name}." for v in views]
+    if is_inside and path.name.startswith(tuple(names)):
+        raise UsageError(f"--movie {path}: is named as the files of a view; choose another name")
     if path.suffix.lower() == ".mp4":
         load_for_file("imageio_ffmpeg", path)
 

@@ -38,6 +38,15 @@ def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) 
     assert not Path("out").exists()
 
 
+def test_too_many_pixels_are_refused_where_they_were_asked_for(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda _: 60 * 2**20)
+    result = run(*COMMANDS["render"], "--size", "9999", "9999")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("--size 9999 9999: views: takes about ")
+
+
 def require_fit(run: Run, line: str, *command: str) -> None:
     """Each of the proposals of a `line` about cells, made alone, takes no more than is free."""
     proposals = line.strip().partition("this would fit: ")[2].split(", or ")
