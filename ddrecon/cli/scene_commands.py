@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 MOST_SIDE = 2**15
 """Pixels along a side, at most."""
-EXPORTED = click.Choice(["vdb", "npz"])
 
 
 @click.command()
@@ -42,17 +41,15 @@ def check(session: Session, scene: Path) -> None:
     from ddrecon.cli.check import describe, lines, supports_of
     from ddrecon.progress import tell
     from ddrecon.scene_file.frames import each_frame, require_frames
-    from ddrecon.scene_file.load import find_expert_keys
 
     if scene_file.tree.frames is not None:
         require_frames(scene_file)
-    expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
     up = getattr(scene_file.tree.volume, "up", "y")
     with tell("reading pictures, and looking at what they show", session.is_quiet):
         first = next(scenes)
         supports = supports_of(chain([first], scenes))
-        report = describe(first, expert, supports, up)
+        report = describe(first, supports, up)
     support = report["support"] or {}
     if (doubt := support.get("doubt")) and "cells" not in support:
         raise scene_file.refused("volume.bounds", doubt)
@@ -135,7 +132,6 @@ def balance(session: Session, scene: Path) -> None:
     help="Its pictures a second.",
 )
 @click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
-@click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
 @click.option("--frames", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @DTYPE
 @REPORT
@@ -151,8 +147,6 @@ def render(
     **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    if options["exported"] and not options["has_fluence"]:
-        raise click.UsageError("--export is for the fluence: say --fluence as well")
     if options["count"] is not None and len(options["names"]) > 1:
         raise click.UsageError("--ring goes around from one view: say --view once")
     if cameras is not None:
@@ -255,7 +249,7 @@ def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
 @click.option(
     "--export",
     "exported",
-    type=EXPORTED,
+    type=click.Choice(["vdb", "npz"]),
     help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
 )
 @DTYPE
@@ -349,14 +343,6 @@ def _optimize_film(
     help="Experiments, each as long as RUN was: what it found is photographed and reconstructed, "
     "and how far off that is are the deviations. In all, also after --resume.",
 )
-@click.option(
-    "--noise",
-    "read",
-    type=FiniteRange(min=0, min_open=True),
-    metavar="X",
-    help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
-    "reconstruction leaves.",
-)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
@@ -366,12 +352,10 @@ def uncertainty(
     output: Path,
     overwrite: bool,
     experiments: int,
-    read: float | None,
     resume: bool,
 ) -> None:
     """Say by experiments how sure RUN, the folder of a finished run, is of each cell and number."""
     from ddrecon.io.files.folders import UNCERTAINTY
-    from ddrecon.pictures.noise import Noise
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.experiments import Uncertainty
@@ -386,8 +370,7 @@ def uncertainty(
             f"{run}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"
         )
-    noise = None if read is None else Noise(read, 0.0)
-    job = Uncertainty(reconstruction, session.seed, experiments, noise)
+    job = Uncertainty(reconstruction, session.seed, experiments)
     with session.claim(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
         record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
     if record:

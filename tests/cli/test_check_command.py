@@ -77,13 +77,6 @@ def test_json(succeed: Run) -> None:
     assert report["optimizes"] == {"density": 120} and report["memory_bytes"] > 0
 
 
-def test_keys_for_experts_are_told_where_they_are_not_at_their_default(succeed: Run) -> None:
-    overrides = ["-D", "diffusion.closure=smooth", "-D", "views.0.weight=2"]
-    lines = succeed("check", "scene.yaml", *overrides).stdout.splitlines()
-    assert "for experts: views.0.weight 2.0, diffusion.closure smooth" in lines
-    assert not json.loads(succeed("check", "scene.yaml", "--json").stdout)["expert_keys"]
-
-
 def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     left_out = [f"-D{key}=null" for key in ("optimize", "views.0.image", "views.1.image")]
     lines = succeed("check", "scene.yaml", *left_out).stdout.splitlines()

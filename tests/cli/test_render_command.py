@@ -121,12 +121,8 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert "no .exr" in line and "pip install" in line
 
 
-@pytest.mark.parametrize("kind", ["npz", "vdb"])
-def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
-    said = succeed(*RENDER, "--fluence", "--export", kind).stdout
-    assert (
-        said.count(f"volumes/fluence.{kind}") == 1 and Path(f"out/volumes/fluence.{kind}").is_file()
-    )
+def test_the_fluence_is_a_volume_of_the_scene(succeed: Run) -> None:
+    assert "volumes/fluence.npz" in succeed(*RENDER, "--fluence").stdout
     field = read_field(Path("out/volumes/fluence.npz"), "fluence")
     expected = ddrecon.fluence(ddrecon.load_scene("scene.yaml")).permute(1, 2, 3, 0)
     np.testing.assert_allclose(field.values, expected.numpy(), rtol=1e-4)

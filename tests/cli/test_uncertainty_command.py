@@ -18,7 +18,7 @@ Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
 FREE = "-D optimize.parameters={density: {init: 0.2}, g: {}, lights.0.irradiance: {}}"
 FAST = ["-D", "diffusion.model=none", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
-KNOWN = ["-q", "--noise", "0.05"]
+KNOWN = ["-q", "-D", "optimize.noise={read: 0.05}"]
 
 
 @pytest.fixture
