@@ -15,10 +15,8 @@ from refusals import refusal
 from vdb_files import Grid, Tile, write_file
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.io.info import describe, lines
 from ddrecon.io.volumes.blosc import unpack_blosc, unpack_lz4
 from ddrecon.io.volumes.table import read_field
-from ddrecon.io.volumes.vdb_read import describe_vdb
 
 NONE, ZIP, MASK, BLOSC = 0, 1, 2, 4
 QUICK = settings(derandomize=True, database=None, deadline=None, max_examples=20)
@@ -78,12 +76,6 @@ def test_values_come_back_bit_for_bit(
     values = field.values.reshape(*field.values.shape[:3], -1).transpose(2, 1, 0, 3)
     assert np.array_equal(values, grid.dense(low, high))
     assert np.allclose(field.bounds, [HALF * (low - 0.5), HALF * (high - 0.5)])
-    told = describe_vdb(path)
-    active = sum(int(is_active.sum()) for _, is_active in grid.leaves.values())
-    active += sum(tile.side**3 for tile in grid.tiles if tile.is_active)
-    assert told["file_version"] == version
-    assert told["grids"]["density"]["active"] == active
-    assert told["grids"]["density"]["voxels"] == [low.tolist(), high.tolist()]
 
 
 def test_what_is_large_is_a_tile(tmp_path: Path) -> None:
@@ -309,22 +301,6 @@ FULL = {(0, 0, 0): (np.ones((512, 1)), np.ones(512, bool))}
 )
 def test_what_is_no_fog_is_refused_by_name(tmp_path: Path, grid: Grid, reason: str) -> None:
     assert refusal(write_file(tmp_path / "a.vdb", grid)).startswith(reason)
-
-
-def test_all_grids_are_described(tmp_path: Path) -> None:
-    grids = (
-        Grid(leaves=FULL, flags=BLOSC | MASK, map=moved(1, 2, 3, by=(4, 5, 6)), is_half=True),
-        Grid("shape", "double", labels={"class": "level set"}, flags=ZIP),
-    )
-    report = describe(write_file(tmp_path / "a.vdb", *grids))
-    assert lines(report)[2:] == [
-        "grid density: Tree_float_5_4_3_HalfFloat, unknown, Blosc and active values,"
-        " 512 active voxels from [0, 0, 0] to [8, 8, 8],"
-        " ScaleTranslateMap of 1 x 2 x 3 u from [4.0, 5.0, 6.0]",
-        "grid shape: Tree_double_5_4_3, level set, zip",
-        "no field: shape is a level set (distances): convert it to a fog volume first",
-    ]
-    assert report["file_version"] == 224
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
