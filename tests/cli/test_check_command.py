@@ -6,7 +6,6 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from click.testing import Result
@@ -56,15 +55,6 @@ def test_only_the_physics_a_scene_needs(
     result = succeed("check", "scene.yaml", "--json", *overrides)
     physics = "\n".join(json.loads(result.stdout)["physics"])
     assert present in physics and absent not in physics
-
-
-def test_suns_and_sky_of_an_environment_map(succeed: Run) -> None:
-    pixels = np.ones((32, 64, 3), np.float32)
-    pixels[[8, 20], [10, 40]] = 3000
-    np.save("sky.npy", pixels)
-    sky = "lights=[{type: environment, file: sky.npy}]"
-    told = "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow"
-    assert told in succeed("check", "scene.yaml", "-D", sky).stdout
 
 
 def test_json(succeed: Run) -> None:

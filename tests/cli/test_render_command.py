@@ -53,18 +53,6 @@ def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run)
         assert np.abs(preview - encoded(image.astype(float))).max() <= 1
 
 
-@pytest.mark.parametrize("g", [-0.4, 0, 0.6])
-def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
-    succeed(*RENDER, *ROUND, "--components", "-D", f"volume.g={g}")
-    for name in ("front", "side"):
-        parts = [pixels(f"{name}.{part}") for part in ("reduced", "single", "multiple")]
-        assert np.array_equal(parts[0] + parts[1] + parts[2], pixels(name))
-        assert all(part.any() for part in parts)
-        assert all(
-            Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple")
-        )
-
-
 def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
     """Image + transmittance times what is behind is the image of a view before it."""
     module = pytest.importorskip("OpenImageIO")
@@ -174,15 +162,6 @@ def test_it_is_said_whether_light_has_come_to_rest(
     assert (report["residual"] < least) == (verdict == "at rest")
 
 
-def test_a_run_is_relit_by_a_picture_in_the_current_folder(succeed: Run) -> None:
-    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
-    np.save("sky.npy", np.ones((4, 8, 3), np.float32))
-    sky, ambient = "{type: environment, file: sky.npy}", "{type: ambient, radiance: 1}"
-    for name, light in (("sky", sky), ("ambient", ambient)):
-        succeed("render", "run", "-o", name, "-q", "--view", "front", "--light", light)
-    np.testing.assert_allclose(np.load("sky/front.npy"), np.load("ambient/front.npy"), rtol=1e-3)
-
-
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
     record = json.loads(succeed("balance", "scene.yaml", "--json").stdout)
     assert set(record["enters"]) == {"lights.0", "lights.1"}
@@ -224,15 +203,6 @@ def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
     relit = pixels("front")
     succeed(*RENDER, "--overwrite", "-D", f"lights=[{', '.join(lights)}]")
     assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
-
-
-def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
-    succeed("optimize", "scene.yaml", "-o", "found", "-q")
-    told = json.loads(Path("found/summary.json").read_text())["views"]
-    report = json.loads(succeed("render", "found", "-o", "out", "-q", "--json").stdout)
-    assert report["psnr"] == {
-        name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()
-    }
 
 
 def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> None:

@@ -185,12 +185,6 @@ def test_all_sixteen_bits_are_kept(tmp_path: Path, channels: int):
     assert not has_alpha or np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
 
 
-def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
-    Pillow.new("CMYK", (4, 4)).save(tmp_path / "a.jpg")
-    with pytest.raises(FormatError, match="CMYK"):
-        read_image(tmp_path / "a.jpg")
-
-
 def save_mask(path: Path, inside: np.ndarray, mode: str) -> np.ndarray:
     """Saves `inside` [h, w] as a mask of Pillow's `mode`, or the dtype of an array."""
     if path.suffix == ".npy":
