@@ -94,7 +94,7 @@ class RunFolder(Iterations):
         is_silent: bool = True,
     ):
         super().__init__(run)
-        self.run, self.path, self.scene_file, self.environment = run, path, scene_file, environment
+        self.path, self.scene_file, self.environment = path, scene_file, environment
         self.preview_every, self.is_silent, self.cells = preview_every, is_silent, 0
         self.log = LossLog(path / "loss.csv")
         self.next_page = monotonic() + PAGE_SECONDS

@@ -27,7 +27,7 @@ from ddrecon.film.folder import MIXED
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.field import prune
 from ddrecon.io.volumes.table import field_names, read_field, write_field
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
@@ -204,18 +204,18 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e9)
-    advance, count = Together.advance, iter(range(10**6))
+    advance, count = Reconstruction.advance, iter(range(10**6))
 
     def arm(last: int) -> None:
         nonlocal count
         count = iter(range(last))
 
-    def counted(run: Together) -> Any:
+    def counted(run: Reconstruction) -> Any:
         if next(count, None) is None:
             raise SystemExit(9)
         return advance(run)
 
-    monkeypatch.setattr(Together, "advance", counted)
+    monkeypatch.setattr(Reconstruction, "advance", counted)
     return arm
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ddrecon import Scene, load_scene
 from ddrecon.reconstruct.frame import Frame
-from ddrecon.reconstruct.loop import Reconstruction, Together
+from ddrecon.reconstruct.loop import Reconstruction
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 
@@ -26,7 +26,7 @@ def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
 
 
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
-    single, together = Reconstruction(still), Together([still, still])
+    single, together = Reconstruction(still), Reconstruction(still, others=[still])
     while not single.is_done:
         row, rows = single.step(), together.advance()
         assert [other.loss for other in rows] == pytest.approx([row.loss] * 2, rel=1e-6)
@@ -37,7 +37,7 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
 
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
-    together = Together([still, other])
+    together = Reconstruction(still, others=[other])
     together.advance()
     state = together.state()
     rows = together.advance()
@@ -45,7 +45,7 @@ def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     for name in one:
         assert torch.equal(one[name], two[name]) == (name != "density")
     # It goes on from its state to the same bits.
-    again = Together([still, other])
+    again = Reconstruction(still, others=[other])
     again.restore(state)
     assert [row.loss for row in again.advance()] == [row.loss for row in rows]
     for run, resumed in zip(together.frames, again.frames, strict=True):
