@@ -136,7 +136,7 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
     run(*OPTIMIZE, "--iterations", "1")
     path = Path("out/checkpoints/last.pt")
     content = torch.load(path, weights_only=True)
-    del content["state"]["frames"][0]["parameters"]["g"]
+    del content["state"]["frames"][0]["parameters"]["density"]
     torch.save(content, path)
     result = run(*RESUME)
     assert (result.exit_code, result.stderr) == (

@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from deadline import deadline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_files import files_below
 from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
 
 from ddrecon.cli.commands import main
@@ -109,13 +108,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
     """The exit code, 0, 2 or 3, of a command that ends at once, names the place, writes nothing."""
-    before = files_below(folder)
+    before = {*folder.rglob("*")}
     with deadline():
         result = CliRunner().invoke(main, list(arguments))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code in (0, 2, 3), result.output
-    assert files_below(folder) == before
+    assert {*folder.rglob("*")} == before
     if result.exit_code:
         assert result.stdout == ""
         lines = [one for one in result.stderr.split("\n")[:-1] if not one.startswith("warning: ")]

@@ -30,7 +30,7 @@ LINE = (
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) -> None:
     text = Path("scene.yaml").read_text()
-    Path("scene.yaml").write_text(text.replace("[16, 4, 3]", "[1024, 1024, 1024]"))
+    Path("scene.yaml").write_text(text.replace("[6, 5, 4]", "[1024, 1024, 1024]"))
     result = run(*COMMANDS[command])
     assert (result.exit_code, result.stdout) == (2, "") and re.fullmatch(LINE + "\n", result.stderr)
     assert not Path("out").exists()
