@@ -7,7 +7,6 @@ scene file, are shown at once.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
@@ -23,7 +22,6 @@ from ddrecon.settings import MOST_AROUND
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
     from ddrecon.film.folder import Film
-    from ddrecon.scene_file.load import SceneFile
 
 
 MOST_SIDE = 2**15
@@ -131,7 +129,7 @@ def balance(session: Session, scene: Path) -> None:
     show_default=True,
     help="Its pictures a second.",
 )
-@click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
+@click.option("--fluence", "has_fluence", is_flag=True, help="And volumes/fluence.npz.")
 @click.option("--frames", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @DTYPE
 @REPORT
@@ -198,11 +196,11 @@ def _render(
     from ddrecon.scene_file.build_views import remove_pictures
     from ddrecon.scene_file.load import referenced_files
 
-    choice, are_rounds_said = Choice(**options), _are_rounds_said(session, scene_file)
+    choice = Choice(**options)
     with session.claim(output, RENDER, overwrite=overwrite) as folder:
         if choice.is_moved:
             scene_file = remove_pictures(scene_file, choice.size)
-        chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
+        chosen = choose_views(session.build(scene_file), choice)
         if choice.movie is not None and folder is not None:
             require_free_files([choice.movie], may_exist=overwrite)
             require_movie(choice.movie, chosen[1], output)
@@ -210,17 +208,6 @@ def _render(
             folder.clear([scene_file.path, *referenced_files(scene_file)])
         report = render_to_folder(*chosen, output, choice, session.progress)
     return report, render_lines(report, output, session.quiet) if report else []
-
-
-def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
-    """Whether a user said how many transport rounds there are, of a result in the run's scene."""
-    from ddrecon.run.result import RESULT
-
-    of_run = scene_file.path.with_name("scene.yaml")
-    if scene_file.path.name == RESULT and of_run.is_file():
-        overrides = (text for text in session.overrides if text.startswith("diffusion"))
-        scene_file = replace(session, overrides=tuple(overrides)).read(of_run)
-    return scene_file.tree.diffusion.transport_rounds is not None
 
 
 @click.command()

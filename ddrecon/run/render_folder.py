@@ -77,15 +77,13 @@ class Choice:
     fps: float = 24.0
 
 
-def choose_views(
-    scene: Scene, choice: Choice, are_rounds_said: bool
-) -> tuple[Scene, Sequence[View]]:
+def choose_views(scene: Scene, choice: Choice) -> tuple[Scene, Sequence[View]]:
     """The scene that is rendered, and its views that are.
 
     Raises UsageError unless the parameter of the `choice` names a number of the scene.
     """
-    if choice.has_fluence and not are_rounds_said:
-        # light in empty cells, which views do not see, takes a second one
+    if choice.has_fluence:
+        # Light in empty cells, which views do not see, takes a second one.
         rounds = scene.diffusion.rounds
         scene.diffusion = replace(scene.diffusion, transport_rounds=rounds and max(rounds, 2))
     views = [scene.view(name) for name in dict.fromkeys(choice.names)] or scene.views

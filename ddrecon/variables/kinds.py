@@ -137,12 +137,13 @@ def _side(scene: Scene) -> float:
 class Kind:
     """One kind of variable.
 
-    `change`: one that pictures show, of what may be a number; values are kept within [`low`, `high`]. `is_color`: values
-    may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components`:
-    names of a vector's entries, which change one at a time. `is_direction`: only where a vector
-    points matters, and a step keeps its length. `tv`: the default weight of total variation, of
-    `is_compressed` kinds that of the logarithm (E11.3), times `alone` where no other field is
-    sought and it only suppresses noise. `difference_steps`: those of finite differences.
+    `change`: one that pictures show, of what may be a number; values are kept within [`low`,
+    `high`]. `is_color`: values may differ by color, the leading axis; `is_cellwise`: by cell, the
+    last three. `components`: names of a vector's entries, which change one at a time.
+    `is_direction`: only where a vector points matters, and a step keeps its length. `tv`: the
+    default weight of total variation, of `is_compressed` kinds that of the logarithm (E11.3), times
+    `alone` where no other field is sought and it only suppresses noise. `difference_steps`: those
+    of finite differences.
     """
 
     change: Change = fixed_change(1.0)
