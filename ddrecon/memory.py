@@ -52,12 +52,16 @@ class Needs:
         alive = self.numbers * math.prod(self.resolution) + IN_PIXEL * self.pixels
         return int(OVERHEAD * self.size * alive)
 
+    @property
+    def of_pixels(self) -> int:
+        """Those of them that pixels take."""
+        return replace(self, resolution=(0, 0, 0)).total
+
     def smaller(self, limit: int) -> Iterator[str]:
         """What takes at most `limit` bytes, in the words of the command line and scene file."""
         if self.size == 8 and self.total <= 2 * limit:
             yield "--dtype float32"
-        pixels = replace(self, resolution=(0, 0, 0)).total
-        cells = self.total - pixels
+        pixels, cells = self.of_pixels, self.total - self.of_pixels
         share = (max(0, limit - pixels) / cells) ** (1 / 3)
         coarser = [int(share * cells_along) for cells_along in self.resolution]
         if min(coarser) > 0:

@@ -1,4 +1,4 @@
-"""Progress bars: who asks for long work hands in the function that shows its progress."""
+"""Progress bars and tables: who asks for long work hands in what shows its progress."""
 
 from __future__ import annotations
 
@@ -51,3 +51,8 @@ def tell(text: str, is_quiet: bool) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """A table in Markdown, line by line."""
+    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]

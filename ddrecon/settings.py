@@ -16,6 +16,8 @@ from ddrecon.records import Violation, bounded, one_of
 
 FLOOR = 3.3
 """Optical thickness of empty space across the box's shortest side, by the closure `smooth`."""
+MOST_AROUND = 10000
+"""Cameras of a ring, at most."""
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
 

@@ -1,6 +1,7 @@
 """What every test has: a seed, one thread, the torch engine, and commands in this process."""
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 from hypothesis import settings
+from small_scene import write_scene
 from zero_tangents import ask_python
 
 from ddrecon.cli.commands import main
@@ -42,6 +44,25 @@ def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
 def same_seed() -> None:
     """No test depends on those before it; the seed decides which views an iteration looks at."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What commands change in their process is put back; Ctrl-C works in the background too."""
+    threads = torch.get_num_threads()
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    yield
+    signal.signal(signal.SIGINT, handler)
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with scene.yaml, its images front.npy and side.npy, and density.npz."""
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture

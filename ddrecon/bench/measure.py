@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -22,10 +21,8 @@ from torch import Tensor
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.extras import load_extra
-from ddrecon.io.files.atomic import replace_file
 from ddrecon.picture import render_each
-from ddrecon.progress import Progress
+from ddrecon.progress import Progress, table_lines
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reference.trace import Traced, Tracer, error_text, least_error
 from ddrecon.scene import Scene
@@ -33,10 +30,6 @@ from ddrecon.validate.hard import relative_error
 from ddrecon.variables.values import with_values
 
 EXACT: dict[str, Any] = {"tolerance": 1e-8, "warm_start": False}
-EXACT_LIMITED = 1e-5
-"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
-minutes.
-"""
 EXACT_STEPS = 3
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
@@ -113,8 +106,7 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
 def bench_lines(rows: Sequence[Row]) -> list[str]:
     """The rows as a Markdown table, and Mitsuba's time."""
     base, last = rows[0], rows[-1]
-    lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, *(row.cells(base) for row in rows))]
-    lines.insert(1, "|" + " --- |" * len(HEAD))
+    lines = table_lines(HEAD, [row.cells(base) for row in rows])
     if last.image_error is not None:
         times = last.image_seconds / base.image_seconds
         lines.append(
@@ -122,25 +114,6 @@ def bench_lines(rows: Sequence[Row]) -> list[str]:
             f"subtracted; {last.name} take {times:.3g} times as long as base"
         )
     return lines
-
-
-def draw(rows: Sequence[Row], path: Path) -> None:
-    """Writes a PNG of times of an image against errors; dots have the numbers of their rows.
-
-    Raises MissingExtraError where matplotlib is not installed.
-    """
-    load_extra("matplotlib", "a plot").use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(11, 6), layout="constrained")
-    for number, row in enumerate(rows, 1):
-        axis.plot(row.image_seconds, row.error, "o", label=f"{number}  {row.name}")
-        axis.annotate(str(number), (row.image_seconds, row.error))
-    axis.set(xscale="log", yscale="log", xlabel="seconds of an image", ylabel="relative error")
-    figure.legend(loc="outside right center", fontsize=8)
-    with replace_file(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-    plt.close(figure)
 
 
 def variants_of(scene: Scene, is_quick: bool) -> dict[str, Scene]:
@@ -154,8 +127,7 @@ def variants_of(scene: Scene, is_quick: bool) -> dict[str, Scene]:
         variants[f"tolerance {tolerance}"] = vary("diffusion", tolerance=tolerance)
     for closure in CLOSURES:
         variants[f"closure {closure}"] = vary("diffusion", closure=closure)
-    for model in ("p1",) if is_quick else ("p1", "flux_limited"):
-        variants[f"model {model}"] = vary("diffusion", model=model, transport_rounds=None)
+    variants["rounds by the medium"] = vary("diffusion", transport_rounds=None)
     for rounds, degree in ((0, 3), (1, 3), (2, 3), *(() if is_quick else ((4, 3), (2, 5)))):
         change = vary("diffusion", transport_rounds=rounds, degree=degree)
         variants[f"rounds {rounds}, degree {degree}"] = change
@@ -184,8 +156,6 @@ def exact_scene(scene: Scene) -> Scene:
     """
     steps = max(EXACT_STEPS, scene.render.steps)
     diffusion = replace(scene.diffusion, **EXACT)
-    if diffusion.model == "flux_limited":
-        diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
     settings = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
     return replace(scene, render=settings, diffusion=diffusion)
 

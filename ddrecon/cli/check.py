@@ -69,13 +69,10 @@ def asks_support(scene: Scene) -> bool:
     return density is not None and density.support is not None
 
 
-def describe(
-    scene: Scene, expert: dict[str, Any], supports: Sequence[Support] = (), up: str = "y"
-) -> dict[str, Any]:
+def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
-    And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
-    that are not at their default; `up` is `volume.up`.
+    And what can hardly be meant. Its parameters are where they start. `up` is `volume.up`.
     """
     scene = with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
@@ -110,7 +107,6 @@ def describe(
         "loss": loss,
         "support": support,
         "engine": current_engine(),
-        "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }
@@ -130,7 +126,6 @@ def lines(report: dict[str, Any]) -> list[str]:
         for view in report["views"]
     ]
     widths = [view["cell"] for view in report["views"]]
-    expert = ", ".join(f"{key} {value}" for key, value in report["expert_keys"].items())
     return [
         f"grid: {sizes}, from {low} to {high}",
         f"views: {len(report['views'])}",
@@ -141,7 +136,6 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"optimizes: {', '.join(parameters) or 'nothing'}",
         *([loss_text(report["loss"])] if report["loss"] else []),
         *([support_text(report["support"])] if report["support"] else []),
-        *([f"for experts: {expert}"] if expert else []),
         f"engine: {report['engine']}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]

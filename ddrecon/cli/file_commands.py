@@ -55,7 +55,7 @@ def export(
     as its volumes.
     """
     scene_file = session.read(sources[0]) if sources[0].suffix in SCENE_SUFFIXES else None
-    _require_volumes(sources)
+    _require_volumes(session, sources)
     from ddrecon.io.files.folders import require_free_files
     from ddrecon.run.result import require_no_film
 
@@ -131,12 +131,17 @@ def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
     return fields, constants, np.array(scene.volume.grid.bounds_xyz)
 
 
-def _require_volumes(sources: Sequence[Path]) -> None:
-    """Raises FormatError for a source that is no scene and is not there, before imports."""
+def _require_volumes(session: Session, sources: Sequence[Path]) -> None:
+    """Raises FormatError for a source that is no scene and is not there, before imports.
+
+    UsageError where nothing is a scene that `session` could override.
+    """
     for path in sources:
         if path.suffix not in SCENE_SUFFIXES:
             with guard_reading(path):
                 pass
+    if session.overrides and not any(map(_is_scene, sources)):
+        raise click.UsageError("-D changes a scene file; name one")
 
 
 def _is_scene(source: Path) -> bool:
@@ -153,7 +158,7 @@ def info(session: Session, file: Path) -> None:
 
     A scene file, or the folder of a finished run, counts as its volume.
     """
-    _require_volumes([file])
+    _require_volumes(session, [file])
     scene = session.load(file) if _is_scene(file) else None
     from ddrecon.io.info import describe, describe_medium, lines
 

@@ -7,7 +7,6 @@ scene file, are shown at once.
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from time import monotonic
@@ -18,18 +17,15 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, FiniteRange, in_session
 from ddrecon.errors import DataWarning, UsageError
+from ddrecon.settings import MOST_AROUND
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
     from ddrecon.film.folder import Film
-    from ddrecon.scene_file.load import SceneFile
 
 
 MOST_SIDE = 2**15
 """Pixels along a side, at most."""
-MOST_AROUND = 10000
-"""Views of a ring, at most, as of `views.ring` in a scene file."""
-EXPORTED = click.Choice(["vdb", "npz"])
 
 
 @click.command()
@@ -43,17 +39,15 @@ def check(session: Session, scene: Path) -> None:
     from ddrecon.cli.check import describe, lines, supports_of
     from ddrecon.progress import tell
     from ddrecon.scene_file.frames import each_frame, require_frames
-    from ddrecon.scene_file.load import find_expert_keys
 
     if scene_file.tree.frames is not None:
         require_frames(scene_file)
-    expert = find_expert_keys(scene_file.tree)
     scenes = map(session.build, each_frame(scene_file))
     up = getattr(scene_file.tree.volume, "up", "y")
     with tell("reading pictures, and looking at what they show", session.is_quiet):
         first = next(scenes)
         supports = supports_of(chain([first], scenes))
-        report = describe(first, expert, supports, up)
+        report = describe(first, supports, up)
     support = report["support"] or {}
     if (doubt := support.get("doubt")) and "cells" not in support:
         raise scene_file.refused("volume.bounds", doubt)
@@ -135,8 +129,7 @@ def balance(session: Session, scene: Path) -> None:
     show_default=True,
     help="Its pictures a second.",
 )
-@click.option("--fluence", "has_fluence", is_flag=True, help="Also write volumes/fluence.npz.")
-@click.option("--export", "exported", type=EXPORTED, help="And volumes/fluence.vdb and so on.")
+@click.option("--fluence", "has_fluence", is_flag=True, help="And volumes/fluence.npz.")
 @click.option("--frames", metavar="A:B", help="Of a film, the frames from A to B alone.")
 @DTYPE
 @REPORT
@@ -152,8 +145,8 @@ def render(
     **options: Any,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run, or of a film."""
-    if options["exported"] and not options["has_fluence"]:
-        raise click.UsageError("--export is for the fluence: say --fluence as well")
+    if options["count"] is not None and len(options["names"]) > 1:
+        raise click.UsageError("--ring goes around from one view: say --view once")
     if cameras is not None:
         typed, path = f"--cameras {cameras}", json.dumps(str(cameras))
         session = session.with_override(f"views={{transforms: {path}}}", typed)
@@ -203,11 +196,11 @@ def _render(
     from ddrecon.scene_file.build_views import remove_pictures
     from ddrecon.scene_file.load import referenced_files
 
-    choice, are_rounds_said = Choice(**options), _are_rounds_said(session, scene_file)
+    choice = Choice(**options)
     with session.claim(output, RENDER, overwrite=overwrite) as folder:
         if choice.is_moved:
             scene_file = remove_pictures(scene_file, choice.size)
-        chosen = choose_views(session.build(scene_file), choice, are_rounds_said)
+        chosen = choose_views(session.build(scene_file), choice)
         if choice.movie is not None and folder is not None:
             require_free_files([choice.movie], may_exist=overwrite)
             require_movie(choice.movie, chosen[1], output)
@@ -215,17 +208,6 @@ def _render(
             folder.clear([scene_file.path, *referenced_files(scene_file)])
         report = render_to_folder(*chosen, output, choice, session.progress)
     return report, render_lines(report, output, session.quiet) if report else []
-
-
-def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
-    """Whether a user said how many transport rounds there are, of a result in the run's scene."""
-    from ddrecon.run.result import RESULT
-
-    of_run = scene_file.path.with_name("scene.yaml")
-    if scene_file.path.name == RESULT and of_run.is_file():
-        overrides = (text for text in session.overrides if text.startswith("diffusion"))
-        scene_file = replace(session, overrides=tuple(overrides)).read(of_run)
-    return scene_file.tree.diffusion.transport_rounds is not None
 
 
 @click.command()
@@ -254,7 +236,7 @@ def _are_rounds_said(session: Session, scene_file: SceneFile) -> bool:
 @click.option(
     "--export",
     "exported",
-    type=EXPORTED,
+    type=click.Choice(["vdb", "npz"]),
     help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
 )
 @DTYPE
@@ -348,14 +330,6 @@ def _optimize_film(
     help="Experiments, each as long as RUN was: what it found is photographed and reconstructed, "
     "and how far off that is are the deviations. In all, also after --resume.",
 )
-@click.option(
-    "--noise",
-    "read",
-    type=FiniteRange(min=0, min_open=True),
-    metavar="X",
-    help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
-    "reconstruction leaves.",
-)
 @click.option("--resume", is_flag=True, help="Go on with the folder's experiments.")
 @REPORT
 @in_session
@@ -365,12 +339,10 @@ def uncertainty(
     output: Path,
     overwrite: bool,
     experiments: int,
-    read: float | None,
     resume: bool,
 ) -> None:
     """Say by experiments how sure RUN, the folder of a finished run, is of each cell and number."""
     from ddrecon.io.files.folders import UNCERTAINTY
-    from ddrecon.pictures.noise import Noise
     from ddrecon.run.result import require_no_film
     from ddrecon.run.run_folder import load_run
     from ddrecon.uncertainty.experiments import Uncertainty
@@ -385,8 +357,7 @@ def uncertainty(
             f"{run}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"
         )
-    noise = None if read is None else Noise(read, 0.0)
-    job = Uncertainty(reconstruction, session.seed, experiments, noise)
+    job = Uncertainty(reconstruction, session.seed, experiments)
     with session.claim(output, UNCERTAINTY, overwrite=overwrite, resume=resume) as folder:
         record = experiment_in_folder(job, folder, is_resumed=resume, is_quiet=session.is_quiet)
     if record:

@@ -116,7 +116,7 @@ def reference(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Folder for the results: bench.json and bench.png, or hard.json.",
+    help="Folder for the results: bench.json, or hard.json.",
 )
 @OVERWRITE
 @REPORT
@@ -145,20 +145,20 @@ def bench(
             _bench_speed(session, scene_file, is_quick, output)
             return
         from ddrecon.io.files.atomic import write_json
-        from ddrecon.validate.hard import describe, run_cases, table
+        from ddrecon.validate.hard import hard_lines, run_cases
 
-        results = run_cases(session.start(), session.progress)
+        report = run_cases(session.start(), session.progress)
         if output is not None:
-            write_json(output / "hard.json", describe(results))
-        session.show(describe(results), table(results))
-        if any(result.failures() for result in results):
+            write_json(output / "hard.json", report)
+        session.show(report, hard_lines(report))
+        if not report["passed"]:
             sys.exit(1)
 
 
 def _bench_speed(
     session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
 ) -> None:
-    from ddrecon.bench.measure import bench_lines, describe, draw, run_bench
+    from ddrecon.bench.measure import bench_lines, describe, run_bench
     from ddrecon.bench.plume import load_pair
     from ddrecon.errors import MissingExtraError, SceneError
     from ddrecon.io.files.atomic import write_json
@@ -175,12 +175,6 @@ def _bench_speed(
         click.echo(f"without path tracing: {error}", err=True)
     rows = run_bench(scene, double, tracer, is_quick, session.progress)
     measured = describe(rows, scene, session.environment())
-    written = []
     if output is not None:
-        written = [f"written to {output}"]
-        try:
-            write_json(output / "bench.json", measured)
-            draw(rows, output / "bench.png")
-        except MissingExtraError as error:
-            written = [f"{written[0]}, without a plot: {error}"]
-    session.show(measured, [*bench_lines(rows), *written])
+        write_json(output / "bench.json", measured)
+    session.show(measured, bench_lines(rows))

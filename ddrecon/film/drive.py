@@ -23,7 +23,7 @@ from ddrecon.io.files.folders import RUN, claim_folder
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import PREVIOUS, fingerprint, newest_checkpoint
 from ddrecon.run.drive import optimize_in_folder
 from ddrecon.run.job import CHECKPOINTS, Checkpoints, Iterations, drive, resume
@@ -136,7 +136,8 @@ def calibrate(film: Film) -> None:
     files = [at_frame(film.scene_file, number) for number in numbers]
     try:
         scenes = [film.build(scene_file) for scene_file in files]
-        together, dtype = Together(scenes), scenes[0].volume.density.dtype
+        together = Reconstruction(scenes[0], others=scenes[1:])
+        dtype = scenes[0].volume.density.dtype
     except FormatError as error:
         advice = f"frames {', '.join(map(str, numbers))} calibrate the film: change frames.first"
         raise FormatError(error.path, f"{error.reason}; {advice} or frames.last") from error

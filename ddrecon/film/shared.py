@@ -13,7 +13,7 @@ from typing import Any
 from ddrecon.errors import FormatError, UsageError
 from ddrecon.io.files.atomic import write_json
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.report import list_numbers
 from ddrecon.run.result import plain, poses_of, put_values
 from ddrecon.run.run_folder import write_values
@@ -22,7 +22,7 @@ from ddrecon.variables.values import EVERY
 SHARED = "shared.json"
 
 
-def write_shared(path: Path, together: Together, numbers: list[int]) -> None:
+def write_shared(path: Path, together: Reconstruction, numbers: list[int]) -> None:
     """Writes what the frames `numbers` have found `together` to `path`."""
     scene, values = together.frames[0].current_scene(), dict[str, Any]()
     poses = poses_of(scene, [p.name for p in together.shared])

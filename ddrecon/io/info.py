@@ -28,8 +28,6 @@ def describe(path: Path) -> dict[str, Any]:
         report = describe_medium(values, {}, bounds)
         for name, field in fields.items():
             report["fields"][name] |= {"unit": field.unit} if field.unit else {}
-        if more := FORMATS[path.suffix.lower()].describe:
-            report |= more(path)
         return report | ({"no_fields": reasons} if reasons else {})
     image = read_image(path)
     height, width = image.size
@@ -93,21 +91,8 @@ def lines(report: dict[str, Any]) -> list[str]:
             f"{name}: {' '.join(f'{number:.4g}' for number in np.atleast_1d(value))} everywhere"
             for name, value in report.get("constants", {}).items()
         ),
-        *(f"grid {name}: {_grid(grid)}" for name, grid in report.get("grids", {}).items()),
         *(f"no field: {reason}" for reason in report.get("no_fields", {}).values()),
     ]
-
-
-def _grid(grid: dict[str, Any]) -> str:
-    """A grid of OpenVDB as its file has it: type, class, compression, voxels, transform."""
-    words = [grid["tree"], grid["class"], " and ".join(grid["compression"]) or "not compressed"]
-    if "active" in grid:
-        low, high = grid["voxels"]
-        words += [
-            f"{grid['active']} active voxels from {low} to {high}",
-            f"{grid['transform']} of {sizes_text(grid['voxel'])} u from {grid['origin']}",
-        ]
-    return ", ".join(words)
 
 
 def _values(report: dict[str, Any], filled: str, about: str = "", unit: str = "") -> str:

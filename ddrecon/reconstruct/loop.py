@@ -51,27 +51,31 @@ def optimize(
     return Result(run.current_scene(), rows)
 
 
-class Together:
-    """Frames of a run, the `search` that moves their parameters, and the `schedule` that ends it.
+class Reconstruction:
+    """A run of a `scene`: the `search` that moves its parameters, and the `schedule` that ends it.
 
-    Frames are scenes that differ in their pictures: one, or several of a film that share all
-    parameters but their fields. `blocks` are the parameters of all, by their names in the search,
-    and `numbers` the single numbers among them. `diagonals` are the metric of fields and maps;
-    `rival` is the loss of images and the values that a trial has to beat.
+    Its `frames` are that scene and `others`, which differ in their pictures: several of a film
+    share all parameters but their fields. `blocks` are the parameters of all, by their names in the
+    search, and `numbers` the single numbers among them. `diagonals` are the metric of fields and
+    maps; `rival` is the loss of images and the values that a trial has to beat. `problem`, `memory`
+    and `parameters` are those of the first frame.
     """
 
-    def __init__(self, scenes: Sequence[Scene], iterations: Iterations | None = None):
-        for scene in scenes:
-            require_legal(scene)
+    def __init__(
+        self, scene: Scene, iterations: Iterations | None = None, others: Sequence[Scene] = ()
+    ):
+        for frame_scene in (scene, *others):
+            require_legal(frame_scene)
         forget_changed()
-        self.frames = [Frame(scene, iterations) for scene in scenes]
+        self.frames = [Frame(frame_scene, iterations) for frame_scene in (scene, *others)]
         self.blocks: dict[str, Parameter] = {}
         shared = {p.name: p for p in self.frames[0].parameters if not p.is_field}
         for frame in self.frames:
             frame.parameters = [shared.get(p.name, p) for p in frame.parameters]
             self.blocks |= {self._key(frame, p): p for p in frame.parameters}
-        every = list(self.blocks.values())
-        problem = self.frames[0].problem
+        every, first = list(self.blocks.values()), self.frames[0]
+        problem = self.problem = first.problem
+        self.memory, self.parameters = first.memory, first.parameters
         self.numbers = Numbers(problem.train, every)
         stages = find_stages(len(problem.factors), problem.train, every)
         self.schedule = Schedule(problem.settings.iterations, stages)
@@ -84,7 +88,7 @@ class Together:
     @property
     def iteration(self) -> int:
         """How many iterations have been made."""
-        return self.frames[0].total.iteration
+        return self.total.iteration
 
     @property
     def is_done(self) -> bool:
@@ -108,7 +112,7 @@ class Together:
         stage = self.schedule.stage
         self.schedule.note(self.iteration + 1, self.search, self.noise_loss)
         is_over = self.schedule.is_over(self.iteration + 1)
-        fraction = self.frames[0].problem.settings.keep_start
+        fraction = self.problem.settings.keep_start
         if fraction and is_over:
             # In the end, fields get back a part of what they began with.
             for p in self.blocks.values():
@@ -129,6 +133,35 @@ class Together:
     def shared(self) -> list[Parameter]:
         """The parameters that all frames have in common."""
         return [p for p in self.blocks.values() if not p.is_field]
+
+    @property
+    def level(self) -> Level:
+        """The problem at the current resolution."""
+        return self.frames[0].level
+
+    @property
+    def total(self) -> Row:
+        """The running totals of the log."""
+        return self.frames[0].total
+
+    def step(self) -> Row:
+        """The log's row of one more iteration; raises DivergenceError as `advance` does."""
+        return self.advance()[0]
+
+    def ending(self) -> dict[str, Any]:
+        """Why the run ended, and the root mean squares of what it leaves and of the noise.
+
+        Both are parts of that of the pictures, as the loss compares them.
+        """
+        unit = self.problem.power or 1.0
+        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
+        ending: dict[str, Any] = self.schedule.ending(self.iteration)
+        ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
+        return ending | {"residual": residual, "noise": noise}
+
+    def current_scene(self) -> Scene:
+        """The scene at full resolution, with everything as reconstructed so far."""
+        return self.frames[0].current_scene()
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
@@ -279,41 +312,3 @@ class Together:
         """The search's name of a parameter of `frame`: fields are each frame's own."""
         is_shared = len(self.frames) == 1 or not p.is_field
         return p.name if is_shared else f"frame {self.frames.index(frame)} {p.name}"
-
-
-class Reconstruction(Together):
-    """A run of one `scene`: its `frame`, and what the run has of it."""
-
-    def __init__(self, scene: Scene, iterations: Iterations | None = None):
-        super().__init__([scene], iterations)
-        frame = self.frame = self.frames[0]
-        self.problem, self.memory, self.parameters = frame.problem, frame.memory, frame.parameters
-
-    @property
-    def level(self) -> Level:
-        """The problem at the current resolution."""
-        return self.frame.level
-
-    @property
-    def total(self) -> Row:
-        """The running totals of the log."""
-        return self.frame.total
-
-    def step(self) -> Row:
-        """The log's row of one more iteration; raises DivergenceError as `advance` does."""
-        return self.advance()[0]
-
-    def ending(self) -> dict[str, Any]:
-        """Why the run ended, and the root mean squares of what it leaves and of the noise.
-
-        Both are parts of that of the pictures, as the loss compares them.
-        """
-        unit = self.problem.power or 1.0
-        residual, noise = math.sqrt(self.total.data_loss / unit), math.sqrt(self.noise_loss)
-        ending: dict[str, Any] = self.schedule.ending(self.iteration)
-        ending["text"] += f"; images are off by {residual:.1%}, noise and model by {noise:.1%}"
-        return ending | {"residual": residual, "noise": noise}
-
-    def current_scene(self) -> Scene:
-        """The scene at full resolution, with everything as reconstructed so far."""
-        return self.frame.current_scene()

@@ -18,7 +18,7 @@ from ddrecon.errors import DivergenceError, FormatError, RanksError
 from ddrecon.interrupts import defer_interrupt
 from ddrecon.progress import BAR, bar_settings
 from ddrecon.ranks import from_first, is_any
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import LAST, UNUSABLE, continue_from, load_checkpoint, save_checkpoint
 
 CHECKPOINTS = "checkpoints"
@@ -57,30 +57,30 @@ class Job(Protocol):
 class Iterations:
     """The job of a run, or of several together."""
 
-    def __init__(self, run: Together):
-        self.together = run
+    def __init__(self, run: Reconstruction):
+        self.run = run
 
     @property
     def iteration(self) -> int:
-        return self.together.iteration
+        return self.run.iteration
 
     @property
     def total(self) -> int | None:
-        schedule = self.together.schedule
+        schedule = self.run.schedule
         return None if schedule.is_auto else schedule.most
 
     @property
     def is_done(self) -> bool:
-        return self.together.is_done
+        return self.run.is_done
 
     def step(self) -> str:
-        return f"PSNR {mean(row.psnr for row in self.together.advance()):.1f} dB"
+        return f"PSNR {mean(row.psnr for row in self.run.advance()):.1f} dB"
 
     def state(self) -> dict[str, Any]:
-        return self.together.state()
+        return self.run.state()
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self.together.restore(state)
+        self.run.restore(state)
 
 
 class Checkpoints:
@@ -124,7 +124,7 @@ def resume(job: Job, saved: Checkpoints | None) -> None:
         saved.note_saved(job, 0.0)
 
 
-def restore(job: Job | Together, state: Mapping[str, Any], loaded: Path) -> None:
+def restore(job: Job | Reconstruction, state: Mapping[str, Any], loaded: Path) -> None:
     """Has `job` go on from the `state` in the file `loaded`; FormatError where it does not fit."""
     try:
         job.restore(state)

@@ -36,7 +36,7 @@ from ddrecon.pictures import srgb
 from ddrecon.progress import Progress
 from ddrecon.ranks import is_first, own_rank, rank_count, sum_over_ranks
 from ddrecon.report.pictures import diverging, find_white, pixels
-from ddrecon.run.run_folder import write_values
+from ddrecon.run.run_folder import write_volume
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
@@ -51,6 +51,7 @@ FEW = 12
 """Where there are more views, only the first and the last are printed."""
 COMPONENTS = (".reduced", ".single", ".multiple")
 MATTE = (".transmittance", ".depth")
+FLUENCE = "volumes/fluence.npz"
 MOVIES = {".mp4": write_film, ".png": write_animation}
 """What writes movies, by their suffixes."""
 
@@ -60,8 +61,8 @@ class Choice:
     """What is rendered of a scene: the views `names`, or all; with a `count` so many around it.
 
     A scene that `is_relit` or `is_moved`, to a `size` (width, height) of its own, is compared with
-    no picture. With a `parameter` there are derivatives by it as well; the fluence is written as
-    .npz, and `exported` as another kind. A `movie` has `fps` views a second.
+    no picture. With a `parameter` there are derivatives by it as well. A `movie` has `fps` views a
+    second.
     """
 
     names: tuple[str, ...] = ()
@@ -69,7 +70,6 @@ class Choice:
     parameter: str | None = None
     count: int | None = None
     has_fluence: bool = False
-    exported: str | None = None
     is_relit: bool = False
     is_moved: bool = False
     size: tuple[int, int] | None = None
@@ -77,15 +77,13 @@ class Choice:
     fps: float = 24.0
 
 
-def choose_views(
-    scene: Scene, choice: Choice, are_rounds_said: bool
-) -> tuple[Scene, Sequence[View]]:
+def choose_views(scene: Scene, choice: Choice) -> tuple[Scene, Sequence[View]]:
     """The scene that is rendered, and its views that are.
 
     Raises UsageError unless the parameter of the `choice` names a number of the scene.
     """
-    if choice.has_fluence and not are_rounds_said:
-        # light in empty cells, which views do not see, takes a second one
+    if choice.has_fluence:
+        # Light in empty cells, which views do not see, takes a second one.
         rounds = scene.diffusion.rounds
         scene.diffusion = replace(scene.diffusion, transport_rounds=rounds and max(rounds, 2))
     views = [scene.view(name) for name in dict.fromkeys(choice.names)] or scene.views
@@ -109,11 +107,11 @@ def render_to_folder(
     """
     memory, seconds, start = SolveMemory(), dict[str, float](), perf_counter()
     files, quality, scales = dict[str, list[str]](), dict[str, float](), dict[str, float]()
-    kinds = dict.fromkeys(filter(None, ("npz", choice.exported))) if choice.has_fluence else ()
     with torch.no_grad(), varied(scene, choice.parameter) as world:
         light_field = solve_light(world, memory)
         light_seconds = perf_counter() - start
-        fluence_files = _write_fluence(light_field, scene, folder, [*kinds]) if kinds else []
+        if choice.has_fluence:
+            _write_fluence(light_field, scene, folder)
         components = ["", *(COMPONENTS if choice.components else ())]
         names = [*components, *(MATTE if choice.components else ())]
         if choice.parameter is not None:
@@ -151,8 +149,8 @@ def render_to_folder(
             "residual": float(rounds[-1].residual),
             "tolerance": scene.diffusion.transport_tolerance,
         }
-    if fluence_files:
-        report["fluence"] = fluence_files
+    if choice.has_fluence:
+        report["fluence"] = [FLUENCE]
     if choice.parameter is not None:
         report["gradient"] = {"parameter": choice.parameter, "full_scale": scales}
     movie = choice.movie or (None if choice.count is None else folder / "ring.png")
@@ -193,19 +191,12 @@ def _write_images(
     return [path.name for path in written]
 
 
-def _write_fluence(
-    light_field: LightField, scene: Scene, folder: Path, kinds: Sequence[str]
-) -> list[str]:
-    """The names of files of these `kinds` in `folder`, which the first rank writes."""
+def _write_fluence(light_field: LightField, scene: Scene, folder: Path) -> None:
+    """Writes the fluence to its file in `folder`, on the first rank."""
     fluence = resample(fluence_of(light_field, scene.diffusion), scene.volume.grid)
     fluence = forward_ad.unpack_dual(fluence).primal
-    stem = folder / "volumes" / "fluence"
-    if not is_first():
-        return []
-    stem.parent.mkdir(exist_ok=True)
-    grid = scene.volume.grid
-    names = [write_values(stem, stem.name, fluence, grid, kind=kind) for kind in kinds]
-    return [f"{stem.parent.name}/{name}" for name in names]
+    if is_first():
+        write_volume(folder, "fluence", fluence, scene.volume.grid)
 
 
 def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
@@ -219,8 +210,9 @@ def require_movie(path: Path, views: Sequence[View], folder: Path) -> None:
         raise UsageError(f"--movie {path}: views differ in size; give them one by --size")
     if path.is_dir():
         raise UsageError(f"--movie {path}: is a folder")
-    if path.resolve() in {(folder / f"{view.name}.png").resolve() for view in views}:
-        raise UsageError(f"--movie {path}: is the preview of a view; choose another name")
+    is_inside, names = path.resolve().parent == folder.resolve(), [f"{v.name}." for v in views]
+    if is_inside and path.name.startswith(tuple(names)):
+        raise UsageError(f"--movie {path}: is named as the files of a view; choose another name")
     if path.suffix.lower() == ".mp4":
         load_for_file("imageio_ffmpeg", path)
 
@@ -272,7 +264,7 @@ def render_lines(report: dict[str, Any], folder: Path, is_quiet: bool) -> list[s
     if "rounds" in report:
         lines.append(rounds_text(**report["rounds"]))
     if "fluence" in report:
-        lines.append(f"fluence: {', '.join(report['fluence'])}")
+        lines.append(f"fluence: {FLUENCE}")
     if "movie" in report:
         lines.append("movie: {file} (radiance {white:.3g} is white)".format(**report["movie"]))
     return [*lines, f"written to {folder}"]

@@ -94,7 +94,7 @@ class RunFolder(Iterations):
         is_silent: bool = True,
     ):
         super().__init__(run)
-        self.run, self.path, self.scene_file, self.environment = run, path, scene_file, environment
+        self.path, self.scene_file, self.environment = path, scene_file, environment
         self.preview_every, self.is_silent, self.cells = preview_every, is_silent, 0
         self.log = LossLog(path / "loss.csv")
         self.next_page = monotonic() + PAGE_SECONDS
@@ -240,9 +240,7 @@ def write_volume(folder: Path, name: str, value: Tensor, grid: Grid) -> str:
     return f"volumes/{write_values(file.with_suffix(''), field_key(name), value, grid)}"
 
 
-def write_values(
-    stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool = False, kind: str = "npz"
-) -> str:
+def write_values(stem: Path, key: str, value: Tensor, grid: Grid, is_map: bool = False) -> str:
     """The name of the file at `stem`, to which a field on `grid` is written under its `key`.
 
     It is [z, y, x] or [C, z, y, x]; a map of radiance [C, h, w] becomes pixels.
@@ -250,7 +248,7 @@ def write_values(
     if is_map:
         write_linear(stem, value.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
         return f"{stem.name}.npy"
-    file, box = stem.with_name(f"{stem.name}.{kind}"), np.array(grid.bounds_xyz)
+    file, box = stem.with_name(f"{stem.name}.npz"), np.array(grid.bounds_xyz)
     array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
     write_field(file, key, array.float().cpu().numpy(), box)
     return file.name

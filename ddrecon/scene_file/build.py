@@ -99,7 +99,8 @@ def build_scene(
     diffusion, _ = choose_diffusion(tree.diffusion, combined, [*media.values()], parameters)
     needs = needs_of_scene(media, views, diffusion, optimize)
     if too_much := refuse_excess(needs, torch.device(device)):
-        raise scene_file.refused("volume.resolution", too_much)
+        is_of_views = 2 * needs.of_pixels > needs.total
+        raise scene_file.refused("views" if is_of_views else "volume.resolution", too_much)
     # Only now each cell has a number of its own.
     media = {
         name: replace(medium, density=medium.density.contiguous()) for name, medium in media.items()

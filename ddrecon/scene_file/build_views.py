@@ -80,7 +80,9 @@ def remove_pictures(scene_file: SceneFile, size: tuple[int, int] | None) -> Scen
             raise scene_file.refused(f"views.{index}.camera", fault)
         camera = replace(camera, resolution=size or camera.resolution)
         views.append(ViewSection(name=view.name, camera=camera, split=view.split))
-    return replace(scene_file, tree=replace(scene_file.tree, views=tuple(views)))
+    marks = {} if size is None else {"views": f"--size {size[0]} {size[1]}"}
+    tree = replace(scene_file.tree, views=tuple(views))
+    return replace(scene_file, tree=tree, marks={**scene_file.marks, **marks})
 
 
 def _build_view(maker: Maker, index: int) -> View:

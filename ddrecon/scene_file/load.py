@@ -250,31 +250,17 @@ def require(scene_file: SceneFile, key: str, path: Path) -> None:
 
 def referenced_files(scene_file: SceneFile) -> list[Path]:
     """Every file that the scene names, each once, in the order of the scene."""
-    return list(dict.fromkeys(file for _, file in walk(scene_file.tree) if isinstance(file, Path)))
+    return list(dict.fromkeys(file for file in walk(scene_file.tree) if isinstance(file, Path)))
 
 
-def find_expert_keys(tree: SceneTree) -> dict[str, Any]:
-    """The keys for experts that are not at their default in `tree`."""
-    return {
-        f"{key}.{field.name}": value
-        for key, record in walk(tree)
-        for field in (fields(record) if is_dataclass(record) else ())
-        if field.metadata.get("expert") and (value := getattr(record, field.name)) != field.default
-    }
-
-
-def walk(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """`value`, a tree or what is at `key` of it, and all below, each with its key."""
-    yield key, value
-    inner: Iterable[tuple[object, Any]] = ()
-    if isinstance(value, Mapping):
-        inner = value.items()
-    elif isinstance(value, tuple):
-        inner = enumerate(value)
-    elif is_dataclass(value):
-        inner = [(field.name, getattr(value, field.name)) for field in fields(value)]
-    for name, entry in inner:
-        yield from walk(entry, f"{key}.{name}".strip("."))
+def walk(value: Any) -> Iterator[Any]:
+    """`value`, a tree, and all below."""
+    yield value
+    inner: Iterable[Any] = value if isinstance(value, tuple) else ()
+    if isinstance(value, Mapping) or is_dataclass(value):
+        inner = (value if isinstance(value, Mapping) else vars(value)).values()
+    for entry in inner:
+        yield from walk(entry)
 
 
 def describe(scene_file: SceneFile) -> dict[str, Any]:

@@ -58,11 +58,11 @@ UNKNOWN = (
     *("sk_x", "sk_y", "skew", "b1", "b2", "s1", "s2", "s3", "s4"),
 )
 """What says of a lens that it is not modeled, unless it is 0 or false."""
-UNNAMED = ("distortion", "distortion_coefficients", "dist_coeffs", "dist")
+UNNAMED = ("distortion", "distortion_coefficients", "distortion_params", "dist_coeffs", "dist")
 """Coefficients whose order is not known."""
 GROUPS = (
     FOCAL,
-    (*COEFFICIENTS, "distortion_params", *UNKNOWN, *UNNAMED),
+    (*COEFFICIENTS, *UNKNOWN, *UNNAMED),
     ("camera_model", "is_fisheye"),
 )
 """What belongs together: of a group that a frame has any of, nothing of the file counts."""
@@ -289,13 +289,6 @@ def _distortion(entries: Entries) -> LensSection | None:
     is_fisheye = is_fisheye or model in FISHEYE
     section = FisheyeSection if is_fisheye else OpencvSection
     nodes = {name: entries[name] for name in COEFFICIENTS if name in entries}
-    if "distortion_params" in entries:
-        # as in nerfstudio; OpenCV's own order is another
-        listed = entries["distortion_params"].children()
-        if len(listed) != 6 and not (is_fisheye and len(listed) == 4):
-            fault = f"expected k1, k2, k3, k4, p1, p2, found {len(listed)} numbers"
-            raise entries["distortion_params"].refused(fault)
-        nodes |= dict(zip(COEFFICIENTS, listed, strict=False))
     lens = {name: read_as(node, float) for name, node in nodes.items()}
     for name in set(lens) - set(LENSES[section.type]):
         if (value := lens.pop(name)) != 0:

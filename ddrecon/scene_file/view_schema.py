@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from ddrecon.grid import Triple
 from ddrecon.records import Violation, bounded, one_of
-from ddrecon.settings import NoiseSettings
+from ddrecon.settings import MOST_AROUND, NoiseSettings
 
 Color = float | Triple
 Size = tuple[int, int]
@@ -193,7 +193,7 @@ class RingSection:
     resolution: Width and height in pixels; left out where there are images.
     """
 
-    count: int = bounded(minimum=1, maximum=10000)
+    count: int = bounded(minimum=1, maximum=MOST_AROUND)
     radius: float = bounded(above=0)
     fov: float = bounded(above=0, below=180)
     height: float = 0.0

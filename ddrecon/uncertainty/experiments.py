@@ -17,7 +17,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.lighting import solve_light
 from ddrecon.picture import view_picture
-from ddrecon.pictures.noise import LEAST, Noise
+from ddrecon.pictures.noise import LEAST
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -35,18 +35,18 @@ class Uncertainty:
     """Experiments, so many `wanted`, about what `run`, which is done, has found: a job.
 
     `values` are what was found, by name, and `errors` of each experiment so far how far it was from
-    its own `truth`. `residuals` [3, h, w] are what is left of each training view's target, by name,
-    and `noise`, of all pictures, replaces what the scene says; `deviation` is that of all pixels.
+    its own `truth`. `residuals` [3, h, w] are what is left of each training view's target, by name;
+    `deviation` is that of all pixels.
     """
 
-    def __init__(self, run: Reconstruction, seed: int, wanted: int = 2, noise: Noise | None = None):
+    def __init__(self, run: Reconstruction, seed: int, wanted: int = 2):
         self.run, self.parameters, self.seed = run, run.parameters, seed
-        self.wanted, self.noise, self.seconds = wanted, noise, 0.0
+        self.wanted, self.seconds = wanted, 0.0
         views, settings = run.level.train.views, run.problem.settings
         self.values = {p.name: p.value.detach() for p in run.parameters}
         images = photograph(run.level.train, self.values)
         self.residuals = {v.name: target_of(v) - images[v.name] for v in views}
-        noises = {v.name: noise or given_noise(v, settings) for v in views}
+        noises = {v.name: given_noise(v, settings) for v in views}
         self.is_noise_known = None not in noises.values()
         # Nothing is known better than a part of all pictures.
         powers = torch.stack([target_of(view).square().mean() for view in views])

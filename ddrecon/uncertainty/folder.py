@@ -50,7 +50,7 @@ def experiment_in_folder(
 
 def _describe(experiments: Uncertainty) -> dict[str, Any]:
     """What experiments depend on, in plain values, so that only those of the same run go on."""
-    run, noise = experiments.run, experiments.noise
+    run, noise = experiments.run, experiments.run.problem.settings.noise
     sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
     described = {"iteration": run.iteration, "values": sums, "seed": experiments.seed}
     return described | {"noise": None if noise is None else vars(noise)}

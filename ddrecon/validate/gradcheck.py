@@ -23,7 +23,7 @@ from ddrecon.light_field import LightField
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
 from ddrecon.picture import view_picture
-from ddrecon.progress import Progress
+from ddrecon.progress import Progress, table_lines
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import SHORT_STEPS, is_of_volume, kind_of
 from ddrecon.variables.values import (
@@ -92,23 +92,24 @@ class GradientCheck:
             entry.error <= AGREE_DIFFERENCES for entry in self.entries
         )
 
-    def row(self) -> str:
-        """The check as a line of the table, with its worst entry."""
-        verdict = "pass" if self.has_passed else "FAIL"
+    def row(self) -> list[str]:
+        """The check as a row of the table, with its worst entry."""
         worst = max(self.entries, key=lambda entry: entry.error)
-        numbers = f"{self.modes_error:.1e} | {worst.error:.1e} | {worst.entry} | {worst.step:.1e}"
-        return f"| {self.parameter} | {verdict} | {numbers} | {worst.adjoint:.7e} |"
+        errors = f"{self.modes_error:.1e}", f"{worst.error:.1e}"
+        place = worst.entry, f"{worst.step:.1e}", f"{worst.adjoint:.7e}"
+        return [self.parameter, "pass" if self.has_passed else "FAIL", *errors, *place]
 
 
 HEAD = (
-    f"| parameter | verdict | tangent - adjoint (allowed {AGREE_MODES:.0e}) "
-    f"| differences - adjoint (allowed {AGREE_DIFFERENCES:.0e}) | at worst | step | derivative |"
+    *("parameter", "verdict", f"tangent - adjoint (allowed {AGREE_MODES:.0e})"),
+    f"differences - adjoint (allowed {AGREE_DIFFERENCES:.0e})",
+    *("at worst", "step", "derivative"),
 )
 
 
 def table(checks: Sequence[GradientCheck]) -> list[str]:
     """The checks as a table in Markdown; errors are relative."""
-    return [HEAD, "|" + "---|" * (HEAD.count("|") - 1), *(check.row() for check in checks)]
+    return table_lines(HEAD, [check.row() for check in checks])
 
 
 def describe(checks: list[GradientCheck]) -> dict[str, Any]:

@@ -7,8 +7,7 @@ radiance below zero.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -31,7 +30,7 @@ from ddrecon.light_field import receive_in_parts
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.picture import render
-from ddrecon.progress import Progress
+from ddrecon.progress import Progress, table_lines
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
 
@@ -173,27 +172,24 @@ NEGATIVE = 1e-7
 
 
 @dataclass(frozen=True)
-class HardResult:
-    """The result of a case, or the `error` of a solve that gave up.
+class HardNumbers:
+    """What is measured of a case; `iterations` to `energy` are of float32.
 
-    `iterations` to `energy` are of float32; errors are relative RMS, absolute where nothing is;
-    `lowest` is a part of the brightest pixel.
+    Errors are relative RMS, absolute where nothing is; `lowest` is a part of the brightest pixel.
     """
 
-    case: str
-    error: str = ""
-    iterations: int = 0
-    residual: float = math.nan
-    attainable: float = math.nan
-    image_error: float = math.nan
-    gradient_error: float = math.nan
-    lowest: float = math.nan
-    energy: float = math.nan
-    energy_double: float = math.nan
-    depth: float = 0.0
+    iterations: int
+    residual: float
+    attainable: float
+    image_error: float
+    gradient_error: float
+    lowest: float
+    energy: float
+    energy_double: float
+    depth: float
 
     def failures(self) -> list[str]:
-        """The bounds that are not kept (a NaN keeps none), or the error."""
+        """The bounds that are not kept; a NaN keeps none."""
         single = SINGLE_FROM_DOUBLE * max(1, self.depth / OPAQUE)
         is_balanced = self.energy <= ENERGY[torch.float32]
         bounds = {
@@ -203,37 +199,27 @@ class HardResult:
             "radiance": self.lowest >= -NEGATIVE,
             "energy": is_balanced and self.energy_double <= ENERGY[torch.float64],
         }
-        broken = [name for name, is_kept in bounds.items() if not is_kept]
-        return [self.error] if self.error else broken
-
-    def row(self) -> str:
-        """The case as a line of the table."""
-        failures = self.failures()
-        verdict = f"FAIL: {', '.join(failures)}" if failures else "pass"
-        numbers = [] if self.error else [f"{getattr(self, name):>14.1e}" for name in NUMBERS]
-        cells = [f"| {self.case:<41}", f"{self.iterations:>10}", *numbers, f"{verdict} |"]
-        return " | ".join(cells)
+        return [name for name, is_kept in bounds.items() if not is_kept]
 
 
-NUMBERS = tuple(field.name for field in fields(HardResult))[3:]
-"""The columns of the table between iterations and verdict."""
+def run_cases(device: torch.device, progress: Progress) -> dict[str, Any]:
+    """The numbers of every case of `CASES`, and its failures, as plain values."""
+    cases = dict[str, dict[str, Any]]()
+    for name in progress(list(CASES), "hard cases"):
+        try:
+            numbers = run_case(CASES[name], device)
+            cases[name] = asdict(numbers) | {"failures": numbers.failures()}
+        except SolveError as error:
+            cases[name] = {"failures": [str(error)]}
+    return {"passed": not any(case["failures"] for case in cases.values()), "cases": cases}
 
 
-def run_cases(device: torch.device, progress: Progress) -> list[HardResult]:
-    """The result of every case of `CASES`."""
-    return [run_case(name, CASES[name], device) for name in progress(list(CASES), "hard cases")]
-
-
-def run_case(name: str, case: HardCase, device: torch.device) -> HardResult:
-    """The result of `case`, called `name`, rendered in both precisions."""
-    try:
-        (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
-            _render(case, dtype, device) for dtype in (torch.float32, torch.float64)
-        )
-    except SolveError as error:
-        return HardResult(name, str(error))
-    return HardResult(
-        name,
+def run_case(case: HardCase, device: torch.device) -> HardNumbers:
+    """What is measured of `case`, rendered in both precisions; SolveError where one gives up."""
+    (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
+        _render(case, dtype, device) for dtype in (torch.float32, torch.float64)
+    )
+    return HardNumbers(
         iterations=iterations,
         **asdict(balance),
         image_error=relative_error(image, exact),
@@ -244,23 +230,16 @@ def run_case(name: str, case: HardCase, device: torch.device) -> HardResult:
     )
 
 
-def table(results: Sequence[HardResult]) -> list[str]:
-    """The results as a table, and how many cases failed."""
-    names = [f"{name.replace('_', ' '):>14}" for name in NUMBERS]
-    header = " | ".join([f"| {'case':<41}", "iterations", *names, "verdict |"])
-    failed = sum(bool(result.failures()) for result in results)
-    verdict = f"{len(results)} cases, {failed} failed"
-    rule = "|" + "---|" * (header.count("|") - 1)
-    return [header, rule, *(result.row() for result in results), verdict]
-
-
-def describe(results: Sequence[HardResult]) -> dict[str, Any]:
-    """The results as plain values, for a JSON file."""
-    cases = [
-        {**asdict(result), "failures": result.failures(), "passed": not result.failures()}
-        for result in results
-    ]
-    return {"passed": all(case["passed"] for case in cases), "cases": cases}
+def hard_lines(report: Mapping[str, Any]) -> list[str]:
+    """The report of `run_cases` as a table, and how many cases failed."""
+    names, rows = [key.name for key in fields(HardNumbers)], list[list[str]]()
+    for name, case in report["cases"].items():
+        numbers = [f"{case[key]:.2g}" if key in case else "" for key in names]
+        failures = ", ".join(case["failures"])
+        rows.append([name, *numbers, f"FAIL: {failures}" if failures else "pass"])
+    failed = sum(bool(case["failures"]) for case in report["cases"].values())
+    head = ["case", *(name.replace("_", " ") for name in names), "verdict"]
+    return [*table_lines(head, rows), f"{len(rows)} cases, {failed} failed"]
 
 
 def _render(

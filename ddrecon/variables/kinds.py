@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 Change = Callable[["Scene", str, "Tensor"], "float | Tensor"]
 """The change of a variable, or of each entry, by the scene, its name and its value."""
 
-DENSITY_CHANGE = 1.7
-"""A change of the optical depth across the box's shortest side."""
 SOUGHT_DEPTH = 20.0
 """Optical depth that the densest medium may have across the box, where density is not known yet."""
 EMISSION_CHANGE = 5.0
@@ -139,15 +137,16 @@ def _side(scene: Scene) -> float:
 class Kind:
     """One kind of variable.
 
-    `change`: one that pictures show; values are kept within [`low`, `high`]. `is_color`: values
-    may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components`:
-    names of a vector's entries, which change one at a time. `is_direction`: only where a vector
-    points matters, and a step keeps its length. `tv`: the default weight of total variation, of
-    `is_compressed` kinds that of the logarithm (E11.3), times `alone` where no other field is
-    sought and it only suppresses noise. `difference_steps`: those of finite differences.
+    `change`: one that pictures show, of what may be a number; values are kept within [`low`,
+    `high`]. `is_color`: values may differ by color, the leading axis; `is_cellwise`: by cell, the
+    last three. `components`: names of a vector's entries, which change one at a time.
+    `is_direction`: only where a vector points matters, and a step keeps its length. `tv`: the
+    default weight of total variation, of `is_compressed` kinds that of the logarithm (E11.3), times
+    `alone` where no other field is sought and it only suppresses noise. `difference_steps`: those
+    of finite differences.
     """
 
-    change: Change
+    change: Change = fixed_change(1.0)
     low: float = -math.inf
     high: float = math.inf
     is_color: bool = False
@@ -177,13 +176,7 @@ _MEAN_COSINE = Kind(
 _BRIGHTNESS = Kind(brightness_change, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
-    "density": Kind(
-        lambda scene, name, start: DENSITY_CHANGE * unit_of(scene, name),
-        low=0,
-        is_cellwise=True,
-        tv=3e-3,
-        is_compressed=True,
-    ),
+    "density": Kind(low=0, is_cellwise=True, tv=3e-3, is_compressed=True),
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,

@@ -6,7 +6,6 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from click.testing import Result
@@ -58,15 +57,6 @@ def test_only_the_physics_a_scene_needs(
     assert present in physics and absent not in physics
 
 
-def test_suns_and_sky_of_an_environment_map(succeed: Run) -> None:
-    pixels = np.ones((32, 64, 3), np.float32)
-    pixels[[8, 20], [10, 40]] = 3000
-    np.save("sky.npy", pixels)
-    sky = "lights=[{type: environment, file: sky.npy}]"
-    told = "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow"
-    assert told in succeed("check", "scene.yaml", "-D", sky).stdout
-
-
 def test_json(succeed: Run) -> None:
     report = json.loads(succeed("check", "scene.yaml", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
@@ -75,13 +65,6 @@ def test_json(succeed: Run) -> None:
     ]
     assert views == [["front", 8, 6, "train"], ["side", 8, 6, "test"]]
     assert report["optimizes"] == {"density": 120} and report["memory_bytes"] > 0
-
-
-def test_keys_for_experts_are_told_where_they_are_not_at_their_default(succeed: Run) -> None:
-    overrides = ["-D", "diffusion.closure=smooth", "-D", "views.0.weight=2"]
-    lines = succeed("check", "scene.yaml", *overrides).stdout.splitlines()
-    assert "for experts: views.0.weight 2.0, diffusion.closure smooth" in lines
-    assert not json.loads(succeed("check", "scene.yaml", "--json").stdout)["expert_keys"]
 
 
 def test_a_scene_without_images_or_optimize(succeed: Run) -> None:

@@ -10,7 +10,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.volumes.table import WRITTEN, field_names, read_field, write_field
+from ddrecon.io.volumes.table import field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -36,20 +36,6 @@ def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
     succeed("export", "scene.yaml", "-o", "transforms.json", "--overwrite")
     again = "check", "scene.yaml", "--json", "-D", "views={transforms: transforms.json}"
     assert succeed(*again).stdout == before
-
-
-def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run) -> None:
-    values = np.zeros((2, 3, 4), np.float32)
-    values[0, 0, 3] = 7
-    bounds = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
-    write_field(Path("start.npz"), "density", values, bounds)
-    last = "start.npz"
-    for suffix in [*WRITTEN, ".npz"]:
-        name = f"{last.partition('.')[0]}x.density{suffix}"
-        assert succeed("export", last, "-o", name).stdout == f"written: {name}\n"
-        last = name
-    field = read_field(Path(last), "density")
-    assert np.array_equal(field.values, values) and np.array_equal(field.bounds, bounds)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".vdb"])

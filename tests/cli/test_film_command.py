@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from contextlib import chdir
 from itertools import chain, product
@@ -24,13 +23,11 @@ import ddrecon
 from ddrecon import load_scene, render
 from ddrecon.cli.commands import main
 from ddrecon.film.drive import share_out, spread_out
-from ddrecon.film.folder import MIXED, Film
+from ddrecon.film.folder import MIXED
 from ddrecon.io.files.folders import LOCK, MANIFEST, hold, names_in
 from ddrecon.io.volumes.field import prune
 from ddrecon.io.volumes.table import field_names, read_field, write_field
-from ddrecon.reconstruct.divergence import NotFiniteError
-from ddrecon.reconstruct.frame import Frame
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.run_folder import load_run
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.frames import at_frame
@@ -183,17 +180,6 @@ def test_a_frame_keeps_a_part_of_its_start(whole: str, succeed: Run) -> None:
     np.testing.assert_allclose(kept, (1 - MIXED) * bare + MIXED * start, atol=1e-6)
 
 
-def test_frames_end_by_themselves_as_runs_do(
-    film: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ddrecon.reconstruct.tuning.REST", 10.0)
-    sizes = "-D", "optimize.iterations=auto", "-D", "frames.calibrate=0"
-    succeed(*optimize("-o", "out", "--frames", "0:1", *sizes))
-    for number in range(2):
-        summary = json.loads(Path(f"out/frames/000{number}/summary.json").read_text())
-        assert summary["ended"]["kind"] == "rest"
-
-
 def test_a_part_far_from_others_knows_nothing_of_them(film: Path, succeed: Run) -> None:
     """It begins from nothing, and its first frame moves as the second does."""
     for name in VIEWS:
@@ -218,18 +204,18 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has the process die in its `n`-th iteration of all; checkpoints are written at each."""
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SECONDS", 0)
     monkeypatch.setattr("ddrecon.run.job.CHECKPOINT_SHARE", 1e9)
-    advance, count = Together.advance, iter(range(10**6))
+    advance, count = Reconstruction.advance, iter(range(10**6))
 
     def arm(last: int) -> None:
         nonlocal count
         count = iter(range(last))
 
-    def counted(run: Together) -> Any:
+    def counted(run: Reconstruction) -> Any:
         if next(count, None) is None:
             raise SystemExit(9)
         return advance(run)
 
-    monkeypatch.setattr(Together, "advance", counted)
+    monkeypatch.setattr(Reconstruction, "advance", counted)
     return arm
 
 
@@ -246,27 +232,6 @@ def test_killed_anywhere_and_resumed_to_the_same_bits(
     assert volumes("parts") == volumes(whole)
     shared = [json.loads(Path(f"{name}/shared.json").read_text()) for name in ("parts", whole)]
     assert shared[0] == shared[1]
-
-
-@pytest.mark.slow
-def test_a_calibration_that_diverges_goes_on_before_its_last_step(
-    whole: str, film: Path, succeed: Run, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """That of all its frames, of which one has gone ahead."""
-    evaluate, count = Frame.evaluate, iter(range(5))
-
-    def fail(frame: Frame) -> Any:
-        if next(count, None) is None:
-            raise NotFiniteError("the loss is not finite")
-        return evaluate(frame)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Frame, "evaluate", fail)
-        failed = run(*optimize("-o", "parts"))
-    kept = "the state after 2 iterations is kept in parts/calibration/checkpoints/last.pt"
-    assert failed.exit_code == 4 and f"{kept}: go on from it with --resume" in failed.stderr
-    succeed(*optimize("-o", "parts", "--resume"))
-    assert volumes("parts") == volumes(whole)
 
 
 @pytest.mark.slow
@@ -391,6 +356,10 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     succeed(*optimize("-o", "out", "--frames", "0:0", *FEW))
     again = run(*optimize("-o", "out"))
     assert again.exit_code == 2 and "not empty" in again.stderr
+    Path("foreign").mkdir()
+    Path("foreign/report.html").write_text("mine")
+    foreign = run(*optimize("-o", "foreign", "--resume", *FEW))
+    assert foreign.exit_code == 2 and "which ddrecon did not write" in foreign.stderr
     other = run(*optimize("-o", "out", "--resume", *FEW, "-D", "volume.albedo=0.5"))
     assert (
         other.exit_code == 2
@@ -448,31 +417,6 @@ def named(place: str) -> list[str]:
     return [MANIFEST, *(name for name in names_in(Path("out", place)) if name[-1] != "/")]
 
 
-def test_a_folder_that_is_no_films_is_left_alone(film: Path, run: Run, refuse: Refuse) -> None:
-    Path("foreign").mkdir()
-    Path("foreign/report.html").write_text("mine")
-    (line,) = refuse(2, *optimize("-o", "foreign", "--resume", *FEW))
-    assert line.startswith("foreign: holds report.html, which ddrecon did not write")
-    with pytest.raises(ddrecon.UsageError, match="which ddrecon did not write"):
-        next(ddrecon.optimize_sequence("film.yaml", "foreign"))
-
-
-def test_a_part_that_waits_says_so(
-    film: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("ddrecon.io.files.folders.PATIENCE", 0.0)
-    part, told = Film(read_scene("film.yaml"), film / "out", build_scene, is_quiet=False), ""
-    Path("out").mkdir()
-    waiting = threading.Thread(target=lambda: part.claim().__enter__())
-    with part.claim():
-        waiting.start()
-        while not told:
-            waiting.join(0.01)
-            told = capsys.readouterr().err
-    waiting.join()
-    assert told.startswith(f"{film}/out: process ") and "waiting for it" in told
-
-
 def test_frames_are_spread_over_all() -> None:
     for count in range(2, 9):
         found = spread_out(range(3, 40, 2), count)
@@ -480,13 +424,3 @@ def test_frames_are_spread_over_all() -> None:
         gaps = np.diff(found)
         assert gaps.max() - gaps.min() <= 2
     assert spread_out([5, 6], 3) == [5, 6]
-
-
-def test_the_page_of_a_film_says_how_its_cameras_moved(film: Path, succeed: Run) -> None:
-    cameras = "-D", "optimize.parameters.views.*.camera={}"
-    succeed(*optimize("-o", "out", "--frames", "0:1", *FEW, *cameras))
-    page, shared = Path("out/report.html").read_text(), Path("out/shared.json").read_text()
-    (name, *_) = (name for name in json.loads(shared)["values"] if name.endswith(".camera"))
-    (row,) = re.findall(f"<td>{re.escape(name)}</td>(.*?)</tr>", page)
-    number = r"[-+.\de]+"
-    assert re.search(f"moved by {number} pixels, turned by {number} degrees", row)

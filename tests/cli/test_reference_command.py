@@ -61,15 +61,6 @@ def test_views_are_targets(succeed: Run) -> None:
     succeed("render", "scene.yaml", "-o", "rendered", "-q")
 
 
-def test_seeds_choose_paths(succeed: Run) -> None:
-    pytest.importorskip("mitsuba", reason=NEEDED)
-    images = []
-    for seed in ("0", "0", "-1"):
-        succeed(*REFERENCE, "--views", "--view", "front", "--overwrite", "--seed", seed)
-        images.append(pixels("front"))
-    assert np.array_equal(images[0], images[1]) and not np.array_equal(images[0], images[2])
-
-
 def test_without_mitsuba(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     told = 'the reference renderer needs mitsuba: pip install "ddrecon[reference]"'

@@ -38,9 +38,10 @@ render scene.yaml -o out --movie m.avi => 2 --movie m.avi: expected a name that 
 render scene.yaml -o out --movie no/m.png => 2 no/m.png: there is no folder
 render scene.yaml -o out --movie mine.png => 2 mine.png: already there; choose another name, or
 render scene.yaml -o out --overwrite --movie full.png => 2 --movie full.png: is a folder
-render scene.yaml -o out --movie out/../out/side.png => 2 --movie out/../out/side.png: is the
+render scene.yaml -o out --movie out/../out/side.png => 2 --movie out/../out/side.png: is named
+render scene.yaml -o out --components --movie out/side.single.png => 2 --movie out/side.single.png:
+render scene.yaml -o out --ring 3 --view side --view front => 2 Error: --ring goes around from one
 render film -o out --movie m.png => 2 Error: --movie is of one frame: name it, such as FILM/frames
-uncertainty done -o sure --noise inf => 2 Error: Invalid value for '--noise': inf is not finite
 render scene.yaml -o out --light '{type: sun}' => 2 --light {type: sun}: lights.0.type: expected
 render -o out => 2 Error: Missing argument 'SCENE'
 optimize scene.yaml => 2 Error: Missing option '-o'
@@ -77,6 +78,8 @@ export scene.yaml -o a.xml --up z => 2 Error: --up z turns volumes only
 export scene.yaml -o none/smoke.xml => 2 none/smoke.xml: there is no folder
 export film -o a.vdb => 2 film: is the folder of a film; name that of a frame, such as film/frames/
 info film => 2 film: is the folder of a film; name that of a frame, such as film/frames/0003
+info density.npz -D volume.g=0 => 2 Error: -D changes a scene file; name one
+export density.npz -o a.vdb -D volume.g=0 => 2 Error: -D changes a scene file; name one
 info front.txt => 3 front.txt: unknown image format '.txt'
 info bad.npz => 3 bad.npz: is damaged: File is not a zip file
 info gone.vol => 3 gone.vol: cannot be read

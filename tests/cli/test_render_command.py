@@ -53,18 +53,6 @@ def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run)
         assert np.abs(preview - encoded(image.astype(float))).max() <= 1
 
 
-@pytest.mark.parametrize("g", [-0.4, 0, 0.6])
-def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
-    succeed(*RENDER, *ROUND, "--components", "-D", f"volume.g={g}")
-    for name in ("front", "side"):
-        parts = [pixels(f"{name}.{part}") for part in ("reduced", "single", "multiple")]
-        assert np.array_equal(parts[0] + parts[1] + parts[2], pixels(name))
-        assert all(part.any() for part in parts)
-        assert all(
-            Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple")
-        )
-
-
 def test_layers_of_the_exr_put_an_image_over_another(succeed: Run) -> None:
     """Image + transmittance times what is behind is the image of a view before it."""
     module = pytest.importorskip("OpenImageIO")
@@ -121,12 +109,8 @@ def test_no_exr_where_openimageio_is_not_installed(
     assert "no .exr" in line and "pip install" in line
 
 
-@pytest.mark.parametrize("kind", ["npz", "vdb"])
-def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
-    said = succeed(*RENDER, "--fluence", "--export", kind).stdout
-    assert (
-        said.count(f"volumes/fluence.{kind}") == 1 and Path(f"out/volumes/fluence.{kind}").is_file()
-    )
+def test_the_fluence_is_a_volume_of_the_scene(succeed: Run) -> None:
+    assert "volumes/fluence.npz" in succeed(*RENDER, "--fluence").stdout
     field = read_field(Path("out/volumes/fluence.npz"), "fluence")
     expected = ddrecon.fluence(ddrecon.load_scene("scene.yaml")).permute(1, 2, 3, 0)
     np.testing.assert_allclose(field.values, expected.numpy(), rtol=1e-4)
@@ -136,29 +120,15 @@ def test_the_fluence_is_a_volume_of_the_scene(succeed: Run, kind: str) -> None:
     assert read_field(Path("out/volumes/fluence.npz"), "fluence").values.shape == (4, 5, 6)
 
 
-@pytest.mark.parametrize("of", ["scene.yaml", "run"])
-def test_fluence_takes_two_rounds_unless_the_scene_says_how_many(succeed: Run, of: str) -> None:
-    """Of a run's result, which always says how many, unless the scene of the run did."""
-
-    def fluence(*options: str) -> np.ndarray:
-        succeed("render", of, "-o", "out", "-q", "--overwrite", "--fluence", *options)
-        return read_field(Path("out/volumes/fluence.npz"), "fluence").values
-
-    for said, options, rounds in (("null", (), 2), ("null", ROUND, 1), ("1", (), 1)):
-        text = Path("scene.yaml").read_text().replace("rounds: 0", "rounds: null")
-        Path("scene.yaml").write_text(text.replace("rounds: null", f"rounds: {said}"))
-        path = of
-        if of == "run":
-            succeed("optimize", "scene.yaml", "-o", of, "-q", "--iterations", "2", "--overwrite")
-            path = "run/result.yaml"
-        one, two = (
-            ddrecon.fluence(
-                ddrecon.load_scene(path, overrides=[f"diffusion.transport_rounds={count}"])
-            ).permute(1, 2, 3, 0)
-            for count in (1, 2)
-        )
-        assert not np.allclose(one.numpy(), two.numpy(), rtol=1e-3)
-        np.testing.assert_allclose(fluence(*options), (one, two)[rounds - 1].numpy(), rtol=1e-4)
+@pytest.mark.parametrize("said", [0, 1, 3])
+def test_fluence_takes_two_rounds_at_least(succeed: Run, said: int) -> None:
+    """But none where there are to be none."""
+    rounds = f"diffusion.transport_rounds={said}"
+    succeed(*RENDER, "--fluence", "-D", rounds)
+    expected = ddrecon.load_scene("scene.yaml", overrides=[rounds.replace("1", "2")])
+    field = read_field(Path("out/volumes/fluence.npz"), "fluence")
+    fluence = ddrecon.fluence(expected).permute(1, 2, 3, 0).numpy()
+    np.testing.assert_allclose(field.values, fluence, rtol=1e-4)
 
 
 REST = [("1", "null", "what diffusion alone lacks"), ("16", "0.01", "at rest")]
@@ -176,15 +146,6 @@ def test_it_is_said_whether_light_has_come_to_rest(
     assert f"transport rounds: {report['count']}, the last {changed}" in out
     least = 0.01 if tolerance == "null" else float(tolerance)
     assert (report["residual"] < least) == (verdict == "at rest")
-
-
-def test_a_run_is_relit_by_a_picture_in_the_current_folder(succeed: Run) -> None:
-    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
-    np.save("sky.npy", np.ones((4, 8, 3), np.float32))
-    sky, ambient = "{type: environment, file: sky.npy}", "{type: ambient, radiance: 1}"
-    for name, light in (("sky", sky), ("ambient", ambient)):
-        succeed("render", "run", "-o", name, "-q", "--view", "front", "--light", light)
-    np.testing.assert_allclose(np.load("sky/front.npy"), np.load("ambient/front.npy"), rtol=1e-3)
 
 
 def test_a_balance_is_printed_and_a_record(succeed: Run) -> None:
@@ -228,15 +189,6 @@ def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
     relit = pixels("front")
     succeed(*RENDER, "--overwrite", "-D", f"lights=[{', '.join(lights)}]")
     assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
-
-
-def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
-    succeed("optimize", "scene.yaml", "-o", "found", "-q")
-    told = json.loads(Path("found/summary.json").read_text())["views"]
-    report = json.loads(succeed("render", "found", "-o", "out", "-q", "--json").stdout)
-    assert report["psnr"] == {
-        name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()
-    }
 
 
 def test_cameras_of_a_file_at_a_size_without_their_pictures(succeed: Run) -> None:

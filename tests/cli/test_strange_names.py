@@ -27,13 +27,6 @@ def strange(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", ["check", "render -o out", "info"])
-def test_scenes_are_read(strange: Path, succeed: Run, command: str) -> None:
-    name, *options = command.split()
-    succeed(name, f"{STRANGE}/scene.yaml", *options)
-    succeed("info", f"{STRANGE}/{STRANGE[-1]}density.npz")
-
-
 @pytest.mark.parametrize(
     ("command", "reason"),
     [

@@ -18,7 +18,7 @@ Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
 FREE = "-D optimize.parameters={density: {init: 0.2}, g: {}, lights.0.irradiance: {}}"
 FAST = ["-D", "diffusion.model=none", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
-KNOWN = ["-q", "--noise", "0.05"]
+KNOWN = ["-q", "-D", "optimize.noise={read: 0.05}"]
 
 
 @pytest.fixture
@@ -101,17 +101,3 @@ def test_one_that_stops_goes_on_to_the_same_bits(
     assert np.array_equal(volume("whole", "density_std"), volume("half", "density_std"))
     succeed("uncertainty", "run", "-o", "other", "--seed", "1", *KNOWN)
     assert not np.array_equal(volume("whole", "density_std"), volume("other", "density_std"))
-
-
-def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
-    finished: Path, succeed: Run
-) -> None:
-    """Whether the last is damaged or gone."""
-    last = finished / "checkpoints/last.pt"
-    last.with_name("previous.pt").write_bytes(last.read_bytes())
-    for lose in (lambda: last.write_bytes(last.read_bytes()[:1000]), last.unlink):
-        lose()
-        told = succeed(
-            "uncertainty", "run", "-o", "sure", "--overwrite", "--calibrate", "1", *KNOWN
-        ).stderr
-        assert "last.pt: " in told and "going on from run/checkpoints/previous.pt" in told

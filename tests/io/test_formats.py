@@ -223,19 +223,6 @@ def test_a_damaged_file(
 
 
 @EVERY
-def test_the_contents_of_another_format(tmp_path: Path, suffix: str, is_volume: bool) -> None:
-    path = tmp_path / f"density{suffix}"
-    for other in FORMS:
-        if other[0] not in (".tif", ".tiff", ".nc"):
-            path.write_bytes(sample(*other))
-            is_refused(path, is_volume)
-    script = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"
-    for content in (b"", b"\0", b"nonsense" * 50, script, pickle.dumps({"density": 1})):
-        path.write_bytes(content)
-        assert is_refused(path, is_volume)
-
-
-@EVERY
 @pytest.mark.timeout(60)
 def test_what_is_no_file(tmp_path: Path, suffix: str, is_volume: bool) -> None:
     path = tmp_path / f"density{suffix}"
@@ -292,7 +279,7 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, suffix: str) -> None:
         np.save(path, objects, allow_pickle=True)
     else:
         np.savez(path, density=objects, allow_pickle=True)
-    with pytest.raises(FormatError, match="Python objects"):
+    with pytest.raises(FormatError, match="Object arrays"):
         read(path, suffix == ".npz")
     path.write_bytes(pickle.dumps(Tripwire(tmp_path / "made")))
     assert is_refused(path, suffix == ".npz") and not (tmp_path / "made").exists()

@@ -28,7 +28,7 @@ from zero_tangents import ask_python
 # pictures and derivatives in forward mode need.
 from ddrecon.cli import main
 from ddrecon.errors import FormatError
-from ddrecon.reconstruct.loop import Together
+from ddrecon.reconstruct.loop import Reconstruction
 
 for name in ("cli.session", "run.render_folder", "scene_file.doubts", "uncertainty.folder"):
     import_module(f"ddrecon.{name}")
@@ -83,16 +83,16 @@ def do(job: dict[str, Any], rank: int) -> int:
 
 def fail_before(iteration: int, how: str) -> None:
     """Has this process fail before it makes `iteration`."""
-    advance = Together.advance
+    advance = Reconstruction.advance
 
-    def fail(run: Together) -> Any:
+    def fail(run: Reconstruction) -> Any:
         if run.iteration + 1 == iteration:
             if how == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
             raise FormatError("some.file", how)
         return advance(run)
 
-    Together.advance = fail  # type: ignore[method-assign]
+    Reconstruction.advance = fail  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ FIELDS = "density", "sigma_s"
 
 def sure(ranks: int, output: str, *options: str) -> Job:
     command = ["uncertainty", "plain", "-o", output, "--engine", "torch"]
-    return {"ranks": ranks, "arguments": [*command, "--noise", "0.05", *options]}
+    return {"ranks": ranks, "arguments": [*command, "-D", "optimize.noise={read: 0.05}", *options]}
 
 
 JOBS = {

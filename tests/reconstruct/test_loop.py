@@ -53,7 +53,7 @@ def test_a_view_of_weight_2_counts_as_two(ball_scene: Scene) -> None:
 
     def evaluate(*views: View) -> tuple[float, torch.Tensor]:
         run = Reconstruction(replace(ball_scene, views=[*views]), 1)
-        objective = run.frame.evaluate().objective
+        objective = run.frames[0].evaluate().objective
         return objective.loss, objective.gradients["density"]
 
     heavy = evaluate(replace(first, weight=6.0), replace(second, weight=3.0))

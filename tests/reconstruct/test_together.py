@@ -9,7 +9,7 @@ from torch import Tensor
 from ddrecon import Scene, load_scene
 from ddrecon.reconstruct.frame import Frame
 from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reconstruct.loop import Reconstruction, Together
+from ddrecon.reconstruct.loop import Reconstruction
 
 NUMBERS = ["views.*.exposure", "lights.0.irradiance"]
 
@@ -29,7 +29,7 @@ def values(run: Reconstruction | Frame) -> dict[str, Tensor]:
 
 @pytest.mark.slow
 def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
-    single, together = Reconstruction(still), Together([still, still])
+    single, together = Reconstruction(still), Reconstruction(still, others=[still])
     while not single.is_done:
         row, rows = single.step(), together.advance()
         assert [other.loss for other in rows] == pytest.approx([row.loss] * 2, rel=1e-6)
@@ -41,7 +41,7 @@ def test_copies_of_a_scene_find_what_it_finds_alone(still: Scene) -> None:
 @pytest.mark.slow
 def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     other = replace(still, views=[replace(view, image=0.5 * view.image) for view in still.views])
-    together = Together([still, other])
+    together = Reconstruction(still, others=[other])
     together.advance()
     state = together.state()
     rows = together.advance()
@@ -49,7 +49,7 @@ def test_volumes_differ_and_numbers_do_not(still: Scene) -> None:
     for name in one:
         assert torch.equal(one[name], two[name]) == (name != "density")
     # It goes on from its state to the same bits.
-    again = Together([still, other])
+    again = Reconstruction(still, others=[other])
     again.restore(state)
     assert [row.loss for row in again.advance()] == [row.loss for row in rows]
     for run, resumed in zip(together.frames, again.frames, strict=True):

@@ -48,7 +48,7 @@ def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(b
     scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, **changes))
     run = Reconstruction(scene, 3)
     while not run.is_done:
-        asked = solve_tolerances(run.frame.misfit)
+        asked = solve_tolerances(run.frames[0].misfit)
         run.step()
         solves = [record for record in run.memory.records if record.kind != "rounds"]
         train, last = solves[:-2], solves[-2:]
@@ -56,4 +56,4 @@ def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(b
             least = asked[record.kind] / 100 if record.iterations else -1
             assert least < record.residual <= asked[record.kind]
     assert all(record.residual <= 1e-6 for record in last)  # diffusion's own, and the round's
-    assert 0 < run.frame.misfit < 1
+    assert 0 < run.frames[0].misfit < 1

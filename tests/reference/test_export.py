@@ -4,7 +4,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -57,21 +56,6 @@ def opened(path: Path, paths: int, *seeds: int) -> np.ndarray:
 def sky() -> EnvironmentLight:
     radiance = COLOR.view(3, 1, 1) * torch.arange(18, dtype=torch.float64).view(1, 3, 6)
     return EnvironmentLight(radiance, COLOR[2], 25 * COLOR[2])
-
-
-def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
-    scene = make_scene(random_values(3, 4, 5), sigma_a=random_values(3, 3, 4, 5, seed=1))
-    written = export_scene(scene, tmp_path / "scene.xml", may_exist=False)
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in written)
-    field = read_field(tmp_path / "scene.sigma_t.vol", "sigma_t")
-    expected = (scene.volume.sigma_a + scene.volume.sigma_s.view(3, 1, 1, 1)) * scene.volume.density
-    np.testing.assert_allclose(field.values, expected.permute(1, 2, 3, 0), rtol=1e-6)
-    np.testing.assert_allclose(field.bounds, scene.volume.grid.bounds_xyz, rtol=1e-6)
-    assert {
-        Path(node.attrib["value"])
-        for node in ElementTree.parse(tmp_path / "scene.xml").iter("string")
-        if "vol" in node.attrib["value"]
-    }
 
 
 @pytest.mark.parametrize("with_sky", [False, True])

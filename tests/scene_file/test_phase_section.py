@@ -56,15 +56,6 @@ def test_each_kind_is_built_and_written_back(
     assert all(map(torch.equal, again.numbers, phase.numbers))
 
 
-def test_g_is_short_for_henyey_greenstein(write: Callable[[str], Path]) -> None:
-    texts = (
-        changed(volume=VOLUME | {"g": 0.4}, optimize=None),
-        scene_with(type="henyey_greenstein", g=0.4),
-    )
-    scenes = [load_scene(write(text)) for text in texts]
-    assert scenes[0].volume.g == scenes[1].volume.g == torch.tensor(0.4)
-
-
 def test_a_table_of_another_scale_is_divided_with_a_warning(
     write: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -130,8 +130,6 @@ def test_focal_lengths_are_a_frames_own_before_those_of_its_file(
     ("shared", "own", "expected"),
     [
         ({"k1": -0.1, "k2": 0.02}, {"k1": 0.05}, OpencvSection(k1=0.05)),
-        ({"distortion_params": [-0.1, 0.02, 0, 0, 0, 0]}, {"k1": 0.05}, OpencvSection(k1=0.05)),
-        ({"k1": -0.1}, {"distortion_params": [0.05, 0, 0, 0, 0, 0]}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "OPENCV"}, OpencvSection(k1=0.05)),
         ({"k1": 0.05}, {"camera_model": "PINHOLE"}, None),
         ({"k1": 0.05}, {"is_fisheye": True}, FisheyeSection(k1=0.05)),
@@ -233,23 +231,19 @@ def test_names_are_legal_and_differ(
 
 
 SCALED = [[2 * x for x in row] for row in POSE[:3]] + POSE[3:]
-FISHEYE = {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0, 0, 0, 0, 1e-3, 0]}
+FISHEYE = {"camera_model": "OPENCV_FISHEYE", "p1": 1e-3}
 FLAT, TRAIN = frame(transform_matrix=POSE[:3]), {"train_filenames": ["a", "b"]}
 WRONG: list[tuple[list[Any], dict[str, Any], str]] = [
     ([frame()], {"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
-    ([frame()], FISHEYE, "distortion_params.4: p1 = 0.001 is not modeled"),
+    ([frame()], FISHEYE, "p1: p1 = 0.001 is not modeled"),
     ([frame()], {"camera_model": "EQUIRECTANGULAR"}, "camera_model: EQUIRECTANGULAR is a lens"),
     ([frame()], {"ftheta_p0": 0.0, "ftheta_p1": 0.01}, "ftheta_p1: is of a lens that is not"),
     ([frame(latlong=True)], {}, "frames.0.latlong: is of a lens that is not modeled; undistort"),
     ([frame()], {"equirectangular": True}, "equirectangular: is of a lens that is not modeled"),
     ([frame()], {"sk_x": 0.1}, "sk_x: is of a lens that is not modeled"),
     ([frame(K=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])], {}, "frames.0.K: is not read: write fl_x, fl_y"),
-    (
-        [frame()],
-        {"distortion_params": [0.1, 0, 0, 0]},
-        "distortion_params: expected k1, k2, k3, k4",
-    ),
     ([frame(dist_coeffs=[[0.1, 0]])], {}, "frames.0.dist_coeffs: is not read: write k1, k2"),
+    ([frame()], {"distortion_params": [0.1]}, "distortion_params: is not read: write k1, k2"),
     ([frame()], {"is_fisheye": "false"}, "is_fisheye: expected true or false"),
     ([frame()], {"x_fov": 180}, "x_fov: must be below 180"),
     ([frame()], {"fl_x": 0}, "fl_x: must be above 0"),
@@ -349,22 +343,17 @@ LENSES = {
 
 @pytest.mark.parametrize("model", LENSES)
 def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> None:
-    """Key by key or as a list; through our own scene files and transforms, to the same rays."""
-    lens, own = LENSES[model], {"camera_model": model}
-    listed = own | {"distortion_params": list(lens.values())}
+    """Through our own scene files and transforms, to the same rays."""
+    numbers = {"camera_model": model, **LENSES[model]}
     bare = {key: value for key, value in NERFSTUDIO.items() if key not in ("k1", "k2")}
-    rays = []
-    for numbers in (own | lens, listed):
-        scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **(bare | numbers)))
-        dump_scene(describe(scene_file), tmp_path / "dump.yaml")
-        assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
-        scene = build_scene(scene_file, dtype=torch.float64)
-        export_transforms(scene, scene_file, tmp_path / "again.json", may_exist=True)
-        again = read(changed(views={"transforms": "again.json"}))
-        for one in (scene, build_scene(again, dtype=torch.float64)):
-            rays.append(cast_rays(one.views[0].camera).direction)
-    for other in rays[1:]:
-        torch.testing.assert_close(other, rays[0], rtol=0, atol=1e-15)
+    scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **(bare | numbers)))
+    dump_scene(describe(scene_file), tmp_path / "dump.yaml")
+    assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
+    scene = build_scene(scene_file, dtype=torch.float64)
+    export_transforms(scene, scene_file, tmp_path / "again.json", may_exist=True)
+    again = build_scene(read(changed(views={"transforms": "again.json"})), dtype=torch.float64)
+    rays = [cast_rays(one.views[0].camera).direction for one in (scene, again)]
+    torch.testing.assert_close(*rays, rtol=0, atol=1e-15)
     read(transforms(tmp_path / "transforms.json", frame(None), **bare))
     pinhole = cast_rays(load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views[0].camera)
     assert (pinhole.direction - rays[0]).abs().max() > 1e-4

@@ -20,12 +20,14 @@ from io import StringIO
 from pathlib import Path
 
 import torch
-from tiny_scene import write_scene
+from small_scene import write_scene
 
 from ddrecon.cli.commands import main
 from ddrecon.run import job
 
 SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGKILL, signal.SIGINT]
+NUMBERS = ["-D", "optimize.parameters.g={init: 0.1}", "--iterations", "6"]
+NUMBERS += ["-D", "optimize.parameters.views.front.camera={}"]
 TOO_EARLY = "\nAborted!\n"
 """What click says of an interrupt before the command has begun."""
 EXPECTED = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 130, signal.SIGINT: 130}
@@ -63,7 +65,7 @@ def optimize(folder: Path, out: Path) -> None:
     is_begun = any(out.glob("checkpoints/[lp]*.pt"))  # not one half written
     going_on = ["--resume"] if is_begun else ["--overwrite"]
     scene, how = str(folder / "scene.yaml"), ["-q", "--preview-every", "4"]
-    main(["optimize", scene, *how, "-o", str(out), *going_on])
+    main(["optimize", scene, *how, "-o", str(out), *going_on, *NUMBERS])
 
 
 def ended(pid: int) -> int:

@@ -17,7 +17,7 @@ def test_no_fault_loses_anything(tmp_path: Path) -> None:
     """Of 4 signals two are SIGKILL, one SIGTERM and one Ctrl-C; twice there is no space."""
     found = subprocess.run(
         [sys.executable, SCRIPT, tmp_path, "4", "2"],
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
     )

@@ -10,10 +10,8 @@ from click.testing import Result
 
 from ddrecon import memory
 from ddrecon.cli.check import memory_estimate
-from ddrecon.io.volumes.table import write_field
 from ddrecon.memory import Needs, explain_shortage, usable_cores
 from ddrecon.run import render_folder
-from ddrecon.scene_file import build
 from ddrecon.scene_file.build import load_scene
 
 Run = Callable[..., Result]
@@ -32,10 +30,19 @@ LINE = (
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) -> None:
     text = Path("scene.yaml").read_text()
-    Path("scene.yaml").write_text(text.replace("[16, 4, 3]", "[1024, 1024, 1024]"))
+    Path("scene.yaml").write_text(text.replace("[6, 5, 4]", "[1024, 1024, 1024]"))
     result = run(*COMMANDS[command])
     assert (result.exit_code, result.stdout) == (2, "") and re.fullmatch(LINE + "\n", result.stderr)
     assert not Path("out").exists()
+
+
+def test_too_many_pixels_are_refused_where_they_were_asked_for(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "free_memory", lambda _: 60 * 2**20)
+    result = run(*COMMANDS["render"], "--size", "9999", "9999")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("--size 9999 9999: views: takes about ")
 
 
 def require_fit(run: Run, line: str, *command: str) -> None:
@@ -80,31 +87,6 @@ def test_smaller_images_are_said_to_fit_where_cells_do(
         Needs((20, 20, 20), 40, int(10**6 * share**2), 4).total for share in (width, 1.05 * width)
     ]
     assert fits[0] <= part * needs.total < fits[1]
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        [],
-        [
-            "volume.sigma_s=[1, 2, 3]",
-            "optimize.parameters={density: {}, sigma_s: {field: true}, sigma_a: {}}",
-        ],
-        ["diffusion.transport_rounds=2", "volume.density={file: density.npz}"],
-        ["diffusion.model=flux_limited"],
-    ],
-    ids=str,
-)
-def test_the_prediction_is_the_estimate(
-    run: Run, monkeypatch: pytest.MonkeyPatch, overrides: list[str]
-) -> None:
-    """What is predicted from the scene file alone is what `check` says of the tensors."""
-    bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
-    write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
-    predicted: list[Needs] = []
-    monkeypatch.setattr(build, "refuse_excess", lambda needs, _: predicted.append(needs))
-    scene = load_scene("scene.yaml", overrides=overrides)
-    assert predicted[0].total == memory_estimate(scene) > 0
 
 
 def write_group(folder: Path, files: dict[str, str]) -> None:

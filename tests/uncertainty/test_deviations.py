@@ -13,11 +13,10 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.picture import render
-from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
-from ddrecon.settings import OptimizeSettings, ParameterSettings
+from ddrecon.settings import NoiseSettings, OptimizeSettings, ParameterSettings
 from ddrecon.uncertainty.deviations import RATIO, Deviations, Field
 from ddrecon.uncertainty.experiments import Uncertainty
 
@@ -39,7 +38,7 @@ def found_of(values: dict[str, Tensor]) -> Uncertainty:
     return found
 
 
-def finished_run() -> Reconstruction:
+def finished_run(noise: NoiseSettings | None = None) -> Reconstruction:
     """One iteration from two pictures, an eighth off, of a medium that scatters many times."""
     eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
     rounds = {"transport_rounds": 1, "tolerance": 1e-6}
@@ -48,7 +47,8 @@ def finished_run() -> Reconstruction:
     images = render(replace(world, views=views))
     images = images * (0.75 + 0.5 * random_values(*images.shape))
     shown = [replace(view, image=image) for view, image in zip(views, images, strict=True)]
-    sought = OptimizeSettings(parameters={"density": ParameterSettings()}, iterations=1)
+    known = {"density": ParameterSettings()}
+    sought = OptimizeSettings(known, iterations=1, noise=noise)
     run = Reconstruction(replace(world, views=shown, optimize=sought))
     run.step()
     return run
@@ -56,15 +56,15 @@ def finished_run() -> Reconstruction:
 
 def test_an_experiment_is_photographed_closer_to_truth_and_errs_as_the_run_does() -> None:
     """By what the run leaves, or by noise that is known; at first the other way around."""
-    run = finished_run()
-    scene, diffusion = run.current_scene(), run.current_scene().diffusion
+    scene = finished_run().current_scene()
+    diffusion = scene.diffusion
     near, far = (
         render(replace(scene, diffusion=replace(diffusion, transport_rounds=rounds)))
         for rounds in (1, 12)
     )
     wrong = float((near - far).abs().mean())
-    for noise in (None, Noise(0.08, 0.0)):
-        found = Uncertainty(run, 0, noise=noise)
+    for noise in (None, NoiseSettings(read=0.08)):
+        found = Uncertainty(finished_run(noise), 0)
         for found.errors, signs in (([], [-1]), ([{}], [-1, 1])):
             views = found._begin().problem.train.views
             for view, given, as_run, true in zip(views, scene.views, near, far, strict=True):

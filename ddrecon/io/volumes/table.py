@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
 from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol
-from ddrecon.io.volumes.vdb_read import describe_vdb, read_vdb, vdb_names
+from ddrecon.io.volumes.vdb_read import read_vdb, vdb_names
 from ddrecon.io.volumes.vdb_write import write_vdb
 
 
@@ -24,19 +23,17 @@ class VolumeFormat:
     """How one kind of volume file is read and written.
 
     Without `names`, a file holds one field and does not name it; without `write` it is only read.
-    `describe` says what else is in it, for JSON.
     """
 
     write: Callable[[Path, Fields, np.ndarray], None] | None
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
-    describe: Callable[[Path], dict[str, Any]] | None = None
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, describe_vdb),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]

@@ -19,15 +19,12 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.volumes.field import VECTORS, Field, check_field
 from ddrecon.io.volumes.vdb_tree import (
-    ACTIVE_MASK,
-    BLOSC,
     NODE_MASKS,
     NOWHERE,
     ZIP,
@@ -55,7 +52,6 @@ MAPS = {
     **dict.fromkeys(("UnitaryMap", "AffineMap"), 16),
 }
 """How many numbers a transform has, by its type."""
-COMPRESSIONS = {ZIP: "zip", BLOSC: "Blosc", ACTIVE_MASK: "active values"}
 STEEPEST = 1e6
 """Steps whose matrix has a larger condition are no axes."""
 SAME_STEPS, SAME_PLACE = 1e-6, 0.01
@@ -83,21 +79,15 @@ class Grid:
     map: str
     steps: np.ndarray
     origin: np.ndarray
-    flags: int
     coding: Coding | None
     begin: int
 
     @property
-    def kind(self) -> str:
-        """Its class: fog volume, level set, staggered, unknown."""
-        return self.labels.get("class", b"unknown").decode(errors="replace")
-
-    @property
     def fault(self) -> str:
         """Why it cannot be read, "" where it can."""
-        if self.kind == "level set":
+        if self.labels.get("class") == b"level set":
             return "is a level set (distances): convert it to a fog volume first"
-        if self.kind == "staggered":
+        if self.labels.get("class") == b"staggered":
             return "is staggered (values on faces): resample it to centers of voxels first"
         if self.coding is None:
             return f"is of type {self.tree}; Tree_..._5_4_3 of {', '.join(NUMBERS)} are read"
@@ -163,7 +153,7 @@ class _File:
             number, is_half = np.dtype(NUMBERS[match[1]]), bool(match[2])
             stored = np.dtype("<f2") if is_half else number
             coding = Coding(self.version, flags, stored, number, 3 if "vec" in tree else 1)
-        return Grid(name, tree, parent, labels, kind, steps, origin, flags, coding, begin)
+        return Grid(name, tree, parent, labels, kind, steps, origin, coding, begin)
 
     def require(self, name: str) -> Grid:
         """The grid `name`; raises FormatError where it cannot be read."""
@@ -183,7 +173,7 @@ class _File:
 
     def measure(self, grid: Grid) -> np.ndarray:
         """The box [2, 3] of the voxels of `grid` that are active, or cells of ours."""
-        box, _ = self.tree_of(grid).measure()
+        box = self.tree_of(grid).measure()
         cells = grid.labels.get(RESOLUTION, b"")
         if len(cells) == 12 and min(sides := struct.unpack("<3i", cells)) > 0:
             box = join(box, np.array([[0, 0, 0], sides]))
@@ -224,25 +214,6 @@ def _read_map(stream: Stream, kind: str) -> tuple[np.ndarray, np.ndarray]:
 def vdb_names(path: Path) -> list[str]:
     """The names of the grids of the file at `path`; raises FormatError unless it can be read."""
     return list(_File(path).grids)
-
-
-def describe_vdb(path: Path) -> dict[str, Any]:
-    """The version of the file at `path`, and what each of its grids is, by name, for JSON."""
-    file, grids = _File(path), dict[str, dict[str, Any]]()
-    for name, grid in file.grids.items():
-        methods = [method for flag, method in COMPRESSIONS.items() if grid.flags & flag]
-        grids[name] = {"tree": grid.tree, "class": grid.kind, "compression": methods}
-        if grid.fault:
-            continue
-        box, count = file.tree_of(grid).measure()
-        grids[name] |= {
-            "active": count,
-            "voxels": (box if count else 0 * box).tolist(),
-            "transform": grid.map,
-            "voxel": np.linalg.norm(grid.steps, axis=1).tolist(),
-            "origin": grid.origin.tolist(),
-        }
-    return {"file_version": file.version, "grids": grids}
 
 
 def read_vdb(path: Path, name: str) -> Field:

@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -93,23 +94,20 @@ class Nodes:
     is_active: np.ndarray
     values: np.ndarray | None = None
 
-    def measure(self) -> tuple[np.ndarray, int]:
-        """The box [2, 3] of what is active, from its first voxels to behind its last, their number.
+    def measure(self) -> np.ndarray:
+        """The box [2, 3] of what is active, from its first voxels to behind its last.
 
         Without any, the first are behind the last.
         """
         is_some = self.is_active if self.is_active.ndim == 1 else self.is_active.any(1)
         corners, ends = self.corners[is_some], self.corners[is_some] + self.side
-        count = len(corners) * self.side**3
         if self.values is None:
             blocks = self.is_active[is_some].reshape(-1, SIDE, SIDE, SIDE)
-            count, starts = int(np.count_nonzero(blocks)), corners
+            starts = corners
             along = [np.asarray(blocks.any(others)) for others in ((2, 3), (1, 3), (1, 2))]
             corners = starts + np.stack([active.argmax(1) for active in along], 1)
             ends = starts + SIDE - np.stack([active[:, ::-1].argmax(1) for active in along], 1)
-        if not len(corners):
-            return NOWHERE, 0
-        return np.stack([corners.min(0), ends.max(0)]), count
+        return np.stack([corners.min(0), ends.max(0)]) if len(corners) else NOWHERE
 
 
 NOWHERE = np.array([[2**40] * 3, [-(2**40)] * 3])
@@ -221,13 +219,9 @@ class Tree:
             for child in children:
                 yield from self.read_node(child, *below)
 
-    def measure(self) -> tuple[np.ndarray, int]:
-        """The box [2, 3] of active voxels, as `Nodes.measure`, and their number."""
-        box, count = NOWHERE, 0
-        for nodes in self.read_topology():
-            box_of_nodes, active = nodes.measure()
-            box, count = join(box, box_of_nodes), count + active
-        return box, count
+    def measure(self) -> np.ndarray:
+        """The box [2, 3] of active voxels, as `Nodes.measure`."""
+        return reduce(join, (nodes.measure() for nodes in self.read_topology()), NOWHERE)
 
     def fill(self, values: np.ndarray, low: np.ndarray) -> None:
         """Writes the tree's values to `values` [x, y, z, C], the voxels from the index `low` on."""

@@ -49,25 +49,6 @@ def test_what_nobody_holds_blocks_nobody(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
-def test_of_several_processes_that_ask_at_once_one_goes_in(tmp_path: Path) -> None:
-    """Each counts those inside, over and over; never is there another."""
-    script = """
-inside, entered = folder / "inside", 0
-while entered < 100:
-    try:
-        with claim_folder(folder, 'run', overwrite=True):
-            os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
-            inside.unlink()
-            entered += 1
-    except UsageError as error:
-        assert "is writing there" in str(error), error
-"""
-    command = [sys.executable, "-c", SCRIPT + script, tmp_path]
-    processes = [subprocess.Popen(command) for _ in range(3)]
-    assert [process.wait() for process in processes] == [0, 0, 0]
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / LOCK).mkdir()
     with pytest.raises(UsageError, match=f"{LOCK}: cannot be locked: Is a directory"):

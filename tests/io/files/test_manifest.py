@@ -73,14 +73,6 @@ def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     assert contents(tmp_path) == before
 
 
-def test_a_folder_of_others_that_is_overwritten_keeps_what_they_wrote(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with claim_folder(tmp_path, RUN, overwrite=True) as folder:
-        folder.clear()
-        write_json(tmp_path / "summary.json", 0)
-    assert set(contents(tmp_path)) == {MANIFEST, "notes.txt", "summary.json"}
-
-
 def test_a_manifest_names_nothing_outside(tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_text("mine")

@@ -108,21 +108,6 @@ def test_a_profile_counts_in_every_format(tmp_path: Path, suffix: str) -> None:
         assert np.array_equal(read_image(wide).pixels, expected)
 
 
-@pytest.mark.parametrize("gamma", [1.0, 1.8])
-def test_a_gray_profile_counts(tmp_path: Path, gamma: float) -> None:
-    """It has a white and one curve, a gamma, which is linear or another than sRGB's."""
-    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + b"\0\0"
-    white = b"XYZ \0\0\0\0" + struct.pack(">3i", 63190, 65536, 54061)  # of D50, in 1/65536
-    table = struct.pack(">I4sII4sII", 2, b"kTRC", 156, 14, b"wtpt", 172, 20)
-    head = icc_profile()[4:128].replace(b"RGB ", b"GRAY")
-    profile = struct.pack(">I", 192) + head + table + curve + white
-    Pillow.new("L", (4, 4), 99).save(tmp_path / "a.png", icc_profile=profile)
-    if gamma == 1:
-        assert np.allclose(read_silently(tmp_path / "a.png").pixels, 99 / 255)
-    else:
-        assert "color profile" in image_refusal(tmp_path / "a.png")
-
-
 @pytest.mark.parametrize("said", [{"cHRM": chrm(DISPLAY_P3)}, {"cICP": bytes([12, 13, 0, 1])}])
 def test_other_primaries_are_said_and_colors_taken(tmp_path: Path, said: dict[str, bytes]) -> None:
     samples = np.full((2, 2, 3), (200, 100, 50))
@@ -159,16 +144,6 @@ def test_turned_pictures_are_taken_as_stored_and_said_once_a_folder(
         told |= {str(each.message) for each in caught}
         assert image.size == (16, 32) and image.pixels[2, 2, 0] > 0.9 > image.pixels[12, 28, 0]
     assert len(told) == 1 and str(tmp_path / f"*{suffix}") in told.pop()
-
-
-def test_a_turn_of_sixteen_bits_is_said(tmp_path: Path) -> None:
-    pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
-    exif = Pillow.Exif()
-    exif[0x112] = 3
-    path = tmp_path / "a.png"
-    write_png(path, np.ones((2, 2, 3), int), 16, eXIf=exif.tobytes().removeprefix(b"Exif\0\0"))
-    with pytest.warns(DataWarning, match="EXIF orientation 3"):
-        read_image(path)
 
 
 def test_a_camera_that_says_adobe_rgb_by_exif_alone_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Images: linear round trips, sRGB decoding, alpha, and refusals that say where the flaw is."""
 
-import sys
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -74,15 +73,6 @@ def test_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ..
     np.save(tmp_path / "a.npy", np.zeros(shape))
     with pytest.raises(FormatError, match=r"expected \[h, w\]"):
         read_image(tmp_path / "a.npy")
-
-
-def test_without_openimageio_linear_files_are_arrays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    pixels = pixels_of(4, 2, 3, 3)
-    assert write_linear(tmp_path / "b", pixels) == [tmp_path / "b.npy"]
-    assert np.array_equal(read_image(tmp_path / "b.npy").pixels, pixels)
 
 
 def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
@@ -183,12 +173,6 @@ def test_all_sixteen_bits_are_kept(tmp_path: Path, channels: int):
     np.testing.assert_allclose(image.pixels, np.broadcast_to(linear * alpha, (7, 5, 3)), atol=1e-6)
     assert image.step == 1 / 65535 and (image.coverage is not None) == has_alpha
     assert not has_alpha or np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
-
-
-def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
-    Pillow.new("CMYK", (4, 4)).save(tmp_path / "a.jpg")
-    with pytest.raises(FormatError, match="CMYK"):
-        read_image(tmp_path / "a.jpg")
 
 
 def save_mask(path: Path, inside: np.ndarray, mode: str) -> np.ndarray:

@@ -9,7 +9,7 @@ import openvdb_python
 import pytest
 from refusals import refusal
 
-from ddrecon.errors import DataWarning, FormatError
+from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
@@ -68,16 +68,6 @@ def test_cells_lie_where_openvdb_has_them(
     ((name, first, size),) = openvdb_python.described(facts, path)
     sides = (BOUNDS[1] - BOUNDS[0]) / shape[::-1]
     assert name == kind and np.allclose(size, sides) and np.allclose(first, BOUNDS[0] + sides / 2)
-
-
-def test_fields_of_a_file_are_read_by_name(tmp_path: Path) -> None:
-    fields = {"density": sparse(3, 130, 5, 3), "full": np.ones((3, 130, 5), np.float32)}
-    path = written(tmp_path / "smoke.vdb", **fields)
-    assert field_names(path) == list(fields)
-    for name, values in fields.items():
-        assert np.array_equal(read_field(path, name).values, values)
-    with pytest.raises(FormatError, match="no field 'lwc'; it has 'density', 'full'"):
-        read_field(path, "lwc")
 
 
 @pytest.mark.parametrize("colors", [(), (3,)])

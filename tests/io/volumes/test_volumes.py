@@ -63,10 +63,6 @@ def test_what_is_no_field_is_refused_with_advice(
     assert told in refusal(tmp_path / "f.npz")
 
 
-def test_unknown_suffixes_list_the_known(tmp_path: Path) -> None:
-    assert ".npz" in refusal(tmp_path / "f.txt")
-
-
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 
 

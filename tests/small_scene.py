@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
+
+from ddrecon.io.volumes.table import write_field
+
 SCENE = """\
 volume:
   bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}
@@ -32,3 +36,16 @@ def contents(folder: Path) -> dict[str, bytes | None]:
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in folder.rglob("*")
     }
+
+
+def write_scene(folder: Path) -> Path:
+    """Writes the scene, its images front.npy and side.npy, and density.npz; its path."""
+    y, x = np.mgrid[-1:1:6j, -1:1:8j]
+    picture = np.maximum(0.5 - x**2 - y**2, 0.1)[..., None] * [1.0, 0.8, 0.6]
+    for name in ("front", "side"):
+        np.save(folder / f"{name}.npy", picture.astype(np.float32))
+    values = np.random.default_rng(0).random((4, 5, 6))
+    write_field(folder / "density.npz", "density", values, np.array([[-0.5] * 3, [0.5] * 3]))
+    path = folder / "scene.yaml"
+    path.write_text(SCENE)
+    return path
