@@ -6,6 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import openvdb_python
 import pytest
 from click.testing import Result
 from small_scene import contents
@@ -89,9 +90,11 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
     constants = "sigma_t 6.5 5.5 4.5, albedo 0.923077 0.909091 0.888889, g 0.3"
     assert succeed("export", "run", "-o", "run.vdb").stdout.splitlines() == [
-        f"fields: density; the same everywhere, not written: {constants}",
+        f"fields: density; the same everywhere, metadata: {constants}",
         "written: run.vdb",
     ]
+    told = openvdb_python.described("[grids['density'][n] for n in ('sigma_t', 'g')]", "run.vdb")
+    assert told == [[6.5, 5.5, 4.5], pytest.approx(0.3)]
     files = "run.vdb", "run/volumes/density.npz"
     ours, theirs = (read_field(Path(name), "density") for name in files)
     assert np.array_equal(ours.values, theirs.values) and np.array_equal(ours.bounds, theirs.bounds)
