@@ -22,11 +22,10 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
-from ddrecon.report.volumes import Shown, describe_volume, find_white_value
+from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.quality import Findings, shift_between
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import fields_of
 
 SHOWN = 24
@@ -92,8 +91,10 @@ def list_numbers(
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
             rows.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
-            begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
-            rows.append((parameter.name, begun, ended))
+            pairs = list(zip(start.tolist(), value.tolist(), strict=True))
+            ended = (f"{y:.4g}" + (f" ({y / x - 1:+.1%})" if x else "") for x, y in pairs)
+            begun = (f"{x:.4g}" for x, _ in pairs)
+            rows.append((parameter.name, ", ".join(begun), ", ".join(ended)))
     return rows
 
 
@@ -139,18 +140,15 @@ def describe_fields(
 
     Those of one name have one scale.
     """
-    z, y, x = scene.volume.grid.extent
     whites = dict[str, float]()
     for name, value in ((n, v) for values in kinds.values() for n, v in values.items()):
         whites[name] = max(whites.get(name, 0.0), find_white_value(value))
     fields = [
-        Shown(name, of, value, (x, y, z), whites[name])
+        Shown(name, of, value, whites[name])
         for of, values in kinds.items()
         for name, value in values.items()
     ]
-    pose = scene.views[0].camera.pose.detach()
-    towards = pose[:, 3] - pose.new_tensor(scene.volume.grid.center_xyz)
-    return describe_volume(fields, upright_axis(scene), towards.tolist(), lines, shown)
+    return describe_volume(fields, describe_world(scene.volume.grid, scene), lines, shown)
 
 
 def curves(rows: Sequence[Row]) -> list[Plot]:

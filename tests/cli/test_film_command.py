@@ -123,9 +123,16 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
     assert [row["frame"] for row in record["frames"]] == list(range(FRAMES)) == list(range(4))
     assert all(1 <= row["iterations"] <= 24 for row in record["frames"])
     assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
-    assert {"report.html", "film.json", "shared.json", "movie.png"} <= {
-        path.name for path in Path("out").iterdir()
-    }
+    assert {"report.html", "film.json", "shared.json"} <= {p.name for p in Path("out").iterdir()}
+    # Its page has the volume of each frame beside its pictures.
+    page = Path("out/report.html").read_text()
+    data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)
+    fields = [json.loads(text) for text in data]
+    assert [[field["name"], field["frame"]] for field in fields] == [
+        ["density", n] for n in range(4)
+    ]
+    assert len({field["data"] for field in fields}) == 4 and len({f["white"] for f in fields}) == 1
+    assert 'data-frames="[0, 1, 2, 3]"' in page and '"name": "side"' in page
     # What is shared is the same in all frames, and known for what it is.
     shared = json.loads(Path("out/shared.json").read_text())
     assert shared["frames"] == [0, 3]

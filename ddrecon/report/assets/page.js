@@ -33,32 +33,47 @@ function listenToControls() {
       redrawAll();
     });
   }
-  for (const slider of document.querySelectorAll("figure.slice input"))
-    slider.addEventListener("input", () => drawSlices(shownField));
+  const from = document.querySelector("#from");
+  from.append(...world.cameras.map(({ name }, index) => new Option(name, index)));
+  from.parentElement.hidden = !world.cameras.length;
+  from.addEventListener("change", () => {
+    lookFrom(world.cameras[from.value].corners[0]);
+    redrawAll();
+  });
+  document.querySelector("#cameras").addEventListener("change", (event) => {
+    sight.cameras = event.target.checked;
+    redrawAll();
+  });
+  listenToSlices();
 }
 
 async function makeAlive() {
   for (const pair of document.querySelectorAll(".pair")) makeWiper(pair);
+  makeExposure();
   const room = document.querySelector("#viewers");
   if (!room || !window.DecompressionStream || !(await readFields())) return;
   const kinds = [...new Set([...fields.values()].map((field) => field.of))];
   document.body.classList.add("alive");
   shownField = room.dataset.shown;
   sight.palette = shownField === "density" ? 0 : 1;
-  lookFrom(room.dataset.eye, Number(room.dataset.up));
+  Object.assign(world, JSON.parse(document.querySelector("#world").textContent));
+  lookFrom(world.eye);
   for (const kind of kinds) {
     const figure = document.createElement("figure");
-    const canvas = document.createElement("canvas");
+    const [behind, canvas, before] = [0, 1, 2].map(() => document.createElement("canvas"));
+    const stage = document.createElement("div");
+    stage.className = "stage";
+    stage.append(behind, canvas, before);
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application");
     canvas.setAttribute("aria-roledescription", "volume");
     const caption = document.createElement("figcaption");
     caption.textContent = kind === "truth" ? "in the scene file" : "reconstructed";
     canvas.setAttribute("aria-label", `${caption.textContent}: arrow keys turn, + and - zoom`);
-    figure.append(canvas, ...(kinds.length > 1 ? [caption] : []));
+    figure.append(stage, ...(kinds.length > 1 ? [caption] : []));
     room.append(figure);
     try {
-      new Viewer(canvas, kind, Number(room.dataset.up));
+      new Viewer(canvas, kind, [behind, before]);
     } catch (error) {
       figure.remove();
       document.body.classList.add("flat"); // no WebGL 2: pictures stay
@@ -68,6 +83,7 @@ async function makeAlive() {
   fillControls();
   listenToControls();
   showField();
+  makeFilm();
 }
 
 makeAlive();
