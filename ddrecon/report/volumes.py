@@ -26,7 +26,7 @@ MOST_CELLS, MOST_OF_PAGE = 1_000_000, 4_000_000
 """A field of more cells is made coarser, by whole factors, and so are those of a page together."""
 SIDEWAYS = (1.3, 1.0, 2.5)
 """Where a volume without cameras is seen from."""
-REACH, FARTHEST = 0.3, 2.0
+REACH, FARTHEST = 0.25, 2.0
 """How far a camera's frustum is drawn, as part of its distance from the volume's middle, which for
 an orthographic one is at most so many of the box's longest sides."""
 

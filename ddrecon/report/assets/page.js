@@ -3,24 +3,19 @@
 
 let shownField;
 
-function fillControls() {
-  const select = document.querySelector("#field");
-  const names = [...new Set([...fields.values()].map((field) => field.name))];
-  if (select.options.length !== names.length)
-    select.replaceChildren(...names.map((name) => new Option(name, name)));
-  if (!names.includes(shownField)) shownField = names[0];
-  select.value = shownField;
-  select.parentElement.hidden = names.length < 2;
-}
-
 function showField() {
   for (const viewer of viewers) if (fields.has(`${viewer.of} density`)) viewer.show(shownField);
   drawSlices(shownField);
 }
 
 function listenToControls() {
-  document.querySelector("#field").addEventListener("change", (event) => {
-    shownField = event.target.value;
+  const select = document.querySelector("#field");
+  const names = [...new Set([...fields.values()].map((field) => field.name))];
+  if (!names.includes(shownField)) shownField = names[0];
+  select.append(...names.map((name) => new Option(name, name, false, name === shownField)));
+  select.parentElement.hidden = names.length < 2;
+  select.addEventListener("change", () => {
+    shownField = select.value;
     sight.palette = shownField === "density" ? sight.palette : 1;
     document.querySelector("#palette").value = sight.palette;
     showField();
@@ -33,14 +28,11 @@ function listenToControls() {
       redrawAll();
     });
   }
-  const from = document.querySelector("#from");
-  from.append(...world.cameras.map(({ name }, index) => new Option(name, index)));
-  from.parentElement.hidden = !world.cameras.length;
-  from.addEventListener("change", () => {
-    lookFrom(world.cameras[from.value].corners[0]);
+  document.querySelector("#from")?.addEventListener("change", (event) => {
+    lookFrom(world.cameras[event.target.value].corners[0]);
     redrawAll();
   });
-  document.querySelector("#cameras").addEventListener("change", (event) => {
+  document.querySelector("#cameras")?.addEventListener("change", (event) => {
     sight.cameras = event.target.checked;
     redrawAll();
   });
@@ -80,7 +72,6 @@ async function makeAlive() {
       console.warn(error);
     }
   }
-  fillControls();
   listenToControls();
   showField();
   makeFilm();

@@ -32,9 +32,10 @@ function drawSlice(canvas, field, axis, cut) {
 
 // Draws every slice of the page, of the field `name`, and says what is in the cell where they meet.
 function drawSlices(name) {
-  const { size } = fields.get(`result ${name}`);
+  const { size, signed, white } = fields.get(`result ${name}`);
   const cut = size.map((count, axis) => Math.min(count - 1, Math.floor(slider(axis).value * count)));
-  const at = cut.map((index, axis) => world.low[axis] + ((index + 0.5) / size[axis]) * world.sides[axis]);
+  const at = cut.map((index, i) => round(world.low[i] + ((index + 0.5) / size[i]) * world.sides[i]));
+  const told = [];
   for (const figure of document.querySelectorAll("figure.slice")) {
     const axis = Number(figure.dataset.axis);
     const count = size[axis];
@@ -42,32 +43,21 @@ function drawSlices(name) {
     for (const canvas of figure.querySelectorAll("canvas")) {
       const field = fields.get(`${canvas.dataset.of} ${name}`);
       canvas.hidden = !field;
-      if (field) drawSlice(canvas, field, axis, cut);
+      if (!field) continue;
+      drawSlice(canvas, field, axis, cut);
+      if (axis === 0) told.push(valueOf(field, ...cut).map(round).join(", "));
     }
     const [across, upwards] = SIDES[axis].map((i) => `${"xyz"[i]} ${round(world.sides[i])}`);
-    const place = `${"xyz"[axis]} = ${round(at[axis])}: cell ${cut[axis]} of ${count}`;
+    const place = `${"xyz"[axis]} = ${at[axis]}: cell ${cut[axis]} of ${count}`;
     figure.querySelector("output").textContent = `${place}; ${across} to the right, ${upwards} up`;
     slider(axis).setAttribute("aria-valuetext", place);
   }
-  const texts = ["result", "truth"].map((of) => fields.get(`${of} ${name}`)).filter(Boolean)
-    .map((field) => `${field.of === "truth" ? "in the scene file " : ""}${valueOf(field, ...cut).map(round).join(", ")}`);
-  document.querySelector("#cell").textContent = `${name} at ${at.map(round).join(", ")}: ${texts.join("; ")}`;
-  drawScale(fields.get(`result ${name}`));
-}
-
-// The scale of the slices, and that of the viewer's colors for values.
-function drawScale({ signed, white }) {
-  const bars = signed ? ["#2149b2, #fff, #b21721"] : ["#000, #fff", "#0a082e, #781c6e, #e65c30, #fccc59, #fcffd9"];
-  const scale = document.querySelector("#scale");
-  scale.replaceChildren(...bars.map((colors) => {
-    const bar = document.createElement("i");
-    bar.style.background = `linear-gradient(to right, ${colors})`;
-    return bar;
-  }), ...EVEN.map((part) => {
-    const tick = document.createElement("span");
-    tick.textContent = round(white * (signed ? 2 * part - 1 : linear(part)));
-    return tick;
-  }));
+  document.querySelector("#cell").textContent =
+    `${name} at ${at.join(", ")}: ${told.join("; in the scene file ")}`;
+  // The scale of the slices, and that of the viewer's colors for values.
+  document.querySelector("#scale").className = signed ? "signed" : "";
+  EVEN.forEach((part, i) => (document.querySelectorAll("#scale span")[i].textContent =
+    round(white * (signed ? 2 * part - 1 : linear(part)))));
 }
 
 // A touch of a slice moves the other two to where it is.

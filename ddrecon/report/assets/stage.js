@@ -3,6 +3,7 @@
 "use strict";
 
 const world = {}; // up, eye, light, low, sides, cameras: as ddrecon says
+const CAMERA = "#ffd479";
 const AXES = ["#ff7b6b", "#7fd67f", "#7fb2ff"];
 const EDGES = [0, 1, 2].flatMap((axis) => [0, 1, 2, 3].map((place) => {
   const ends = [[0, 0, 0], [0, 0, 0]];
@@ -21,60 +22,46 @@ function drawAround(layers, { eye, right, up, forward }, tangent) {
   const contexts = layers.map((canvas) => {
     [canvas.width, canvas.height] = [width, height].map((side) => side * devicePixelRatio);
     const context = canvas.getContext("2d");
+    context.scale(devicePixelRatio, devicePixelRatio);
     context.font = "12px system-ui, sans-serif";
     return context;
   });
-  const scale = height / 2 / tangent;
-  const place = (point) => {
+  const place = (point) => { // to the right, down, and away from the eye
     const away = point.map((part, axis) => part - eye[axis]);
     const depth = dot(away, forward);
-    const to = scale / Math.max(depth, 1e-6);
-    return [width / 2 + dot(away, right) * to, height / 2 - dot(away, up) * to, depth];
+    const scale = height / 2 / tangent / Math.max(depth, 1e-6);
+    return [width / 2 + dot(away, right) * scale, height / 2 - dot(away, up) * scale, depth];
   };
-  const middle = Math.hypot(...eye);
-  const pick = (points) => { // the canvas for these, at their place; none for what is behind the eye
-    if (points.some((point) => point[2] < 0.02)) return undefined;
+  // Draws `points` as a line of a `color`, with a `text` at its end, or an `image` between them.
+  const draw = (points, color, text = "", image = undefined) => {
+    if (points.some(([, , depth]) => depth < 0.02)) return;
     const depth = points.reduce((sum, point) => sum + point[2] / points.length, 0);
-    const context = contexts[depth > middle ? 0 : 1];
-    context.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
-    return context;
-  };
-  const draw = (points, color) => {
-    const context = pick(points);
-    if (!context) return;
-    context.strokeStyle = color;
-    context.beginPath();
-    points.forEach(([x, y]) => context.lineTo(x, y));
-    context.stroke();
-  };
-  const write = (text, point, color) => {
-    const context = pick([point]);
-    if (!context) return;
-    context.fillStyle = color;
-    context.fillText(text, point[0] + 4, point[1] + 12);
-  };
-  const longest = Math.max(...world.sides);
-  for (const { axis, ends, isFirst } of EDGES) {
-    const corners = ends.map((end) => end.map((part, i) => (part - 0.5) * world.sides[i] / longest));
-    const points = corners.map(place);
-    draw(points, isFirst ? AXES[axis] : "#fff5");
-    if (isFirst) write(`${"xyz"[axis]} ${round(world.low[axis] + world.sides[axis])}`, points[1], AXES[axis]);
-    if (isFirst && axis === 0) write(world.low.map(round).join(", "), points[0], "#fffb");
-  }
-  if (!sight.cameras) return;
-  for (const { name, corners } of world.cameras) {
-    const [from, ...ends] = corners.map(place);
-    const context = pick([from, ...ends]);
-    const image = pictureOf(name);
-    if (context && image) {
-      const [[x, y], [rightX, rightY], , [downX, downY]] = ends;
+    const context = contexts[depth > Math.hypot(...eye) ? 0 : 1];
+    if (image) {
+      const [[x, y], [rightX, rightY], , [downX, downY]] = points;
       context.save();
       context.transform(rightX - x, rightY - y, downX - x, downY - y, x, y);
       context.drawImage(image, 0, 0, 1, 1);
       context.restore();
     }
-    ends.forEach((end, i) => draw([from, end, ends[(i + 1) % 4]], "#ffd479"));
-    write(name, ends[3], "#ffd479");
+    [context.strokeStyle, context.fillStyle] = [color, color];
+    context.beginPath();
+    for (const point of points) context.lineTo(point[0], point[1]);
+    context.stroke();
+    context.fillText(text, points.at(-1)[0] + 4, points.at(-1)[1] + 12);
+  };
+  const longest = Math.max(...world.sides);
+  for (const { axis, ends, isFirst } of EDGES) {
+    const corners = ends.map((end) => end.map((part, i) => ((part - 0.5) * world.sides[i]) / longest));
+    const text = isFirst ? `${"xyz"[axis]} ${round(world.low[axis] + world.sides[axis])}` : "";
+    draw(corners.map(place), isFirst ? AXES[axis] : "#fff5", text);
+    if (isFirst && axis === 0) draw([place(corners[0])], "#fffb", world.low.map(round).join(", "));
+  }
+  for (const { name, corners } of sight.cameras ? world.cameras : []) {
+    const [from, ...ends] = corners.map(place);
+    draw(ends, CAMERA, "", pictureOf(name));
+    for (const end of ends) draw([from, end], CAMERA);
+    draw([ends[0], ends[3]], CAMERA, name);
   }
 }
 

@@ -114,7 +114,6 @@ class Viewer {
   show(name) {
     const density = fields.get(`${this.of} density`) ?? fields.get(`${this.of} ${name}`);
     const shown = fields.get(`${this.of} ${name}`) ?? density;
-    this.isReady = true;
     this.upload("density", density);
     this.upload("values", shown);
     this.hasColors = shown.channels === 3;
@@ -138,7 +137,7 @@ class Viewer {
     this.isMoving = isMoving;
     this.frame ??= requestAnimationFrame(() => {
       this.frame = undefined;
-      if (this.isReady) this.draw();
+      if (this.textures.values) this.draw();
     });
   }
 
@@ -229,7 +228,7 @@ class Viewer {
 // Looks from where `eye` (x, y, z) is, or nearer, before a picture there.
 function lookFrom(eye) {
   const [sideways, upwards, towards] = [2, 0, 1].map((more) => eye[(world.up + more) % 3]);
-  sight.distance = Math.min(2, 0.68 * Math.hypot(...eye));
+  sight.distance = Math.min(2, 0.73 * Math.hypot(...eye));
   sight.yaw = Math.atan2(sideways, towards);
   sight.pitch = Math.atan2(upwards, Math.hypot(sideways, towards));
 }
