@@ -66,8 +66,7 @@ def describe_world(grid: Grid, scene: Scene | None) -> dict[str, Any]:
         height, width = view.camera.size
         last = height * width - 1
         rays = cast_rays(view.camera).select(torch.tensor([0, width - 1, last, last + 1 - width]))
-        pair = (array_order(vectors).detach().cpu() for vectors in (rays.origin, rays.direction))
-        origin, direction = pair
+        origin, direction = (array_order(v).detach().cpu() for v in (rays.origin, rays.direction))
         far = float((origin.mean(0) - middle).norm())
         if not view.camera.is_perspective:
             origin = origin + max(0.0, far - FARTHEST * longest) * direction

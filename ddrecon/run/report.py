@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
@@ -34,6 +35,7 @@ PIXELS = 1_200_000
 """The most pixels that all pictures of views have together."""
 GOES_ON = {"kind": "running", "text": "goes on"}
 """The `ended` of a run that still goes on."""
+SURE = "How sure they are, experiments say: ddrecon uncertainty RUN -o OUTPUT."
 LISTED = 12
 """More numbers of one parameter are not listed."""
 FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"
@@ -57,6 +59,7 @@ def write_run_report(
     scene = findings.scene
     versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     table = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
+    table["text"] = SURE
     write_page(
         path,
         title=f"ddrecon: {path.absolute().parent.name}",
@@ -91,11 +94,19 @@ def list_numbers(
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
             rows.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
-            pairs = list(zip(start.tolist(), value.tolist(), strict=True))
-            ended = (f"{y:.4g}" + (f" ({y / x - 1:+.1%})" if x else "") for x, y in pairs)
-            begun = (f"{x:.4g}" for x, _ in pairs)
-            rows.append((parameter.name, ", ".join(begun), ", ".join(ended)))
+            rows.append((parameter.name, *_tell_change(start, value, parameter.key == "direction")))
     return rows
+
+
+def _tell_change(start: Tensor, value: Tensor, is_direction: bool) -> tuple[str, str]:
+    """The numbers `start` [n], and those found, with their changes: parts of them, or an angle."""
+    pairs = list(zip(start.tolist(), value.tolist(), strict=True))
+    parts = ["" if is_direction or not x else f" ({y / x - 1:+.1%})" for x, y in pairs]
+    found = ", ".join(f"{y:.4g}{part}" for (_, y), part in zip(pairs, parts, strict=True))
+    if is_direction:
+        apart = float(torch.nn.functional.cosine_similarity(start.double(), value.double(), dim=0))
+        found += f" (turned by {math.degrees(math.acos(min(1.0, apart))):.2g} degrees)"
+    return ", ".join(f"{x:.4g}" for x in start.tolist()), found
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:

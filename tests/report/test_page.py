@@ -229,8 +229,6 @@ console.log(JSON.stringify(JSON.parse(fs.readFileSync(0, "utf8")).map(read)));
 
 def test_pages_read_out_what_a_cell_holds() -> None:
     """Within half a step of the eight bits that they have, of signed fields as well."""
-    if (node := shutil.which("node")) is None:
-        pytest.skip("no node here to run the scripts of a page")
     row, signed = torch.linspace(0, 2, 9), torch.linspace(-0.6, 0.6, 9)
     fields = [
         Shown("density", "result", row.view(1, 1, 9), 2.0),
@@ -240,12 +238,49 @@ def test_pages_read_out_what_a_cell_holds() -> None:
     contents = embedded(*fields)
     for content in contents:
         content["bytes"] = content.pop("cells").ravel().tolist()
-    command, told = [node, "-e", SCRIPT, str(ASSETS / "volumes.js")], json.dumps(contents)
-    done = subprocess.run(command, input=told, check=True, capture_output=True, text=True)
-    density, albedo, g = (np.array(values) for values in json.loads(done.stdout))
+    density, albedo, g = map(np.array, run_script("volumes.js", SCRIPT, contents))
     np.testing.assert_allclose(density[:, 0], row, atol=0.01)
     np.testing.assert_allclose(albedo, np.stack([row, row / 2, row / 4], -1), atol=0.01)
     np.testing.assert_allclose(g[:, 0], signed, atol=0.005)
+
+
+STAGE = """
+const fs = require("fs");
+globalThis.devicePixelRatio = 1;
+globalThis.document = { querySelectorAll: () => [] };
+globalThis.sight = { cameras: true };
+const drawn = [[], []];
+const contexts = drawn.map((points) => new Proxy(
+  { lineTo: (x, y) => points.push([x, y]) }, { get: (own, key) => own[key] ?? (() => 0) }));
+const layers = contexts.map(
+  (context) => ({ clientWidth: 300, clientHeight: 200, getContext: () => context }));
+const text = fs.readFileSync(process.argv[1], "utf8");
+const [world, drawAround] = new Function(`${text} return [world, drawAround];`)();
+Object.assign(world, { low: [0, 0, 0], sides: [2, 2, 2], cameras: [] });
+const sides = { eye: [0, 0, 2], right: [1, 0, 0], up: [0, 1, 0], forward: [0, 0, -1] };
+drawAround(layers, sides, 0.5);
+console.log(JSON.stringify(drawn));
+"""
+
+
+def test_a_box_is_drawn_where_an_eye_sees_its_corners() -> None:
+    """A cube of two units, from two boxes away: its far half behind the smoke, the near before."""
+    told = run_script("stage.js", STAGE)
+    for points, depth in zip(told, (2.5, 1.5), strict=True):
+        seen = {tuple(np.round(point, 6)) for point in points}
+        reach = round(0.5 / depth / 0.5 * 100, 6)
+        corners = {(150 + a * reach, 100 + b * reach) for a in (-1, 1) for b in (-1, 1)}
+        assert {tuple(np.round(corner, 6)) for corner in corners} <= seen
+
+
+def run_script(name: str, code: str, told: object = None) -> Any:
+    """What `code` prints as JSON, given the path of the script `name` and what it is `told`."""
+    if (node := shutil.which("node")) is None:
+        pytest.skip("no node here to run the scripts of a page")
+    command = [node, "-e", code, str(ASSETS / name)]
+    done = subprocess.run(command, input=json.dumps(told), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 def framed(text: str) -> str:

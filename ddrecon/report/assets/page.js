@@ -42,6 +42,7 @@ function listenToControls() {
 async function makeAlive() {
   for (const pair of document.querySelectorAll(".pair")) makeWiper(pair);
   makeExposure();
+  makeFilm();
   const room = document.querySelector("#viewers");
   if (!room || !window.DecompressionStream || !(await readFields())) return;
   const kinds = [...new Set([...fields.values()].map((field) => field.of))];
@@ -56,6 +57,7 @@ async function makeAlive() {
     const stage = document.createElement("div");
     stage.className = "stage";
     stage.append(behind, canvas, before);
+    behind.ariaHidden = before.ariaHidden = "true";
     canvas.tabIndex = 0;
     canvas.setAttribute("role", "application");
     canvas.setAttribute("aria-roledescription", "volume");
@@ -74,7 +76,6 @@ async function makeAlive() {
   }
   listenToControls();
   showField();
-  makeFilm();
 }
 
 makeAlive();
