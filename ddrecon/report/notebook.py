@@ -9,7 +9,7 @@ from ddrecon.report.page import page_text
 from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.scene import Scene
 
-HEIGHT = 600
+HEIGHT = 640
 """Pixels of the frame."""
 FIELDS = ("density", "sigma_a", "sigma_s")
 

@@ -58,6 +58,8 @@ function drawAround(layers, { eye, right, up, forward }, tangent) {
     if (isFirst && axis === 0) draw([place(corners[0])], "#fffb", world.low.map(round).join(", "));
   }
   for (const { name, corners } of sight.cameras ? world.cameras : []) {
+    const aside = dot(corners[0], eye) / Math.hypot(...corners[0]) / Math.hypot(...eye);
+    if (aside > 0.97) continue; // it would stand in the way
     const [from, ...ends] = corners.map(place);
     draw(ends, CAMERA, "", pictureOf(name));
     for (const end of ends) draw([from, end], CAMERA);

@@ -225,10 +225,9 @@ class Viewer {
   }
 }
 
-// Looks from where `eye` (x, y, z) is, or nearer, before a picture there.
+// Looks from the side where `eye` (x, y, z) is.
 function lookFrom(eye) {
   const [sideways, upwards, towards] = [2, 0, 1].map((more) => eye[(world.up + more) % 3]);
-  sight.distance = Math.min(2, 0.73 * Math.hypot(...eye));
   sight.yaw = Math.atan2(sideways, towards);
   sight.pitch = Math.atan2(upwards, Math.hypot(sideways, towards));
 }
