@@ -9,9 +9,10 @@ from typing import Any
 
 from ddrecon.cameras import CELL, cell_width
 from ddrecon.engine import current_engine
-from ddrecon.errors import SceneError
+from ddrecon.errors import DdreconError, SceneError
 from ddrecon.io.info import sizes_text
 from ddrecon.memory import gibibytes
+from ddrecon.reconstruct.pace import time_iteration
 from ddrecon.reconstruct.setup import select_views
 from ddrecon.reconstruct.support import (
     Support,
@@ -70,16 +71,18 @@ def asks_support(scene: Scene) -> bool:
 
 
 def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
+    """What `ddrecon check` reports of `scene`: its grid, physics, engine, time and so on.
 
     And what can hardly be meant. Its parameters are where they start. `up` is `volume.up`.
     """
-    scene = with_values(scene, scene.starts)
+    built, scene = scene, with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
     low, high = grid.bounds_xyz
-    loss = None
-    if scene.optimize is not None:
-        loss = describe_loss(scene.optimize, train) if train.views else None
+    loss, seconds = None, None
+    if scene.optimize is not None and train.views:
+        loss = describe_loss(scene.optimize, train)
+        with suppress(DdreconError):  # what is wrong is told by a run
+            seconds = time_iteration(built)
     support = None
     with suppress(SceneError) if not asks_support(scene) else nullcontext():
         upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
@@ -108,6 +111,8 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> d
         "support": support,
         "engine": current_engine(),
         "memory_bytes": memory_estimate(scene),
+        "iteration_seconds": seconds,
+        "iterations": scene.optimize and scene.optimize.iterations,
         "doubts": find_doubts(scene),
     }
 
@@ -138,7 +143,16 @@ def lines(report: dict[str, Any]) -> list[str]:
         *([support_text(report["support"])] if report["support"] else []),
         f"engine: {report['engine']}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
+        *([_time_text(report)] if report["iteration_seconds"] else []),
     ]
+
+
+def _time_text(report: dict[str, Any]) -> str:
+    """How long iterations take, and as many as were asked for, or a hundred of a run by itself."""
+    seconds, count = report["iteration_seconds"], report["iterations"]
+    count = 100 if count == AUTO else count
+    whole = f"at most {count * seconds / 60:.2g} minutes for {count}"
+    return f"time: about {seconds:.2g} s an iteration at full resolution, {whole}"
 
 
 def _advise_on_cells(width: float) -> str:

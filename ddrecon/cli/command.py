@@ -84,6 +84,12 @@ SCENE = click.argument("scene", type=click.Path(path_type=Path))
 OUTPUT = click.option(
     "-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results."
 )
+UP = click.option(
+    "--up",
+    type=click.Choice(["y", "z"]),
+    help="Which axis points up in exported volumes, turned from the scene's volume.up; of VOLUMEs y"
+    " is up. z is for programs such as Blender and Unreal.",
+)
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder that is not empty.")
 
 

@@ -8,21 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ddrecon.cli.command import REPORT, SCENE_SUFFIXES, in_session
+from ddrecon.cli.command import REPORT, SCENE_SUFFIXES, UP, in_session
 from ddrecon.errors import UsageError
 from ddrecon.io.files.reading import guard_reading
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ddrecon.cli.session import Session
-    from ddrecon.io.volumes.field import Fields
-    from ddrecon.scene import Scene
-
-LEFT_OUT = ("sigma_a", "sigma_s")
-"""Fields that are not written: programs of film and games take sigma_t and albedo."""
-ROUNDING = 1e-6
-"""Relative rounding below which cells count as equal: one cross section follows from others."""
+    from ddrecon.io.volumes.field import Facts, Fields
 
 
 @click.command()
@@ -38,12 +30,7 @@ ROUNDING = 1e-6
     help="Where it goes.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
-@click.option(
-    "--up",
-    type=click.Choice(["y", "z"]),
-    help="Which axis points up in FILE, a volume, turned from the scene's volume.up; of VOLUMEs y "
-    "is up. z is for programs such as Blender and Unreal.",
-)
+@UP
 @in_session
 def export(
     session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool, up: str | None
@@ -68,6 +55,7 @@ def export(
     if kind not in suffixes:
         raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(suffixes)}")
     from ddrecon.reference.export import export_scene
+    from ddrecon.run.exported import LENGTHS, fields_to_export
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
 
@@ -89,46 +77,20 @@ def export(
         elif kind == ".json":
             written = export_transforms(scene, scene_file, output, may_exist=overwrite)
         else:
-            fields, constants, bounds = _fields_of(scene)
+            fields, constants, bounds = fields_to_export(scene)
     if kind in WRITTEN:
         written = [output]
         require_free_files(written, may_exist=overwrite)
-        write_fields(output, *turn_up(fields, bounds, upright, up or upright))
+        facts: Facts = {**constants, "units": LENGTHS} if is_of_scene else {}
+        write_fields(output, *turn_up(fields, bounds, upright, up or upright), facts)
     if constants:
+        rest = ", metadata" if kind == ".vdb" else ", not written"
         numbers = ", ".join(
             " ".join([name, *(f"{number:.6g}" for number in value.flatten().tolist())])
             for name, value in constants.items()
         )
-        click.echo(f"fields: {', '.join(fields)}; the same everywhere, not written: {numbers}")
+        click.echo(f"fields: {', '.join(fields)}; the same everywhere{rest}: {numbers}")
     click.echo(f"written: {', '.join(map(str, written))}")
-
-
-def _fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
-    """What differs from cell to cell, what is the same everywhere, and the box, of `scene`.
-
-    Density is always among the first. Fields are [z, y, x] or [z, y, x, 3], constants have one
-    number or three, and the box [2, 3] is its corners (x, y, z).
-    """
-    import numpy as np
-
-    from ddrecon.variables.kinds import is_of_volume, split_name
-    from ddrecon.variables.values import value_of, variable_names
-
-    fields, constants = dict[str, np.ndarray](), dict[str, np.ndarray]()
-    for name in filter(is_of_volume, variable_names(scene)):
-        if name in LEFT_OUT:
-            continue
-        value = value_of(scene, name).detach().float().cpu()
-        if value.ndim >= 3:
-            low, high = value.flatten(-3).aminmax(dim=-1)
-            if split_name(name)[1] == "density" or (high - low > ROUNDING * high.abs()).any():
-                last = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-                fields[name] = last.numpy()
-                continue
-            value = (low + high) / 2
-        if value.numel() in (1, 3):
-            constants[name] = value.numpy()
-    return fields, constants, np.array(scene.volume.grid.bounds_xyz)
 
 
 def _require_volumes(session: Session, sources: Sequence[Path]) -> None:
@@ -161,6 +123,7 @@ def info(session: Session, file: Path) -> None:
     _require_volumes(session, [file])
     scene = session.load(file) if _is_scene(file) else None
     from ddrecon.io.info import describe, describe_medium, lines
+    from ddrecon.run.exported import fields_to_export
 
-    report = describe_medium(*_fields_of(scene)) if scene else describe(file)
+    report = describe_medium(*fields_to_export(scene)) if scene else describe(file)
     session.show(report, lines(report))

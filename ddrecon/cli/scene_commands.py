@@ -15,7 +15,16 @@ from warnings import warn
 
 import click
 
-from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, FiniteRange, in_session
+from ddrecon.cli.command import (
+    DTYPE,
+    OUTPUT,
+    OVERWRITE,
+    REPORT,
+    SCENE,
+    UP,
+    FiniteRange,
+    in_session,
+)
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.settings import MOST_AROUND
 
@@ -239,6 +248,7 @@ def _render(
     type=click.Choice(["vdb", "npz"]),
     help="Of a film, also write sequence/film_0000.vdb and so on: all fields, and the velocity.",
 )
+@UP
 @DTYPE
 @REPORT
 @in_session
@@ -253,6 +263,7 @@ def optimize(
     frames: str | None,
     shared: Path | None,
     exported: str | None,
+    up: str | None,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images, of a film frame after frame."""
     from ddrecon.run.result import RESULT
@@ -263,6 +274,8 @@ def optimize(
             f"{scene}: a finished run leaves nothing to optimize; name its scene, {of_run}, "
             "and another folder or --resume --iterations N"
         )
+    if up is not None and exported is None:
+        raise click.UsageError("--up turns what --export writes: say --export as well")
     if iterations is not None:
         typed = f"--iterations {iterations}"
         session = session.with_override(f"optimize.iterations={iterations}", typed)
@@ -272,7 +285,7 @@ def optimize(
 
         film = Film(scene_file, output, session.build, {}, preview_every, session.is_quiet)
         choice = {"overwrite": overwrite, "resume": resume, "shared": shared}
-        _optimize_film(session, film, frames, exported, choice)
+        _optimize_film(session, film, frames, (exported, up), choice)
         return
     film_options = {"--frames": frames, "--shared": shared, "--export": exported}
     if of_films := [option for option, value in film_options.items() if value is not None]:
@@ -295,7 +308,11 @@ def optimize(
 
 
 def _optimize_film(
-    session: Session, film: Film, frames: str | None, exported: str | None, choice: dict[str, Any]
+    session: Session,
+    film: Film,
+    frames: str | None,
+    exported: tuple[str | None, str | None],
+    choice: dict[str, Any],
 ) -> None:
     """Reconstructs the frames of `film` that are this rank's; `choice` is how its folder opens."""
     from ddrecon.film.drive import drive_film, share_out
@@ -312,7 +329,7 @@ def _optimize_film(
         if is_first():
             from_first(None)
         with alone():
-            record = drive_film(film, numbers, exported)
+            record = drive_film(film, numbers, *exported)
     session.show(record, film_lines(record, film.path))
 
 

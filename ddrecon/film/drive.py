@@ -20,17 +20,20 @@ from ddrecon.film.folder import SEQUENCE, VELOCITY, Film, open_film
 from ddrecon.film.report import write_film_report
 from ddrecon.film.shared import SHARED, read_shared, write_shared
 from ddrecon.io.files.folders import RUN, claim_folder
-from ddrecon.io.volumes.table import field_names, read_field, write_fields
+from ddrecon.io.volumes.field import Facts
+from ddrecon.io.volumes.table import read_field, turn_up, write_fields
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import PREVIOUS, fingerprint, newest_checkpoint
 from ddrecon.run.drive import optimize_in_folder
+from ddrecon.run.exported import LENGTHS, fields_to_export
 from ddrecon.run.job import CHECKPOINTS, Checkpoints, Iterations, drive, resume
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import SCENE, volume_file, write_volume
 from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.build_views import remove_pictures
 from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import read_scene
 
@@ -63,10 +66,13 @@ def optimize_sequence(
                 yield Result(scene, LossLog(film.of(number) / "loss.csv").rows())
 
 
-def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict[str, Any]:
+def drive_film(
+    film: Film, numbers: Sequence[int], exported: str | None, up: str | None = None
+) -> dict[str, Any]:
     """What `film.json` says of `film` after its frames `numbers`, those that are not yet done.
 
-    All that are done then are `exported` as volumes of this kind. Raises as `drive_frames` does.
+    All that are done then are `exported` as volumes of this kind, in which the axis `up` points up.
+    Raises as `drive_frames` does.
     """
     finished, due = film.done(), 0.0
     try:
@@ -79,17 +85,24 @@ def drive_film(film: Film, numbers: Sequence[int], exported: str | None) -> dict
         record = _report(film)
     if exported is not None:
         with film.claim():
-            _export(film, exported)
+            _export(film, exported, up)
     return record
 
 
-def _export(film: Film, kind: str) -> None:
+def _export(film: Film, kind: str, up: str | None) -> None:
     (film.path / SEQUENCE).mkdir(exist_ok=True)
+    fps, upright = film.frames.fps, film.scene_file.tree.volume.up
+    facts: Facts = {"units": f"{LENGTHS}; velocity [u/{'s' if fps else 'frame'}]"}
+    facts = {**facts, "fps": np.array(fps)} if fps else facts
     for number in film.done():
-        files = sorted((film.of(number) / "volumes").glob("*.npz"))
-        fields = {file.stem: read_field(file, field_names(file)[0]).values for file in files}
+        folder = film.of(number)
+        found = film.build(remove_pictures(read_scene(folder / RESULT), None))
+        fields, constants, bounds = fields_to_export(found)
+        if (file := volume_file(folder, VELOCITY)).is_file():
+            fields[VELOCITY] = read_field(file, VELOCITY).values * (fps or 1)
         path = film.path / SEQUENCE / f"film_{number:04d}.{kind}"
-        write_fields(path, fields, np.array(film.grid.bounds_xyz))
+        turned = turn_up(fields, bounds, upright, up or upright)
+        write_fields(path, *turned, {**facts, **constants})
 
 
 def share_out(numbers: Sequence[int]) -> Sequence[int]:

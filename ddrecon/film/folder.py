@@ -126,8 +126,8 @@ class Film:
         """
         before = self._before(number)
         if before is None:
-            return _fields_in(self.calibrated(number), names)
-        fields, motion = _fields_in(self.of(before), names), self._velocity(before)
+            return fields_in(self.calibrated(number), names)
+        fields, motion = fields_in(self.of(before), names), self._velocity(before)
         if motion is None:
             return fields
         # The air goes on as it went, and its motion with it.
@@ -144,7 +144,7 @@ class Film:
         """The motion a frame from frame `start` to `end`, in cells: [3, z, y, x]."""
         sums = []
         for frame in (start, end):
-            fields = _fields_in(self.of(frame), self.optimized)
+            fields = fields_in(self.of(frame), self.optimized)
             moving = [name for name in fields if name.endswith("density")] or [*fields][:1]
             # Colors are averaged.
             values = [fields[name].reshape(-1, *self.grid.shape).mean(0) for name in moving]
@@ -173,7 +173,7 @@ class Film:
 
     def _velocity(self, number: int) -> Tensor | None:
         """The motion of the frame `number`, in cells a frame: [3, z, y, x]."""
-        field = _fields_in(self.of(number), [VELOCITY]).get(VELOCITY)
+        field = fields_in(self.of(number), [VELOCITY]).get(VELOCITY)
         return None if field is None else field.flip(0) / self._cell
 
     @property
@@ -276,7 +276,7 @@ def _require_free(path: Path, numbers: Sequence[int]) -> None:
                 pass
 
 
-def _fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
+def fields_in(folder: Path, names: list[str]) -> dict[str, Tensor]:
     """Those of the variables `names` that are fields [..., z, y, x], as the run in `folder` has."""
     files = {name: volume_file(folder, name) for name in names}
     read = {n: read_field(file, field_key(n)) for n, file in files.items() if file.is_file()}

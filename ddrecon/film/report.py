@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -11,24 +12,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from ddrecon.film.folder import Film
+from ddrecon.film.folder import Film, fields_in
 from ddrecon.film.shared import SHARED
 from ddrecon.io.files.atomic import write_json
-from ddrecon.io.images.table import read_image, webp_of, write_animation
+from ddrecon.io.images.table import read_image, webp_of
 from ddrecon.pictures import srgb
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import pixels, shrink
+from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.report import psnr_text
+from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import REPORT, SUMMARY
+from ddrecon.scene_file.build_views import remove_pictures
+from ddrecon.scene_file.load import read_scene
 
-RECORD, MOVIE = "film.json", "movie.png"
+RECORD = "film.json"
 KEYS = ("iterations", "seconds", "psnr", "ssim", "test_psnr", "test_ssim")
 """Entries of a run's summary that a film's record keeps of each frame."""
-SECONDS = 4.0
-"""How long its movie takes."""
 SHOWN = 48
-"""Frames whose pictures are on the page; all are in their folders."""
+"""Frames whose pictures and volumes are on the page; all are in their folders."""
 WIDEST = 768
 """Pixels across target, render and difference, at most."""
 
@@ -47,13 +50,15 @@ def write_film_report(film: Film) -> dict[str, Any]:
         record["values"] = values
     write_json(film.path / RECORD, record)
     if rows:
+        numbers = [*summaries][:: -(-len(summaries) // SHOWN)]
         write_page(
             film.path / REPORT,
             title=f"ddrecon: {film.path.absolute().name}",
             lead=_lead(record),
             goes_on=len(rows) < record["asked"],
             plots={"heading": "Quality", "drawn": _curves(rows)},
-            frames=_figures(film, summaries),
+            volume=_volumes(film, numbers),
+            frames={"numbers": numbers, "strips": _figures(film, summaries, numbers)},
             numbers=_calibration(film.shared) if values else None,
         )
     return record
@@ -84,14 +89,27 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> list[Plot]:
     return drawn
 
 
+def _volumes(film: Film, numbers: Sequence[int]) -> dict[str, Any]:
+    """The fields of the frames `numbers`, and what stands around them by the last one."""
+    last = remove_pictures(read_scene(film.of(numbers[-1]) / RESULT), None)
+    fields = [
+        Shown(name, "result", value, find_white_value(value), number)
+        for number in numbers
+        for name, value in fields_in(film.of(number), film.optimized).items()
+    ]
+    whites = {f.name: max(g.white for g in fields if g.name == f.name) for f in fields}
+    scaled = [replace(field, white=whites[field.name]) for field in fields]
+    return describe_volume(scaled, describe_world(film.grid, film.build(last)), (), fields[0].name)
+
+
 def _figures(
-    film: Film, summaries: Mapping[int, Mapping[str, Any]]
+    film: Film, summaries: Mapping[int, Mapping[str, Any]], numbers: Sequence[int]
 ) -> list[list[tuple[bytes, str]]]:
-    """Pictures of the views held out, or of the first one, frame after frame; writes the movie."""
+    """Pictures of the views held out, or of the first one, in the frames `numbers`."""
     views = next(iter(summaries.values()))["views"]
     shown = [name for name, view in views.items() if view["split"] == "test"] or [*views][:1]
-    numbers, figures = [*summaries][:: -(-len(summaries) // SHOWN)], []
-    for index, name in enumerate(shown):
+    figures = []
+    for name in shown:
         strips = [_strip(film.of(number) / "previews" / f"{name}.png") for number in numbers]
         psnrs = [summaries[number]["views"][name]["psnr"] for number in numbers]
         figures.append(
@@ -100,9 +118,6 @@ def _figures(
                 for number, strip, psnr in zip(numbers, strips, psnrs, strict=True)
             ]
         )
-        if index == 0 and len({strip.shape for strip in strips}) == 1 and len(strips) > 1:
-            frames = [srgb.encode_bytes(strip) for strip in strips]
-            write_animation(film.path / MOVIE, frames, len(frames) / SECONDS)
     return figures
 
 

@@ -30,6 +30,8 @@ TRACED_PIXELS = 8192
 """About the most pixels of a view that are traced to see what is cut off."""
 CUT_LIGHT = 0.002
 """The part of a view's light that a support may cut off without a warning."""
+LONELY = 0.01
+"""The part of the cells that fewer than two views may see without a word."""
 KEY = "optimize.parameters.density.support"
 
 
@@ -107,14 +109,17 @@ def describe_support(
 ) -> dict[str, Any] | None:
     """What a report says of `supports`, that of a scene or of each frame of a film; None without.
 
-    `cells` is the part of the cells of `grid` that any keeps; the rest is that of `doubt_support`.
+    `cells` is the part of the cells of `grid` that any keeps, `lonely` that of which fewer than two
+    views see; the rest is that of `doubt_support`.
     """
     if not supports:
         return None
     described = doubt_support(supports, grid, upright)
     if not described.get("doubt", "").startswith(OUTSIDE):
         kept = torch.stack([support.on(grid) for support in supports]).any(0)
+        _, seen = supports[0]._hulls(grid)
         described["cells"] = float(kept.float().mean())
+        described["lonely"] = float((kept & (seen.sum(0) < 2)).float().mean())
     return described
 
 
@@ -157,6 +162,9 @@ def support_text(support: dict[str, Any]) -> str:
     described = f"pictures leave smoke in {100 * support['cells']:.3g} % of the cells"
     if "box" in support:
         described += f"; what they show fits in {bounds_text(torch.tensor(support['box']))}"
+    if support["lonely"] > LONELY:
+        share = f"{100 * support['lonely']:.2g} %"
+        described += f"; fewer than two views see {share} of the cells, which can hold ghosts"
     return described
 
 

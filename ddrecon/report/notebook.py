@@ -6,14 +6,11 @@ from html import escape
 
 from ddrecon.medium.coefficients import Volume
 from ddrecon.report.page import page_text
-from ddrecon.report.volumes import Shown, describe_volume, find_white_value
+from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.scene import Scene
-from ddrecon.turntable import upright_axis
 
-HEIGHT = 600
+HEIGHT = 640
 """Pixels of the frame."""
-SIDEWAYS = (0.5, 0.4, 1.0)
-"""The direction from which a volume without cameras is seen."""
 FIELDS = ("density", "sigma_a", "sigma_s")
 
 
@@ -29,25 +26,17 @@ def show(shown: Scene | Volume) -> Drawn:
 
     A scene is seen from its first camera. The frame's scripts reach nothing of the notebook.
     """
+    scene = shown if isinstance(shown, Scene) else None
     volume = shown.volume if isinstance(shown, Scene) else shown
-    cameras = [view.camera for view in shown.views] if isinstance(shown, Scene) else []
-    lights = ""
-    if isinstance(shown, Scene):
-        lights = f"; {len(shown.lights)} lights, {len(cameras)} views"
+    lights = f"; {len(scene.lights)} lights, {len(scene.views)} views" if scene else ""
     cells = " x ".join(str(count) for count in reversed(volume.grid.shape))
     words = f"{cells} cells, density up to {float(volume.density.detach().max()):.4g}{lights}"
-    up, (x, y, z) = 1, SIDEWAYS
-    if isinstance(shown, Scene) and cameras:
-        pose, up = cameras[0].pose.detach(), upright_axis(shown)
-        x, y, z = (pose[:, 3] - pose.new_tensor(volume.grid.center_xyz)).tolist()
     fields = {name: getattr(volume, name).detach() for name in FIELDS}
     fields = {name: value for name, value in fields.items() if value.ndim >= 3}
-    depth, height, width = volume.grid.extent
     viewed = [
-        Shown(name, "result", value, (width, height, depth), find_white_value(value))
-        for name, value in fields.items()
+        Shown(name, "result", value, find_white_value(value)) for name, value in fields.items()
     ]
-    volume_section = describe_volume(viewed, up, (x, y, z))
+    volume_section = describe_volume(viewed, describe_world(volume.grid, scene))
     page = page_text(title="ddrecon", lead=words, volume=volume_section, is_small=True)
     return Drawn(
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '

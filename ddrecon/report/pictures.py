@@ -47,45 +47,18 @@ def comparison(target: Tensor, image: Tensor) -> np.ndarray:
     return place_beside([expected / white, rendered / white, difference])
 
 
-def slices(field: Tensor, white: float | None = None) -> np.ndarray:
+def slices(field: Tensor) -> np.ndarray:
     """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y.
 
-    y (or z) is up; the largest value is white, unless another is. A field with negative values is
-    as `diverge` shows it.
+    y (or z) is up; the largest value is white. Where some are negative, `diverge` shows their mean.
     """
-    array = _cells_of(field)
-    z, y, x = (size // 2 for size in array.shape[:3])
-    white = white or find_high(np.abs(array))
-    shown = _show(array, white)
-    return _three_sides([shown[z], shown[:, :, x], shown[:, y]])
-
-
-def projections(field: Tensor) -> np.ndarray:
-    """The means of `field` along z, x and y, placed as `slices` are; the largest mean is white.
-
-    With negative values it is as `slices` shows such a field.
-    """
-    array = _cells_of(field)
-    means = [array.mean(axis) for axis in (0, 2, 1)]
-    white = max(*(float(np.abs(side).max()) for side in means), 1e-6)
-    return _three_sides([_show(side, white) for side in means])
-
-
-def _show(values: np.ndarray, white: float) -> np.ndarray:
-    """`values` [..., 3] as colors; their mean as `diverge` has it where some are below 0."""
-    return diverge(values.mean(-1) / white) if values.min() < 0 else values / white
-
-
-def _cells_of(field: Tensor) -> np.ndarray:
-    """`field` as float32 [z, y, x, 3]."""
-    colors = field if field.ndim == 4 else field[None]
-    return colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0).float().cpu().numpy()
-
-
-def _three_sides(sides: list[np.ndarray]) -> np.ndarray:
-    """Sides [y, x], [z, y] and [z, x] with colors, in a row; y is up, or z where there is no y."""
-    across_z, across_x, across_y = sides
-    return place_beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
+    colors = (field if field.ndim == 4 else field[None]).detach().expand(3, -1, -1, -1)
+    cells = colors.permute(1, 2, 3, 0).float().cpu().numpy()
+    shown = cells / find_high(np.abs(cells))
+    shown = diverge(shown.mean(-1)) if cells.min() < 0 else shown
+    z, y, x = (size // 2 for size in cells.shape[:3])
+    sides = shown[z, ::-1], shown[:, ::-1, x].transpose(1, 0, 2), shown[::-1, y]
+    return place_beside([*sides])
 
 
 def shrink(image: Tensor, most: int) -> Tensor:

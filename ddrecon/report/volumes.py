@@ -5,24 +5,35 @@ from __future__ import annotations
 import base64
 import gzip
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d
+from torch.nn.functional import avg_pool3d, normalize
 
+from ddrecon.cameras import cast_rays
+from ddrecon.grid import Grid, array_order
 from ddrecon.io.images.table import png_of
+from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.pictures import srgb
-from ddrecon.report.pictures import diverge, find_high, projections, slices
+from ddrecon.report.pictures import diverge, find_high, slices
+from ddrecon.scene import Scene
+from ddrecon.turntable import upright_axis
 
-MOST_CELLS = 1_000_000
-"""A field of more is made coarser, by whole factors."""
+MOST_CELLS, MOST_OF_PAGE = 1_000_000, 4_000_000
+"""A field of more cells is made coarser, by whole factors, and so are those of a page together."""
+SIDEWAYS = (1.3, 1.0, 2.5)
+"""Where a volume without cameras is seen from."""
+REACH, FARTHEST = 0.25, 2.0
+"""How far a camera's frustum is drawn, as part of its distance from the volume's middle, which for
+an orthographic one is at most so many of the box's longest sides."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A field `name` [z, y, x] or [C, z, y, x] in a box with `sides` (x, y, z).
+    """A field `name` [z, y, x] or [C, z, y, x], in a `frame` of a film.
 
     `of` is `result` or `truth`; `white` is the value shown as white.
     """
@@ -30,8 +41,8 @@ class Shown:
     name: str
     of: str
     values: Tensor
-    sides: tuple[float, float, float]
     white: float
+    frame: int | None = None
 
 
 def find_white_value(values: Tensor) -> float:
@@ -42,26 +53,61 @@ def find_white_value(values: Tensor) -> float:
     return find_high(values.detach().abs().float().cpu().numpy())
 
 
+def describe_world(grid: Grid, scene: Scene | None) -> dict[str, Any]:
+    """What stands around a volume on `grid`, for the scripts: which axis is up, light and cameras.
+
+    `light` is towards the first lamp of `scene`, `eye` where its first camera stands, from the
+    middle. Of each camera there are the `corners` of its frustum: its place, then those of its
+    picture from the upper left, clockwise.
+    """
+    middle, longest = torch.tensor(grid.center_xyz), max(grid.extent)
+    cameras, lights = list[dict[str, Any]](), list[Tensor]()
+    for view in scene.views if scene else ():
+        height, width = view.camera.size
+        last = height * width - 1
+        rays = cast_rays(view.camera).select(torch.tensor([0, width - 1, last, last + 1 - width]))
+        origin, direction = (array_order(v).detach().cpu() for v in (rays.origin, rays.direction))
+        far = float((origin.mean(0) - middle).norm())
+        if not view.camera.is_perspective:
+            origin = origin + max(0.0, far - FARTHEST * longest) * direction
+        ends = torch.cat([origin.mean(0, keepdim=True), origin + REACH * far * direction])
+        corners = ((ends - middle) / longest).tolist()
+        cameras.append({"name": view.name, "corners": corners})
+    for light in scene.lights if scene else ():
+        if isinstance(light, DirectionalLight):
+            lights.append(-light.direction.detach().cpu())
+        elif isinstance(light, PointLight):
+            lights.append(light.position.detach().cpu() - middle)
+    low, high = grid.bounds_xyz
+    return {
+        "up": upright_axis(scene) if scene and scene.views else 1,
+        "eye": cameras[0]["corners"][0] if cameras else SIDEWAYS,
+        "light": normalize(lights[0], dim=0).tolist() if lights else None,
+        "low": low,
+        "sides": [b - a for a, b in zip(low, high, strict=True)],
+        "cameras": cameras,
+    }
+
+
 def describe_volume(
     fields: Sequence[Shown],
-    up: int,
-    towards_eye: Sequence[float],
+    world: Mapping[str, Any],
     lines: Sequence[str] = (),
     shown: str = "density",
 ) -> dict[str, Any]:
     """The section of a page with the `fields` to turn and to cut, and `lines` about them.
 
-    `up` is the axis (0, 1, 2) that points up; `towards_eye` (x, y, z) is where the first camera
-    stands; `shown` is the name of the field that is shown at first. Where no scripts run, there are
-    pictures of the results.
+    `world` is what `describe_world` says; `shown` is the name of the field that is shown at first.
+    Where no scripts run, there are pictures of the results, of the last frame.
     """
+    most = min(MOST_CELLS, MOST_OF_PAGE // max(1, len(fields)))
+    last = [f for f in fields if f.of == "result" and f.frame == fields[-1].frame]
     return {
         "lines": lines,
         "shown": shown,
-        "stills": [_describe_still(field) for field in fields if field.of == "result"],
-        "up": up,
-        "eye": " ".join(f"{component:.4g}" for component in towards_eye),
-        "fields": [_embed(field) for field in fields],
+        "stills": [_describe_still(field) for field in last],
+        "world": world,
+        "fields": [_embed(field, most) for field in fields],
     }
 
 
@@ -71,27 +117,26 @@ def _describe_still(field: Shown) -> dict[str, Any]:
     largest = f"(the largest value of a cell is {high:.4g})"
     if low < 0:
         largest = f"(values from {low:.4g} to {high:.4g})"
-    pictures = {"slices": png_of(slices(values)), "means": png_of(projections(values))}
-    return {"name": field.name, "largest": largest, **pictures}
+    return {"name": field.name, "largest": largest, "slices": png_of(slices(values))}
 
 
-def _embed(field: Shown) -> dict[str, Any]:
-    """`field` for the scripts: as displayed, 8 bits, x fastest; block means above `MOST_CELLS`."""
+def _embed(field: Shown, most: int) -> dict[str, Any]:
+    """`field` for the scripts: as displayed, 8 bits, x fastest; means of blocks, `most` of them."""
     values = field.values.detach().float()
     values = values if values.ndim == 4 else values[None]
-    factor = math.ceil((values[0].numel() / MOST_CELLS) ** (1 / 3))
+    factor = math.ceil((values[0].numel() / most) ** (1 / 3))
     values = avg_pool3d(values, factor, ceil_mode=True, count_include_pad=False)
     cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
-    if cells.min() < 0:
+    if is_signed := bool(cells.min() < 0):
         cells = diverge(cells.mean(-1))
     packed = gzip.compress(srgb.encode_bytes(cells).tobytes(), mtime=0)
-    longest = max(field.sides)
     return {
         "name": field.name,
         "of": field.of,
         "size": list(values.shape[:0:-1]),
-        "box": [side / longest for side in field.sides],
+        "frame": field.frame,
         "white": field.white,
+        "signed": is_signed,
         "channels": cells.shape[-1],
         "data": base64.b64encode(packed).decode("ascii"),
     }

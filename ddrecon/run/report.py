@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ddrecon.io.images.table import webp_of
@@ -22,11 +23,10 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import write_page
 from ddrecon.report.pictures import find_white, pixels, shrink
-from ddrecon.report.volumes import Shown, describe_volume, find_white_value
+from ddrecon.report.volumes import Shown, describe_volume, describe_world, find_white_value
 from ddrecon.run.quality import Findings, shift_between
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import fields_of
 
 SHOWN = 24
@@ -35,6 +35,7 @@ PIXELS = 1_200_000
 """The most pixels that all pictures of views have together."""
 GOES_ON = {"kind": "running", "text": "goes on"}
 """The `ended` of a run that still goes on."""
+SURE = "How sure they are, experiments say: ddrecon uncertainty RUN -o OUTPUT."
 LISTED = 12
 """More numbers of one parameter are not listed."""
 FINER = "PSNRs are of pictures as coarse as the cells, and finer ones are harder to match"
@@ -58,6 +59,7 @@ def write_run_report(
     scene = findings.scene
     versions = ((k, v if isinstance(v, list) else [v]) for k, v in environment.items())
     table = {"heading": "Numbers found", "head": ["", "start", "found"], "rows": numbers}
+    table["text"] = SURE
     write_page(
         path,
         title=f"ddrecon: {path.absolute().parent.name}",
@@ -92,9 +94,19 @@ def list_numbers(
             text = f"moved by {moved:.2f} pixels, turned by {turned:.2g} degrees"
             rows.append((parameter.name, "as given", text))
         elif not parameter.is_field and len(value) <= LISTED:
-            begun, ended = (", ".join(f"{x:.4g}" for x in n.tolist()) for n in (start, value))
-            rows.append((parameter.name, begun, ended))
+            rows.append((parameter.name, *_tell_change(start, value, parameter.key == "direction")))
     return rows
+
+
+def _tell_change(start: Tensor, value: Tensor, is_direction: bool) -> tuple[str, str]:
+    """The numbers `start` [n], and those found, with their changes: parts of them, or an angle."""
+    pairs = list(zip(start.tolist(), value.tolist(), strict=True))
+    parts = ["" if is_direction or not x else f" ({y / x - 1:+.1%})" for x, y in pairs]
+    found = ", ".join(f"{y:.4g}{part}" for (_, y), part in zip(pairs, parts, strict=True))
+    if is_direction:
+        apart = float(torch.nn.functional.cosine_similarity(start.double(), value.double(), dim=0))
+        found += f" (turned by {math.degrees(math.acos(min(1.0, apart))):.2g} degrees)"
+    return ", ".join(f"{x:.4g}" for x in start.tolist()), found
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:
@@ -139,18 +151,15 @@ def describe_fields(
 
     Those of one name have one scale.
     """
-    z, y, x = scene.volume.grid.extent
     whites = dict[str, float]()
     for name, value in ((n, v) for values in kinds.values() for n, v in values.items()):
         whites[name] = max(whites.get(name, 0.0), find_white_value(value))
     fields = [
-        Shown(name, of, value, (x, y, z), whites[name])
+        Shown(name, of, value, whites[name])
         for of, values in kinds.items()
         for name, value in values.items()
     ]
-    pose = scene.views[0].camera.pose.detach()
-    towards = pose[:, 3] - pose.new_tensor(scene.volume.grid.center_xyz)
-    return describe_volume(fields, upright_axis(scene), towards.tolist(), lines, shown)
+    return describe_volume(fields, describe_world(scene.volume.grid, scene), lines, shown)
 
 
 def curves(rows: Sequence[Row]) -> list[Plot]:

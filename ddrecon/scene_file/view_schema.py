@@ -240,12 +240,14 @@ class FramesSection:
     last: Number of the last frame.
     step: From one frame to the next.
     calibrate: Frames, spread along the film, that find all but fields together. 0: none.
+    fps: Frames a second: exported velocities are per second, without it per frame.
     """
 
     first: int = bounded(minimum=0)
     last: int = bounded(minimum=0)
     step: int = bounded(1, minimum=1)
     calibrate: int = bounded(3, minimum=0)
+    fps: float | None = bounded(None, above=0)
 
     @property
     def numbers(self) -> range:

@@ -17,14 +17,15 @@ from ddrecon.cli.check import supports_of
 Run = Callable[..., Result]
 
 
-def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
+def test_grid_views_physics_memory_and_time(succeed: Run, folder: Path) -> None:
     before = contents(folder)
     lines = succeed("check", "scene.yaml").stdout.splitlines()
     assert lines[0].startswith("grid: 6 x 5 x 4 cells of 0.1667 x 0.2 x 0.25")
     assert "  front: perspective, 8 x 6 pixels, train, with image" in lines
     assert "  side: perspective, 8 x 6 pixels, test, with image" in lines
     assert {"views: 2", "physics:", "optimizes: density (120 numbers)"} <= set(lines)
-    assert lines[-1].startswith("memory: about ") and "MiB" in lines[-1]
+    assert lines[-2].startswith("memory: about ") and "MiB" in lines[-2]
+    assert lines[-1].startswith("time: about ") and "minutes for 4" in lines[-1]
     assert contents(folder) == before
 
 
@@ -70,7 +71,8 @@ def test_json(succeed: Run) -> None:
 def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     left_out = [f"-D{key}=null" for key in ("optimize", "views.0.image", "views.1.image")]
     lines = succeed("check", "scene.yaml", *left_out).stdout.splitlines()
-    assert "optimizes: nothing" in lines and "  front: perspective, 8 x 6 pixels, train" in lines
+    assert "optimizes: nothing" in lines and lines[-1].startswith("memory:")
+    assert "  front: perspective, 8 x 6 pixels, train" in lines
     assert "optimizes: density" in succeed("check", "scene.yaml", *left_out[1:]).stdout
 
 

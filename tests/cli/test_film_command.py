@@ -14,6 +14,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+import openvdb_python
 import pytest
 import torch
 from click.testing import CliRunner, Result
@@ -119,9 +120,16 @@ def test_a_film_is_runs_in_a_sequence(film: Path, succeed: Run) -> None:
     assert [row["frame"] for row in record["frames"]] == list(range(FRAMES)) == list(range(4))
     assert all(1 <= row["iterations"] <= 24 for row in record["frames"])
     assert all(row["registered_psnr"] >= row["test_psnr"] for row in record["frames"])
-    assert {"report.html", "film.json", "shared.json", "movie.png"} <= {
-        path.name for path in Path("out").iterdir()
-    }
+    assert {"report.html", "film.json", "shared.json"} <= {p.name for p in Path("out").iterdir()}
+    # Its page has the volume of each frame beside its pictures.
+    page = Path("out/report.html").read_text()
+    data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)
+    fields = [json.loads(text) for text in data]
+    assert [[field["name"], field["frame"]] for field in fields] == [
+        ["density", n] for n in range(4)
+    ]
+    assert len({field["data"] for field in fields}) == 4 and len({f["white"] for f in fields}) == 1
+    assert 'data-frames="[0, 1, 2, 3]"' in page and '"name": "side"' in page
     # What is shared is the same in all frames, and known for what it is.
     shared = json.loads(Path("out/shared.json").read_text())
     assert shared["frames"] == [0, 3]
@@ -380,6 +388,25 @@ def test_misuse_of_folders(film: Path, succeed: Run, run: Run) -> None:
     assert Path("out/sequence/film_0000.vdb").is_file()
     beyond = run("render", "out", "-o", "seen", "--frames", "2:3")
     assert beyond.exit_code == 2 and "--frames 2:3: names no frame; expected" in beyond.stderr
+
+
+def test_a_sequence_is_turned_and_moves_by_the_second(film: Path, whole: str, succeed: Run) -> None:
+    """Arrows turn as places do, and go as far in a second as in all of its frames."""
+    shutil.copytree(whole, "whole")
+    again = "optimize", f"{whole}/scene.yaml", "-o", "whole", "--resume", "--dtype", "float64"
+    succeed(*again, "-q", "--export", "vdb", "--up", "z", "-D", "frames.fps=25")
+    exported = Path("whole/sequence/film_0002.vdb")
+    by_frame, turned = (
+        read_field(path, "velocity").values.astype(float)
+        for path in (Path("whole/frames/0002/volumes/velocity.npz"), exported)
+    )
+    moved = np.where(np.abs(by_frame).max(-1, keepdims=True) > 1e-4 * np.abs(by_frame).max(), 25, 0)
+    x, y, z = (moved * by_frame).transpose(3, 0, 1, 2)
+    there = np.stack([x, -z, y], -1).transpose(1, 0, 2, 3)[:, ::-1]
+    np.testing.assert_allclose(turned, there, rtol=1e-5, atol=1e-7)
+    facts = "[grids['velocity'][name] for name in ('fps', 'units')]"
+    fps, units = openvdb_python.described(facts, exported)
+    assert fps == 25 and "velocity [u/s]" in units
 
 
 def test_a_part_done_anew_leaves_all_else(film: Path, succeed: Run, refuse: Refuse) -> None:

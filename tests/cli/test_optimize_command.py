@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from click.testing import Result
 from small_scene import contents
 
@@ -76,9 +77,9 @@ def test_what_a_run_writes(succeed: Run, density_of: DensityOf) -> None:
     assert rendered == pytest.approx(told, abs=1e-3)
     # The report shows every view, field and setting.
     text = Path("out/report.html").read_text()
-    assert text.count("<img ") == 2 * 2 + 2 and text.count("<svg ") == 2
+    assert text.count("<img ") == 2 * 2 + 1 and text.count("<svg viewBox") == 2
     shown = [f"{name}: {psnr:.2f} dB" for name, psnr in told.items()]
-    shown += ["density, middle slices", "means along the axes", "irradiance: 3.0"]
+    shown += ["density, middle slices", "irradiance: 3.0"]
     assert all(words in text for words in [*shown, "fluxes Q1 and L1", "torch"])
 
 
@@ -196,16 +197,21 @@ def test_what_takes_long_before_and_after_the_bar_is_told(
 
 
 def test_a_report_lists_the_numbers_that_were_found(succeed: Run) -> None:
-    """As parameters.json has them; of a camera by how much it moved."""
+    """As parameters.json has them, and by how much they changed; of a camera its move."""
     searched = ["lights.0.irradiance={init: 2}", "views.front.exposure={init: 0.9}"]
-    searched += ["views.front.camera={}", "density={init: 0.1}"]
+    searched += ["views.front.camera={}", "density={init: 0.1}", "lights.0.direction={}"]
     options = [f"optimize.parameters.{each}" for each in searched]
     succeed(*OPTIMIZE, "one", *(word for option in options for word in ("-D", option)))
     page, found = Path("one/report.html").read_text(), read_json("one/parameters.json")
     for name, start in (("lights.0.irradiance", 2), ("views.front.exposure", 0.9)):
-        values = ", ".join(f"{x:.4g}" for x in np.ravel(found[name]))
+        values = ", ".join(f"{x:.4g} ({x / start - 1:+.1%})" for x in np.ravel(found[name]))
         cells = [name, ", ".join([f"{start:.4g}"] * np.size(found[name])), values]
         assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+    before = np.array(yaml.safe_load(Path("one/scene.yaml").read_text())["lights"][0]["direction"])
+    after = np.array(found["lights.0.direction"])
+    cosine = before @ after / np.linalg.norm(before) / np.linalg.norm(after)
+    (turned,) = re.findall(r"\(turned by (\S+) degrees\)", page)
+    assert float(turned) == pytest.approx(np.degrees(np.arccos(cosine)), rel=0.05)
     ((moved, turned),) = re.findall(r"moved by (\S+) pixels, turned by (\S+) degrees", page)
     matrix = np.array(found["views.front.camera"]["matrix"])
     # It looked along -z: its turn is what its matrix is.

@@ -12,10 +12,12 @@ from media import box_grid, make_camera, tensor
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
 from ddrecon.hull import find_shown, hull_of
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.support import Support, describe_support, support_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 
@@ -166,6 +168,20 @@ def test_auto_takes_no_noise_of_compression_for_smoke(
     assert bool(shown[cloud | stem].all())
     away = torch.nn.functional.max_pool2d((cloud | stem).float()[None], 9, 1, 4)[0] == 0
     assert float(shown[away].float().mean()) < 2e-4
+
+
+@pytest.mark.parametrize(("shift", "lonely"), [(0, 0), (0.5, 0.5), (1, 1)])
+def test_cells_that_one_view_sees_are_told(shift: float, lonely: float) -> None:
+    """Of two parallel cameras beside each other, by a part of the box, each sees a part alone."""
+    grid = Grid((4, 4, 8), (-0.5,) * 3, (0.5,) * 3)
+    camera = make_camera((0, 0, 2.5), (8, 8), half_width=0.5, is_perspective=False)
+    pose = camera.pose.clone()
+    pose[0, 3] += shift
+    views = [View("one", camera), View("other", replace(camera, pose=pose))]
+    shown = [torch.ones(8, 8, dtype=torch.bool)] * 2
+    described = describe_support([Support(views, shown, 0.0)], grid)
+    assert described["lonely"] == lonely
+    assert ("ghosts" in support_text(described)) == (lonely > 0)
 
 
 def refusal(scene: Scene) -> str:

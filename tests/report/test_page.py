@@ -7,6 +7,9 @@ import itertools
 import json
 import math
 import re
+import shutil
+import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,20 +17,31 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from media import make_scene, random_values
+from media import make_camera, make_scene, random_values
 
 import ddrecon
+from ddrecon.cameras import project
+from ddrecon.grid import Grid
+from ddrecon.light.lights import PointLight
 from ddrecon.pictures import srgb
 from ddrecon.reconstruct.log import Row
 from ddrecon.report import volumes
 from ddrecon.report.curve import Plot, draw_curve
 from ddrecon.report.page import page_text, write_page
 from ddrecon.report.pictures import slices
-from ddrecon.report.volumes import Shown, describe_volume, find_white_value
+from ddrecon.report.volumes import (
+    FARTHEST,
+    Shown,
+    describe_volume,
+    describe_world,
+    find_white_value,
+)
 from ddrecon.run.report import curves
 
 NASTY = '<script>alert("&")</script>'
+ASSETS = Path(volumes.__file__).with_name("assets")
 VOID = {"meta", "img", "input"}
+WORLD = describe_world(Grid((1, 1, 1), (0.0,) * 3, (1.0,) * 3), None)
 
 
 class Balance(HTMLParser):
@@ -55,7 +69,7 @@ class Balance(HTMLParser):
 @pytest.fixture
 def facts() -> dict[str, Any]:
     """A page of every section, whose texts are `NASTY`."""
-    shown = Shown(NASTY, "result", torch.ones(1, 1, 1), (1.0, 1.0, 1.0), 1.0)
+    shown = Shown(NASTY, "result", torch.ones(1, 1, 1), 1.0)
     plots = [draw_curve(NASTY, {NASTY: [(0.0, 1.0)]}, NASTY)]
     table = {"heading": NASTY, "head": [NASTY], "rows": [[NASTY]], "text": NASTY}
     return {
@@ -63,10 +77,10 @@ def facts() -> dict[str, Any]:
         "lead": NASTY,
         "goes_on": True,
         "doubts": [NASTY],
-        "volume": describe_volume([shown], 1, (0.0, 0.0, 1.0), [NASTY], NASTY),
+        "volume": describe_volume([shown], WORLD | {"cameras": [{"name": NASTY}]}, [NASTY], NASTY),
         "plots": {"heading": NASTY, "drawn": plots, "text": NASTY},
         "views": {"groups": [(NASTY, [(b"target", b"render", NASTY)])], "rows": [[NASTY]]},
-        "frames": [[(b"\x89PNG...", NASTY)]],
+        "frames": {"numbers": [0], "strips": [[(b"\x89PNG...", NASTY)]]},
         "numbers": table,
         "physics": [NASTY],
         "settings": NASTY,
@@ -134,7 +148,7 @@ def test_each_curve_of_a_run_is_what_its_name_says() -> None:
 
 def embedded(*fields: Shown) -> list[dict]:
     """The fields in a page, decoded as its scripts do: [z, y, x, channels]."""
-    contents = describe_volume(fields, 1, (0.0, 0.0, 1.0))["fields"]
+    contents = describe_volume(fields, WORLD)["fields"]
     for content in contents:
         data = gzip.decompress(base64.b64decode(content["data"]))
         shape = [*content["size"][::-1], content["channels"]]
@@ -146,9 +160,8 @@ def embedded(*fields: Shown) -> list[dict]:
 def test_a_field_is_embedded_as_it_is_displayed(colors: tuple[int, ...]) -> None:
     """x fastest, in 8 bits of sRGB, at most half a step of it off; above white it is white."""
     values = torch.rand(*colors, 3, 4, 5, generator=torch.Generator().manual_seed(0)) * 2
-    (found,) = embedded(Shown("albedo", "truth", values, (1.0, 0.5, 2.0), white=1.5))
+    (found,) = embedded(Shown("albedo", "truth", values, white=1.5))
     assert (found["name"], found["of"], found["size"]) == ("albedo", "truth", [5, 4, 3])
-    assert found["box"] == [0.5, 0.25, 1.0]
     cells = values.permute(1, 2, 3, 0) if colors else values[..., None]
     expected = 255 * srgb.encode(np.clip(cells.numpy() / 1.5, 0, 1))
     assert np.abs(found["cells"] - expected).max() <= 0.501
@@ -158,7 +171,7 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
     """By means of blocks, those at the far ends of what is left over."""
     monkeypatch.setattr(volumes, "MOST_CELLS", 20)
     values = torch.rand(5, 4, 6, generator=torch.Generator().manual_seed(1))
-    (found,) = embedded(Shown("density", "result", values, (1.0, 1.0, 1.0), white=1.0))
+    (found,) = embedded(Shown("density", "result", values, white=1.0))
     assert found["size"] == [3, 2, 3]
     expected = 255 * srgb.encode(float(values[4:, 2:, 2:4].mean()))
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
@@ -167,7 +180,7 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
     """Blue below, red above, as strong as far from zero: in pages and in pictures alike."""
     values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
-    (found,) = embedded(Shown("g", "result", values, (1.0, 1.0, 1.0), find_white_value(values)))
+    (found,) = embedded(Shown("g", "result", values, find_white_value(values)))
     page = found["cells"][0, 0].astype(float)
     picture = srgb.encode_bytes(slices(values)[0, :5]).astype(float)
     for blue, light_blue, white, light_red, red in (page, picture):
@@ -178,10 +191,96 @@ def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
 
 
 def test_what_is_drawn_has_a_name_and_a_role() -> None:
-    page = page_text(volume=describe_volume([], 1, (0.0, 0.0, 1.0)))
+    page = page_text(volume=describe_volume([], WORLD))
     canvases = re.findall("<canvas[^>]*>", page)
     assert len(canvases) == 6
     assert all('role="img"' in one and 'aria-label="' in one for one in canvases)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_cameras_and_lights_stand_where_the_scene_has_them(is_perspective: bool) -> None:
+    """In boxes from the middle; corners are seen in the middles of the image's corner pixels."""
+    grid = Grid((4, 6, 2), (1.0, 2.0, 3.0), (2.0, 5.0, 4.0))
+    camera = make_camera((9.0, 5.0, 20.0), (5, 8), is_perspective=is_perspective)
+    scene = make_scene(torch.ones(4, 6, 2), camera=camera, grid=grid, travel=(0.0, -2.0, 0.0))
+    told = describe_world(grid, scene)
+    assert told["light"] == [0, 1, 0] and told["sides"] == [1, 3, 1] and told["low"] == (3, 2, 1)
+    assert told["cameras"][0]["name"] == "view"
+    middle = camera.pose.new_tensor(grid.center_xyz)
+    places = middle.new_tensor(told["cameras"][0]["corners"]) * 3 + middle
+    pixels, _ = project(camera, places[1:])
+    expected = middle.new_tensor([[0.5, 0.5], [7.5, 0.5], [7.5, 4.5], [0.5, 4.5]])
+    torch.testing.assert_close(pixels, expected, rtol=0, atol=1e-3)
+    nearest = camera.pose[:, 3] if is_perspective else places[0]
+    torch.testing.assert_close(places[0], nearest, rtol=0, atol=1e-4)
+    assert is_perspective or float((places[0] - middle).norm()) < 1.2 * 3 * FARTHEST
+    # A point light is where it is, seen from the middle.
+    lamp = PointLight(torch.tensor([3.5, 3.5, 9.5]), torch.ones(3))
+    assert describe_world(grid, replace(scene, lights=[lamp]))["light"] == [0, 0, 1]
+
+
+SCRIPT = """
+const fs = require("fs");
+const valueOf = new Function(`${fs.readFileSync(process.argv[1], "utf8")} return valueOf;`)();
+const read = (field) => [...Array(field.size[0]).keys()].map((x) => valueOf(field, x, 0, 0));
+console.log(JSON.stringify(JSON.parse(fs.readFileSync(0, "utf8")).map(read)));
+"""
+
+
+def test_pages_read_out_what_a_cell_holds() -> None:
+    """Within half a step of the eight bits that they have, of signed fields as well."""
+    row, signed = torch.linspace(0, 2, 9), torch.linspace(-0.6, 0.6, 9)
+    fields = [
+        Shown("density", "result", row.view(1, 1, 9), 2.0),
+        Shown("albedo", "result", torch.stack([row, row / 2, row / 4]).view(3, 1, 1, 9), 2.0),
+        Shown("g", "result", signed.view(1, 1, 9), 0.6),
+    ]
+    contents = embedded(*fields)
+    for content in contents:
+        content["bytes"] = content.pop("cells").ravel().tolist()
+    density, albedo, g = map(np.array, run_script("volumes.js", SCRIPT, contents))
+    np.testing.assert_allclose(density[:, 0], row, atol=0.01)
+    np.testing.assert_allclose(albedo, np.stack([row, row / 2, row / 4], -1), atol=0.01)
+    np.testing.assert_allclose(g[:, 0], signed, atol=0.005)
+
+
+STAGE = """
+const fs = require("fs");
+globalThis.devicePixelRatio = 1;
+globalThis.document = { querySelectorAll: () => [] };
+globalThis.sight = { cameras: true };
+const drawn = [[], []];
+const contexts = drawn.map((points) => new Proxy(
+  { lineTo: (x, y) => points.push([x, y]) }, { get: (own, key) => own[key] ?? (() => 0) }));
+const layers = contexts.map(
+  (context) => ({ clientWidth: 300, clientHeight: 200, getContext: () => context }));
+const text = fs.readFileSync(process.argv[1], "utf8");
+const [world, drawAround] = new Function(`${text} return [world, drawAround];`)();
+Object.assign(world, { low: [0, 0, 0], sides: [2, 2, 2], cameras: [] });
+const sides = { eye: [0, 0, 2], right: [1, 0, 0], up: [0, 1, 0], forward: [0, 0, -1] };
+drawAround(layers, sides, 0.5);
+console.log(JSON.stringify(drawn));
+"""
+
+
+def test_a_box_is_drawn_where_an_eye_sees_its_corners() -> None:
+    """A cube of two units, from two boxes away: its far half behind the smoke, the near before."""
+    told = run_script("stage.js", STAGE)
+    for points, depth in zip(told, (2.5, 1.5), strict=True):
+        seen = {tuple(np.round(point, 6)) for point in points}
+        reach = round(0.5 / depth / 0.5 * 100, 6)
+        corners = {(150 + a * reach, 100 + b * reach) for a in (-1, 1) for b in (-1, 1)}
+        assert {tuple(np.round(corner, 6)) for corner in corners} <= seen
+
+
+def run_script(name: str, code: str, told: object = None) -> Any:
+    """What `code` prints as JSON, given the path of the script `name` and what it is `told`."""
+    if (node := shutil.which("node")) is None:
+        pytest.skip("no node here to run the scripts of a page")
+    command = [node, "-e", code, str(ASSETS / name)]
+    done = subprocess.run(command, input=json.dumps(told), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 def framed(text: str) -> str:

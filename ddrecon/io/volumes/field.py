@@ -18,6 +18,8 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
+Facts = Mapping[str, str | np.ndarray]
+"""What is the same everywhere, by name: texts, and arrays of one number or three."""
 VECTORS = ("velocity",)
 """Names of fields whose three numbers are along x, y and z, not colors."""
 EMPTY = 1e-4

@@ -11,7 +11,7 @@ import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.io.volumes.field import BOX, VECTORS, Field, Fields
+from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
 from ddrecon.io.volumes.plain import npz_names, read_npz, read_vol, write_npz, write_vol
 from ddrecon.io.volumes.vdb_read import read_vdb, vdb_names
@@ -22,18 +22,20 @@ from ddrecon.io.volumes.vdb_write import write_vdb
 class VolumeFormat:
     """How one kind of volume file is read and written.
 
-    Without `names`, a file holds one field and does not name it; without `write` it is only read.
+    Without `names`, a file holds one field and does not name it; without `write` it is only read,
+    and with `has_metadata` facts about fields are written.
     """
 
-    write: Callable[[Path, Fields, np.ndarray], None] | None
+    write: Callable[..., None] | None
     read: Callable[[Path, str], Field]
     names: Callable[[Path], list[str]] | None = None
+    has_metadata: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(write_npz, read_npz, npz_names),
     ".vol": VolumeFormat(write_vol, read_vol),
-    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names),
+    ".vdb": VolumeFormat(write_vdb, read_vdb, vdb_names, True),
     ".nc": VolumeFormat(None, read_netcdf, netcdf_names),
 }
 WRITTEN = [suffix for suffix, kind in FORMATS.items() if kind.write]
@@ -91,15 +93,18 @@ def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -
     write_fields(path, {name: values}, bounds)
 
 
-def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+def write_fields(
+    path: Path, fields: Fields, bounds: np.ndarray, facts: Facts | None = None
+) -> None:
     """Writes several fields of the same cells, by name, each as `write_field` does.
 
-    Raises FormatError where the format holds but one field, or is not written.
+    `facts` are written where the format takes any. Raises FormatError where it holds but one field,
+    or is not written.
     """
-    write = _format_of(path).write
-    if write is None:
+    kind = _format_of(path)
+    if (write := kind.write) is None:
         raise FormatError(path, f"{path.suffix} is read, not written: take {', '.join(WRITTEN)}")
-    write(path, fields, np.asarray(bounds, np.float64))
+    write(path, fields, np.asarray(bounds, np.float64), *[facts or {}] * kind.has_metadata)
 
 
 def _format_of(path: Path) -> VolumeFormat:

@@ -3,7 +3,8 @@
 Each field is a fog volume of its own name, of type float, or vec3s for colors. Voxel (i, j, k) of a
 file is our cell (i, j, k) along x, y, z; its center is where the grid's transform puts that index.
 The background is 0, and active is what `prune` leaves. How many cells the box has, which a sparse
-grid does not say, is its metadata `ddrecon_resolution`.
+grid does not say, is its metadata `ddrecon_resolution`; facts about the fields are metadata as
+well. Vectors of `VECTORS` are of no class, and turn with their grid.
 
 They are of the plainest kind: not compressed, no tiles.
 """
@@ -18,7 +19,7 @@ import numpy as np
 
 from ddrecon.io.files.arrays import as_float32
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import Fields, prune
+from ddrecon.io.volumes.field import VECTORS, Facts, Fields, prune
 from ddrecon.io.volumes.vdb_read import HEADER, MAGIC, POSITIONS, RESOLUTION
 from ddrecon.io.volumes.vdb_tree import ACTIVE_MASK, LEAF, LOWER, SIDE, UPPER, VOXELS
 
@@ -28,29 +29,30 @@ TREES = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 """Values of a voxel, by the kind of tree."""
 
 
-def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+def write_vdb(path: Path, fields: Fields, bounds: np.ndarray, facts: Facts) -> None:
     """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes, pruned.
 
-    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform.
+    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform; all `facts`,
+    texts and one number or three, become metadata of each.
     """
     data = HEADER.pack(MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1)
     data += str(uuid.uuid4()).encode() + _metadata({}) + struct.pack("<I", len(fields))
     for name, values in fields.items():
-        data += _grid(name, prune(as_float32(values)), bounds, len(data))
+        data += _grid(name, prune(as_float32(values)), bounds, facts, len(data))
     with replace_file(path) as temporary:
         temporary.write_bytes(data)
 
 
-def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> bytes:
-    """The grid of `values`, for the place `start` in a file."""
+def _grid(name: str, values: np.ndarray, bounds: np.ndarray, facts: Facts, start: int) -> bytes:
+    """The grid of `values`, and `facts`, for the place `start` in a file."""
     tree, components = list(TREES.items())[values.ndim - 3]
     descriptor = _text(name) + _text(tree) + _text("")
     cells = values.shape[2::-1]
-    labels = {
-        "class": ("string", b"fog volume"),
-        "name": ("string", name.encode()),
-        RESOLUTION: ("vec3i", struct.pack("<3i", *cells)),
-    }
+    labels = {name: _label(fact) for name, fact in facts.items()}
+    labels |= {"class": _label("fog volume"), "name": _label(name)}
+    labels |= {RESOLUTION: ("vec3i", struct.pack("<3i", *cells))}
+    if name in VECTORS:
+        labels |= {"class": _label("unknown"), "vector_type": _label("contravariant relative")}
     places, is_active, voxels = _leaves(values)
     topology, order = _topology(places, [_bits(mask) for mask in is_active], bytes(4 * components))
     # The map from index to world: a translation, a scale, and what OpenVDB derives from it.
@@ -113,6 +115,13 @@ def _topology(places: np.ndarray, masks: list[bytes], background: bytes) -> tupl
         data += struct.pack("<3i", *(place << (LEAF + LOWER + UPPER) for place in root))
         add_node(np.flatnonzero(which.ravel() == index), UPPER, LOWER)
     return data, order
+
+
+def _label(fact: str | np.ndarray) -> tuple[str, bytes]:
+    """The type and value of the metadata that says `fact`."""
+    if isinstance(fact, str):
+        return "string", fact.encode()
+    return {1: "float", 3: "vec3s"}[fact.size], fact.astype("<f4").tobytes()
 
 
 def _metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:

@@ -1,17 +1,33 @@
-// The pictures of a film, one at a time, with a slider that goes from frame to frame.
+// A film, one frame at a time: its pictures and its volume, by a slider or played.
 "use strict";
 
-function makeFilm(film) {
-  const figures = [...film.querySelectorAll("figure")];
-  const slider = document.createElement("input");
-  slider.type = "range";
-  slider.max = figures.length - 1;
-  slider.value = 0;
-  slider.setAttribute("aria-label", "frame");
-  const show = () => figures.forEach((figure, at) => (figure.hidden = at !== Number(slider.value)));
-  slider.addEventListener("input", show);
-  film.prepend(slider);
+function makeFilm() {
+  const control = document.querySelector("#film");
+  if (!control) return;
+  const numbers = JSON.parse(control.dataset.frames);
+  const [button, slider] = control.children;
+  const output = control.querySelector("output");
+  slider.max = numbers.length - 1;
+  const show = () => {
+    const at = Number(slider.value);
+    for (const film of document.querySelectorAll(".film"))
+      [...film.children].forEach((figure, index) => (figure.hidden = index !== at));
+    output.textContent = `frame ${numbers[at]}`;
+    slider.setAttribute("aria-valuetext", output.textContent);
+    chooseFrame(numbers[at]);
+    if (shownField) showField();
+  };
+  let timer;
+  const play = (isPlayed) => {
+    clearInterval(timer);
+    timer = isPlayed && setInterval(() => {
+      slider.value = (Number(slider.value) + 1) % numbers.length;
+      show();
+    }, Math.max(40, 4000 / numbers.length));
+    button.setAttribute("aria-pressed", Boolean(isPlayed));
+  };
+  button.addEventListener("click", () => play(!timer));
+  slider.addEventListener("input", () => (play(false), show()));
+  control.hidden = false;
   show();
 }
-
-for (const film of document.querySelectorAll(".film")) makeFilm(film);

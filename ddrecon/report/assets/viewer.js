@@ -43,7 +43,6 @@ float noise(vec2 at) { return fract(52.9829189 * fract(dot(at, vec2(0.06711056, 
 void main() {
   vec2 at = (2.0 * gl_FragCoord.xy - pixels) / pixels.y * tangent;
   vec3 way = normalize(forward + at.x * right + at.y * up);
-  vec3 behind = mix(vec3(0.004, 0.005, 0.008), vec3(0.018, 0.023, 0.035), gl_FragCoord.y / pixels.y);
   vec2 span = cross_box(eye, way);
   vec3 sum = vec3(0.0);
   float clear = 1.0;
@@ -69,11 +68,12 @@ void main() {
       clear *= kept;
     }
   }
-  color = vec4(pow(sum + clear * behind, vec3(1.0 / 2.2)), 1.0);
+  vec3 seen = pow(sum, vec3(1.0 / 2.2));
+  color = vec4(seen, max(1.0 - pow(clear, 1.0 / 2.2), max(seen.r, max(seen.g, seen.b))));
 }`;
 
 // What all viewers of a page share, so that result and truth turn together.
-const sight = { yaw: 0.6, pitch: 0.25, distance: 2.0, opacity: 16, low: 0.03, high: 1, palette: 0 };
+const sight = { yaw: 0.6, pitch: 0.25, distance: 2.0, opacity: 16, low: 0.03, high: 1, palette: 0, cameras: true };
 const viewers = [];
 
 function redrawAll(isMoving = false) {
@@ -81,11 +81,11 @@ function redrawAll(isMoving = false) {
 }
 
 class Viewer {
-  // Throws where there is no WebGL 2. `of` is "result" or "truth".
-  constructor(canvas, of, upAxis) {
+  // Throws where there is no WebGL 2. `of` is "result" or "truth"; `layers` are behind and before it.
+  constructor(canvas, of, layers) {
     this.canvas = canvas;
     this.of = of;
-    this.upAxis = upAxis;
+    this.layers = layers;
     this.gl = canvas.getContext("webgl2", { antialias: false });
     if (!this.gl) throw new Error("no WebGL 2");
     this.program = this.link();
@@ -114,7 +114,6 @@ class Viewer {
   show(name) {
     const density = fields.get(`${this.of} density`) ?? fields.get(`${this.of} ${name}`);
     const shown = fields.get(`${this.of} ${name}`) ?? density;
-    this.box = density.box;
     this.upload("density", density);
     this.upload("values", shown);
     this.hasColors = shown.channels === 3;
@@ -138,7 +137,7 @@ class Viewer {
     this.isMoving = isMoving;
     this.frame ??= requestAnimationFrame(() => {
       this.frame = undefined;
-      if (this.box) this.draw();
+      if (this.textures.values) this.draw();
     });
   }
 
@@ -150,11 +149,12 @@ class Viewer {
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.useProgram(this.program);
     const at = (name) => gl.getUniformLocation(this.program, name);
-    const longest = Math.max(...this.box);
-    for (const [name, vector] of Object.entries({ ...this.camera(), half_box: this.box.map((side) => side / longest / 2) }))
-      gl.uniform3fv(at(name), vector);
+    const longest = Math.max(...world.sides);
+    const [camera, tangent] = [this.camera(), 0.36 * Math.max(1, canvas.height / canvas.width)];
+    const vectors = { ...camera, half_box: world.sides.map((side) => side / longest / 2) };
+    for (const [name, vector] of Object.entries(vectors)) gl.uniform3fv(at(name), vector);
     gl.uniform2f(at("pixels"), canvas.width, canvas.height);
-    gl.uniform1f(at("tangent"), 0.36 * Math.max(1, canvas.height / canvas.width));
+    gl.uniform1f(at("tangent"), tangent);
     for (const name of ["opacity", "low", "high"]) gl.uniform1f(at(name), sight[name]);
     gl.uniform1i(at("steps"), this.isMoving ? 64 : 160);
     gl.uniform1i(at("palette"), sight.palette && this.hasColors ? 2 : sight.palette);
@@ -164,15 +164,16 @@ class Viewer {
       gl.uniform1i(at(slot), unit);
     });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    drawAround(this.layers, camera, tangent);
   }
 
-  // Where the eye is and its axes, in boxes, with the axis `upAxis` upwards.
+  // Where the eye is and its axes, in boxes.
   camera() {
     const vector = (sideways, upwards, towards) => {
       const result = [0, 0, 0];
-      result[(this.upAxis + 2) % 3] = sideways;
-      result[this.upAxis] = upwards;
-      result[(this.upAxis + 1) % 3] = towards;
+      result[(world.up + 2) % 3] = sideways;
+      result[world.up] = upwards;
+      result[(world.up + 1) % 3] = towards;
       return result;
     };
     const [cy, sy, cp, sp] = [Math.cos(sight.yaw), Math.sin(sight.yaw), Math.cos(sight.pitch), Math.sin(sight.pitch)];
@@ -182,7 +183,7 @@ class Viewer {
       forward: vector(...away.map((part) => -part)),
       right: vector(cy, 0, -sy),
       up: vector(-sy * sp, cp, -cy * sp),
-      light: vector(0.45, 0.8, 0.4),
+      light: world.light ?? vector(0.45, 0.8, 0.4),
     };
   }
 
@@ -224,10 +225,9 @@ class Viewer {
   }
 }
 
-// Looks from where `eye` (x, y, z, as text) is, with the axis `upAxis` upwards.
-function lookFrom(eye, upAxis) {
-  const parts = eye.split(" ").map(Number);
-  const [sideways, upwards, towards] = [parts[(upAxis + 2) % 3], parts[upAxis], parts[(upAxis + 1) % 3]];
+// Looks from the side where `eye` (x, y, z) is.
+function lookFrom(eye) {
+  const [sideways, upwards, towards] = [2, 0, 1].map((more) => eye[(world.up + more) % 3]);
   sight.yaw = Math.atan2(sideways, towards);
   sight.pitch = Math.atan2(upwards, Math.hypot(sideways, towards));
 }
@@ -252,5 +252,6 @@ function turn(yaw, pitch) {
 }
 
 function zoom(factor) {
-  sight.distance = Math.min(8, Math.max(0.3, sight.distance * factor));
+  const farthest = Math.max(4, ...world.cameras.map(({ corners }) => Math.hypot(...corners[0])));
+  sight.distance = Math.min(2 * farthest, Math.max(0.3, sight.distance * factor));
 }

@@ -10,6 +10,7 @@ import pytest
 from refusals import refusal
 
 from ddrecon.errors import DataWarning
+from ddrecon.io.volumes.field import Facts
 from ddrecon.io.volumes.table import field_names, read_field, write_fields
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
@@ -21,8 +22,8 @@ def sparse(*shape: int, seed: int = 0) -> np.ndarray:
     return np.where(rng.random(shape) > 0.999, rng.random(shape), 0).astype(np.float32)
 
 
-def written(path: Path, **fields: np.ndarray) -> Path:
-    write_fields(path, fields, BOUNDS)
+def written(path: Path, facts: Facts | None = None, **fields: np.ndarray) -> Path:
+    write_fields(path, fields, BOUNDS, facts)
     return path
 
 
@@ -39,6 +40,21 @@ def test_the_tools_of_openvdb_list_the_grids(tmp_path: Path) -> None:
     assert "Tree_vec3s_5_4_3" in albedo and "Tree_float_5_4_3" in filled
     assert f"Number of active voxels:       {np.count_nonzero(density)}\n" in filled
     assert empty.startswith("sigma_a\n") and "Background value: 0\n" in empty
+
+
+def test_openvdb_knows_facts_and_what_vectors_are(tmp_path: Path) -> None:
+    """Numbers, colors and texts are metadata of each grid; arrows turn with a grid, colors not."""
+    facts = {"sigma_t": np.array([1.5, 2, 4]), "g": np.array(0.25), "units": "sigma_t [1/u] µ"}
+    vectors = dict.fromkeys(("velocity", "albedo"), sparse(9, 4, 5, 3))
+    path = written(tmp_path / "smoke.vdb", facts, density=sparse(9, 4, 5), **vectors)
+    told = "[[g['sigma_t'], g['g'], g['units']] for g in grids.values()]"
+    assert openvdb_python.described(told, path) == 3 * [[[1.5, 2, 4], 0.25, facts["units"]]]
+    kinds = "{n: [g.gridClass, g.metadata.get('vector_type')] for n, g in grids.items()}"
+    assert openvdb_python.described(kinds, path) == {
+        "density": ["fog volume", None],
+        "albedo": ["fog volume", None],
+        "velocity": ["unknown", "contravariant relative"],
+    }
 
 
 def test_only_leaves_that_hold_something_are_there(tmp_path: Path) -> None:
