@@ -47,7 +47,7 @@ COMMON = (
     click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
     DEBUG,
 )
-FEWER = {"info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG)}
+FEWER = {"info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG), "import_": (DEBUG,)}
 """The common options of commands that compute nothing."""
 ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 """Waiting threads spin for a moment, then sleep; said before torch is loaded.

@@ -9,7 +9,7 @@ from itertools import pairwise
 import click
 
 from ddrecon import __version__
-from ddrecon.cli.file_commands import export, info
+from ddrecon.cli.file_commands import export, import_, info
 from ddrecon.cli.scene_commands import balance, check, optimize, render, uncertainty
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.engine import engine_versions
@@ -68,6 +68,6 @@ def main() -> None:
 
 
 OF_SCENES = check, render, balance, optimize, uncertainty
-ALL = (*OF_SCENES, gradcheck, reference, bench, export, info)
+ALL = (*OF_SCENES, gradcheck, reference, bench, export, import_, info)
 for command in ALL:
     main.add_command(command)

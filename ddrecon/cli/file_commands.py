@@ -1,4 +1,4 @@
-"""Commands that take data files: export, info."""
+"""Commands that take data files: export, import, info."""
 
 from __future__ import annotations
 
@@ -109,6 +109,26 @@ def _require_volumes(session: Session, sources: Sequence[Path]) -> None:
 def _is_scene(source: Path) -> bool:
     """Whether `source` is a scene file or, perhaps, the folder of a run."""
     return source.is_dir() or source.suffix in SCENE_SUFFIXES
+
+
+@click.command("import")
+@click.argument("source", type=click.Path(path_type=Path), metavar="FILE.xml")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="SCENE.yaml",
+    help="The scene file; its volume and its sky go beside it.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@in_session
+def import_(session: Session, source: Path, output: Path, overwrite: bool) -> None:
+    """Write a scene file of a Mitsuba 3 scene: a grid volume in a cube, its lights and cameras."""
+    from ddrecon.reference.scene_import import import_scene
+
+    written = import_scene(source, output, may_exist=overwrite)
+    click.echo(f"written: {', '.join(map(str, written))}")
 
 
 @click.command()

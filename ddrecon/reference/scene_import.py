@@ -1,0 +1,198 @@
+"""Mitsuba's scenes as scene files of ours: a grid volume in a cube, its lights and its cameras.
+
+What a plugin holds is asked of the loaded scene, so that Mitsuba's own defaults count. Volumes are
+evaluated at the centers of the cells of `sigma_t`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ddrecon.errors import DataWarning, FormatError, SceneError
+from ddrecon.io.files.arrays import check_size
+from ddrecon.io.files.folders import require_free_files
+from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images.oiio import write_exr
+from ddrecon.io.volumes.table import write_fields
+from ddrecon.reference.trace import load_mitsuba
+from ddrecon.scene_file.load import dump_scene
+
+TOLERANCE = 1e-4
+"""By which matrices of a rotation, and boxes, relative to their size, may differ."""
+
+
+def import_scene(source: Path, path: Path, *, may_exist: bool) -> list[Path]:
+    """Writes the Mitsuba scene in the file `source` (.xml) to `path` (.yaml), and its volume and
+    its sky beside that; returns their paths.
+
+    Raises FormatError for a file that Mitsuba refuses and for what we have no words for, UsageError
+    where a file exists and `may_exist` is False, MissingExtraError without Mitsuba.
+    """
+    module = load_mitsuba()
+    module.set_variant("scalar_rgb")
+    with guard_reading(source):
+        source.stat()
+    try:
+        scene = module.load_file(str(source))
+        volume, fields, bounds = _volume(module, scene)
+        lights, sky = list[dict[str, Any]](), None
+        for emitter in scene.emitters():
+            light, pixels = _light(module, emitter)
+            lights.append(light)
+            sky = pixels if sky is None else sky
+        views = [_view(module, sensor) for sensor in scene.sensors()]
+    except (SceneError, RuntimeError) as error:
+        raise FormatError(source, " ".join(str(error).split())) from error
+    stored, picture = (path.with_name(f"{path.stem}.{end}") for end in ("volume.npz", "sky.exr"))
+    written = [path, stored, *([picture] if sky is not None else [])]
+    require_free_files(written, may_exist=may_exist)
+    write_fields(stored, fields, bounds)
+    if sky is not None:
+        write_exr(picture, sky)
+    for name in fields:
+        volume[name] = {"file": stored.name}
+    for light in lights:
+        light |= {"file": picture.name} if light["type"] == "environment" else {}
+    dump_scene({"volume": volume, "lights": lights, "views": views}, path)
+    return written
+
+
+def _parts(module: ModuleType, plugin: Any) -> dict[str, Any]:
+    """What `plugin` holds, by Mitsuba's names: numbers, and other plugins."""
+    parameters = module.traverse(plugin)
+    parts = {key: parameters[key] for key in parameters.keys()}  # noqa: SIM118  not a mapping
+
+    class Callback(module.TraversalCallback):  # type: ignore[name-defined]
+        def put(self, name: str, value: Any, *_: Any) -> None:
+            if isinstance(value, module.Object):
+                parts[name] = value
+
+    plugin.traverse(Callback())
+    return parts
+
+
+def _volume(module: ModuleType, scene: Any) -> tuple[dict[str, Any], dict[str, Any], np.ndarray]:
+    """The section of the volume, its fields [z, y, x] or [z, y, x, 3], and its box [2, 3]."""
+    shapes = [shape for shape in scene.shapes() if shape.interior_medium()]
+    if others := len(scene.shapes()) - len(shapes):
+        warnings.warn(f"left out: {others} shapes without a medium inside", DataWarning, 3)
+    if len(shapes) != 1 or shapes[0].class_name() != "Cube":
+        raise SceneError(f"expected one cube with a medium inside, found {len(shapes)} such shapes")
+    medium = _parts(module, shapes[0].interior_medium())
+    grid, phase = medium["sigma_t"], medium["phase_function"]
+    if grid.class_name() != "GridVolume":
+        raise SceneError(f"sigma_t is a {grid.class_name()}; expected a gridvolume")
+    bounds = np.array([grid.bbox().min, grid.bbox().max], np.float64).reshape(2, 3)
+    corners = np.array(_parts(module, shapes[0])["vertex_positions"]).reshape(-1, 3)
+    away = np.abs(corners - bounds[:, None]).min(0) / np.ptp(bounds, axis=0)
+    if away.max() > TOLERANCE or (np.ptp(corners, axis=0) == 0).any():
+        raise SceneError("the cube is not the box of its gridvolume, or does not lie along x, y, z")
+    if phase.class_name() not in ("HGPhaseFunction", "IsotropicPhaseFunction"):
+        raise SceneError(f"phase function {phase.class_name()}: only hg and isotropic are read")
+    volume: dict[str, Any] = {"sigma_t": float(medium["scale"])}
+    fields = {"density": _evaluate(module, grid, grid, bounds)}
+    if fields["density"].ndim == 4:  # by color
+        fields = {"sigma_t": fields["density"] * volume["sigma_t"]}
+        volume["density"] = 1
+    albedo = _evaluate(module, medium["albedo"], grid, bounds)
+    flat = albedo.reshape(-1, albedo.shape[3] if albedo.ndim == 4 else 1)
+    if np.ptp(flat, axis=0).any():
+        fields["albedo"] = albedo
+    else:
+        volume["albedo"] = _plain(flat[0])
+    parts = _parts(module, phase)
+    return volume | ({"g": float(parts["g"])} if "g" in parts else {}), fields, bounds
+
+
+def _evaluate(module: ModuleType, volume: Any, grid: Any, bounds: np.ndarray) -> np.ndarray:
+    """`volume` at the centers of the cells of `grid`, whose box `bounds` is."""
+    cells = [int(count) for count in grid.resolution()]
+    check_size(12 * math.prod(cells), Path("sigma_t"), "the volume")
+    axes = [
+        low + (np.arange(n) + 0.5) / n * (high - low)
+        for n, low, high in zip(cells, *bounds, strict=True)
+    ]
+    points = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], -1).reshape(-1, 3)
+    inside, values = module.Interaction3f(), np.empty(points.shape, np.float32)
+    for cell, point in enumerate(points.tolist()):
+        inside.p = point
+        values[cell] = np.ravel(volume.eval(inside))
+    values = values.reshape(*cells[::-1], 3)
+    return values[..., 0] if (values == values[..., :1]).all() else values
+
+
+def _light(module: ModuleType, emitter: Any) -> tuple[dict[str, Any], np.ndarray | None]:
+    """A light, and of an environment map its pixels [h, w, 3]."""
+    parts, kind = _parts(module, emitter), emitter.class_name()
+    if kind == "DirectionalEmitter":
+        direction = _matrix(parts["to_world"])[:3, 2]
+        color = _texture(module, parts["irradiance"])
+        return {"type": "directional", "direction": direction.tolist(), "irradiance": color}, None
+    if kind == "ConstantBackgroundEmitter":
+        return {"type": "ambient", "radiance": _texture(module, parts["radiance"])}, None
+    if kind == "PointLight":
+        place = np.ravel(parts["position"]).tolist()
+        color = _texture(module, parts["intensity"])
+        return {"type": "point", "position": place, "intensity": color}, None
+    if kind != "EnvironmentMapEmitter":
+        raise SceneError(f"{kind}: only directional, constant, point and envmap are read")
+    turn = _matrix(parts["to_world"])[:3, :3]
+    up = "z" if abs(turn[2, 1]) > 0.5 else "y"
+    level = np.array([turn[0], turn[2], -turn[1]]) if up == "z" else turn
+    angle = math.atan2(level[0, 2], level[0, 0])
+    cosine, sine = math.cos(angle), math.sin(angle)
+    if np.abs(level - [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]).max() > TOLERANCE:
+        raise SceneError("an envmap is turned about another axis than its pole, which is y or z")
+    light = {"type": "environment", "scale": float(parts["scale"]), "up": up}
+    # Mitsuba keeps a column more on both sides, so that the map wraps around.
+    pixels = np.array(parts["data"], np.float32)[:, 1:-1]
+    return light | {"rotation": math.degrees(angle)}, pixels
+
+
+def _view(module: ModuleType, sensor: Any) -> dict[str, Any]:
+    """A camera, with the size of its film."""
+    parts, kind = _parts(module, sensor), sensor.class_name()
+    film = sensor.film()
+    width, height = (int(count) for count in film.size())
+    matrix = _matrix(parts["to_world"])
+    sides = np.linalg.norm(matrix[:3, :3], axis=0)
+    pose = np.eye(4)
+    pose[:3] = np.stack([-matrix[:3, 0], matrix[:3, 1], -matrix[:3, 2], matrix[:3, 3]], 1)
+    pose[:3, :3] /= sides
+    if list(film.crop_size()) != [width, height]:
+        raise SceneError(f"{sensor.id()}: the film is cropped")
+    camera: dict[str, Any] = {"matrix": pose.tolist(), "resolution": [width, height]}
+    if kind == "PerspectiveCamera":
+        offsets = (parts[f"principal_point_offset_{axis}"] for axis in "xy")
+        middle = [0.5 - float(offset) for offset in offsets]
+        fov = float(parts["x_fov"])
+        camera |= {"type": "perspective", "fov": fov, "principal_point": middle}
+    elif kind == "OrthographicCamera":
+        aspect = float(sides[1] / sides[0])
+        camera |= {"type": "orthographic", "width": 2 * float(sides[0]), "pixel_aspect": aspect}
+    else:
+        raise SceneError(f"{kind}: only perspective and orthographic cameras are read")
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", sensor.id())
+    return ({"name": name} if name else {}) | {"camera": camera}
+
+
+def _matrix(transform: Any) -> np.ndarray:
+    """[4, 4] of a transform."""
+    return np.array(transform.matrix, np.float64)
+
+
+def _texture(module: ModuleType, texture: Any) -> float | list[float]:
+    """The color of a `texture` that is the same everywhere."""
+    return _plain(np.ravel(texture.eval(module.SurfaceInteraction3f())))
+
+
+def _plain(color: np.ndarray) -> float | list[float]:
+    numbers: list[float] = color.tolist()
+    return numbers[0] if len(set(numbers)) == 1 else numbers
