@@ -20,7 +20,7 @@ def time_iteration(scene: Scene) -> float:
     run, points = Reconstruction(scene), list[tuple[int, float]]()
     for _ in range(BEGUN):
         run.step()
-    frame, levels = run.frame, len(run.problem.factors)
+    frame, levels = run.frames[0], len(run.problem.factors)
     for level in range(levels)[:2]:
         frame.enter(level)
         frame.evaluate()  # what is prepared once
