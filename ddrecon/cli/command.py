@@ -44,7 +44,6 @@ COMMON = (
     ),
     click.option("--seed", type=click.IntRange(-(2**31), 2**32 - 1), default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),
-    click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
     DEBUG,
 )
 FEWER = {"info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG), "import_": (DEBUG,)}

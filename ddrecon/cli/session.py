@@ -50,7 +50,6 @@ class Session:
     threads: int | None = None
     seed: int = 0
     quiet: bool = False
-    verbose: bool = False
     dtype: str = "float64"
     report: Path | None = None
     place: torch.device | None = None
@@ -158,7 +157,7 @@ class Session:
 
     def progress(self, items: Sequence[Any], text: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
-        return tqdm(items, desc=text, leave=self.verbose, **bar_settings(self.is_quiet))
+        return tqdm(items, desc=text, leave=False, **bar_settings(self.is_quiet))
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""

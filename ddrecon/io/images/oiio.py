@@ -78,7 +78,7 @@ def read_hdr(path: Path) -> np.ndarray:
     if b"\nCOLORCORR" in head[1]:
         raise FormatError(path, "has corrected colors (COLORCORR); save it as .exr")
     exposures = re.findall(rb"^EXPOSURE *=(.*)$", head[1], re.MULTILINE)
-    return as_float32(pixels / math.prod(map(float, exposures)))
+    return as_float32(pixels * (1 / math.prod(map(float, exposures))))
 
 
 def read_tiff(path: Path) -> np.ndarray:

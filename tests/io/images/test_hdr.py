@@ -69,7 +69,7 @@ REFUSED = {
     "another format": ("-Y 2 +X 9", b"P6\n", "is no HDR image"),
     "XYZ": ("-Y 2 +X 9", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n", "FORMAT"),
     "exposure": ("-Y 2 +X 9", HEADER + b"EXPOSURE=bright\n", "is damaged"),
-    "no exposure": ("-Y 2 +X 9", HEADER + b"EXPOSURE=0\n", "at row"),
+    "no exposure": ("-Y 2 +X 9", HEADER + b"EXPOSURE=0\n", "is damaged"),
     "corrected colors": ("-Y 2 +X 9", HEADER + b"COLORCORR=1 1 1\n", "COLORCORR"),
     "turned": ("+Y 2 +X 9", HEADER, "turned rows"),
     "no size": ("-Y two +X 9", HEADER, "is damaged"),
