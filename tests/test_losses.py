@@ -83,6 +83,8 @@ def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones(
     )
     assert small == pytest.approx(1e-4, rel=1e-9)
     assert larger - large == pytest.approx(2 * HUBER * 10, rel=1e-9)
+    # The line touches the parabola where it begins.
+    assert large == pytest.approx(HUBER**2 + 2 * HUBER * (10.0 - HUBER), rel=1e-9)
 
 
 def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:

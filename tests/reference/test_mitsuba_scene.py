@@ -165,6 +165,16 @@ def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused()
         described(scene)
 
 
+def test_a_table_of_values_goes_from_backward_to_forward() -> None:
+    scene = make_scene(random_values(*SHAPE))
+    scene.volume.phase = Tabulated(2 + even_angles(STEPS).cos()[None])
+    phase = described(scene)["medium"]["phase"]
+    values = [float(value) for value in phase["values"].split(", ")]
+    cosine = torch.linspace(-1, 1, len(values), dtype=torch.float64)
+    expected = scene.volume.phase.value(cosine)[0]
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
+
+
 def test_two_environment_maps_are_refused() -> None:
     lights = every_light(random_values(1))
     with pytest.raises(SceneError, match="2 environment maps"):
