@@ -7,9 +7,10 @@ another, where in ddrecon the calls come from. The iteration is one of `configs/
 resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels.
 
 A call is an operation of torch, which on a GPU costs at least 5 microseconds; not counted are views
-of tensors, memory without numbers yet, and numbers that are read. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
-depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
-numbers, for which it waits as well. All are counted alike on a machine without a GPU.
+of tensors, memory without numbers yet, and numbers that are read. A launch is that of a fused
+kernel. A read hands a tensor's numbers, or a size that depends on them, to Python: there the
+processor waits for a GPU. A write makes a tensor of Python's numbers, for which it waits as well.
+All are counted alike on a machine without a GPU.
 """
 
 from __future__ import annotations
@@ -180,9 +181,7 @@ def launches_counted(counts: Counts) -> Iterator[None]:
 
 
 def begin_plume(cells: int, pixels: int, rounds: int, device: str) -> Reconstruction:
-    """The gray plume of `bench`, from half its density and its own image: no rounds are the paper's
-    case.
-    """
+    """The gray plume of `bench`, from half its density; without `rounds` it is the paper's case."""
     scene = plume_scene(cells, pixels, torch.float32, torch.device(device))
     settings = replace(scene.diffusion, transport_rounds=rounds)
     return start_run(replace(scene, diffusion=settings))

@@ -97,11 +97,12 @@ class Operator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E3.2)."""
+        adjoint = -adjoint
         conductance_bars = (
-            difference(adjoint, axis).mul_(difference(u, axis)).neg_().sum_to_size(c.shape)
+            difference(adjoint, axis).mul_(difference(u, axis)).sum_to_size(c.shape)
             for axis, c in self.along_axes
         )
-        return (adjoint * u).neg_().sum_to_size(self.loss.shape), *conductance_bars
+        return (adjoint * u).sum_to_size(self.loss.shape), *conductance_bars
 
     def change(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Tensor:
         """dA u = dloss u + G^T (dc G u) of each axis (E3.1)."""

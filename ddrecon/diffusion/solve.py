@@ -156,7 +156,7 @@ def _iterate(
         helps = steps.square <= at_least
         torch.where(helps, steps.square, at_least, out=steps.square)
         torch.where(helps, steps.residual, source, out=steps.residual)
-        steps.solution.masked_fill_(~helps, 0)
+        steps.solution.mul_(helps)
         steps.direction.zero_()
         steps.previous.fill_(1)
     while iteration != count:

@@ -15,6 +15,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_in_cells, turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
@@ -28,7 +29,12 @@ def scatter_once_more(medium: Medium, light: Tensor) -> Tensor:
 def _factors(medium: Medium) -> Tensor:
     """(1 - f) p_l, or p_l, by the degree l."""
     moments = remaining_moments(medium)
-    return moments if medium.is_cellwise else (1 - medium.forward_fraction) * moments
+    return moments if medium.is_cellwise else _lessen(moments, medium.forward_fraction)
+
+
+@remember
+def _lessen(moments: Tensor, fraction: Tensor) -> Tensor:
+    return (1 - fraction) * moments
 
 
 def scatter_towards(

@@ -291,8 +291,8 @@ class Reconstruction:
         def precondition(vectors: Sequence[Values]) -> list[Values]:
             fields = dict[str, Tensor]()
             for key, diagonal in self.diagonals.items():
-                bars = torch.stack([vector[key] for vector in vectors]) * free[key]
-                fields[key] = metrics[key].solve(bars) if key in metrics else bars / diagonal
+                bars, metric = torch.stack([vector[key] for vector in vectors]), metrics.get(key)
+                fields[key] = metric.solve(bars) if metric else bars * free[key] / diagonal
             return [
                 {key: bars[n] for key, bars in fields.items()}
                 | self.numbers.precondition(vector, free)

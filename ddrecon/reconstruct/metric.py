@@ -76,18 +76,19 @@ class FieldMetric:
         grid, unit = parameter.grid, parameter.unit
         factor = weight * parameter.tv / unit**2
         faces, slope = face_stiffness(value / unit, grid, parameter.knee, factor)
-        self._slope, self._free = torch.ones_like(value) if slope is None else slope, free
+        slope = torch.ones_like(value) if slope is None else slope
+        self._scale = free / slope
         z, y, x = map(_with_colors, faces)
         held = tuning.HELD * torch.stack([z, y, x]).max() * (1 - free)
-        loss = _with_colors(diagonal / self._slope**2 + held)
+        loss = _with_colors(diagonal / slope**2 + held)
         periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
         self._operator = Operator((z, y, x), loss, periodic, grid.spacing)
 
     def solve(self, residual: Tensor) -> Tensor:
         """The inverse metric times `residual` [..., z, y, x], one or several, of what is free."""
-        right = _with_colors(residual * self._free / self._slope)
+        right = _with_colors(residual * self._scale)
         solution = solve_by_multigrid(self._operator, right, None, 0.0, tuning.CYCLES).value
-        return solution.view_as(residual) * self._free / self._slope
+        return solution.view_as(residual) * self._scale
 
 
 def _with_colors(field: Tensor) -> Tensor:

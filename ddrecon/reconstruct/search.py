@@ -164,7 +164,7 @@ class Search:
             change = _combine(of_loss, of_prior, self.weight)
             change = {name: bar * free[name] for name, bar in change.items()}
             curvature = _dot(move, change)
-            pairs.append((move, change, torch.where(curvature > 0, 1 / curvature, 0.0)))
+            pairs.append((move, change, ((curvature > 0) / curvature).nan_to_num()))
         weights = list[Tensor]()
         for move, change, inverse in reversed(pairs):
             weights.append(inverse * _dot(move, residual))

@@ -189,7 +189,7 @@ template <class F> INLINE void advance(const Pass<F>& p, F* work, F* solution, S
         });
     if (p.kind == ADVANCE) {
         REORDERED
-        if (cells.start == 0) number[PREVIOUS] = number[POWER];  // which nobody reads meanwhile
+        if (cells.start == 0) number[PREVIOUS] = number[POWER]; // which nobody reads meanwhile
         INDEPENDENT
         for (int i = 0; i < cells.width; ++i) {
             u[i] += step * d[i];

@@ -96,6 +96,8 @@ class KernelPasses(Passes):
         return coarsening, pair_cells(operator, axis, faces, loss)
 
     def run(self) -> None:
+        # Nothing depends on scales: a GPU finds those of all grids at once, at the end.
+        self.rows.sort(key=lambda row: row["kind"] == Kind["SCALE"])
         program, nothing = Program(self, "prepare"), self.like.new_empty(1)
         program.run(program.bind(nothing, nothing), 0)
 
@@ -259,11 +261,15 @@ def _list_launches(
 ) -> list[dict[str, int]]:
     """Launches of the passes from `first` to `last`.
 
-    A pass over more than `most` cells is one. Others share it, an item does a color of them all.
+    A pass over more than `most` cells is one, but for scales, which do not depend on each other.
+    Others share it, an item does a color of them all.
     """
     launches = list[dict[str, int]]()
     for number, row in enumerate(rows[first:last], first):
         is_large = row["items"] * row["width"] > most
+        if number > first and row["kind"] == rows[number - 1]["kind"] == Kind["SCALE"] and most < 0:
+            launches[-1]["end"] = number + 1
+            continue
         if launches and launches[-1]["shares"] and not is_large:
             launches[-1]["end"] = number + 1
             continue
@@ -283,7 +289,7 @@ def passes_kernel(name: str, bits: int) -> TextKernel:
     for (int k = begin; k < end; ++k) {{
         const Pass<F>& pass = ((const Pass<F>*)table)[k];
         const Size from = shares ? pass.items * item / shares : item;
-        const Size to = shares ? pass.items * (item + 1) / shares : item + 1;
+        const Size to = shares ? pass.items * (item + 1) / shares : item + (item < pass.items);
         for (Size i = from; i < to; ++i) {name}(pass, work, solution, {steps}, i);
     }}
     """
