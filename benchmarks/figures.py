@@ -40,6 +40,7 @@ COMMANDS = {
     "capture": "python benchmarks/reconstruction.py capture",
     "film": "python benchmarks/reconstruction.py film",
     "replay": "python benchmarks/path_replay.py --paths 4 16",
+    "cloud": "python benchmarks/cloud_path_replay.py FOLDER/wdas_cloud_sixteenth.vdb",
     "engines": "python benchmarks/engines.py",
     "tangents": "python benchmarks/engines.py --tangents",
     "launches": "python benchmarks/launches.py",
@@ -59,8 +60,8 @@ COMMANDS = {
 """By the name of a figure, what prints it."""
 KEPT_BY_THEMSELVES = ("fig10", "paper")
 """Scripts that keep their tables: the paper's, of one experiment or of all."""
-COPIED = ("pyshdom",)
-"""Figures of a copy in FOLDER that its license keeps out of here: measured where there is one."""
+COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb"}
+"""Figures of what licenses keep out of here, and its place in FOLDER: measured where it is."""
 SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
     ("the same, worst", "eleven", "worst", "default"),
@@ -188,7 +189,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     references = given.references.resolve()
-    absent = [name for name in COPIED if not (references / name).exists()]
+    absent = [name for name, place in COPIED.items() if not (references / place).exists()]
     absent += [] if shutil.which("nvidia-smi") else ["gpu"]
     chosen = given.names or [name for name in COMMANDS if name not in absent]
     for name in [] if given.write else chosen:

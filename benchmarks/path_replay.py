@@ -31,7 +31,7 @@ from torch.nn.functional import adaptive_avg_pool3d
 from ddrecon.bench.measure import Shot, shoot
 from ddrecon.bench.plume import plume_scene
 from ddrecon.grid import Grid
-from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
+from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene, sensor_id
 from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
 
@@ -44,8 +44,8 @@ DENSITY, ALBEDO = ".sigma_t.data", ".albedo.value.value"
 
 @dataclass(frozen=True)
 class Replay:
-    """Mitsuba on the first view of a gray scene: `gradients` of a loss by what `parameters` are
-    called `names`.
+    """Mitsuba on views of a gray scene: `gradients` of a loss by what `parameters` are called
+    `names`.
     """
 
     module: Any
@@ -55,10 +55,12 @@ class Replay:
     headroom: float
 
     @staticmethod
-    def of(scene: Scene, headroom: float = HEADROOM) -> Replay:
-        """That of `scene`, on as many threads as torch has; `headroom` 1: as Mitsuba comes."""
+    def of(scene: Scene, headroom: float = HEADROOM, views: int = 1) -> Replay:
+        """That of the first `views` of `scene`, on as many threads as torch has; `headroom` 1: as
+        Mitsuba comes.
+        """
         module = load_mitsuba(torch.get_num_threads())
-        described = mitsuba_scene(scene, scene.views[:1]) | {
+        described = mitsuba_scene(scene, scene.views[:views]) | {
             MEDIUM: mitsuba_scene(_pad_scene(scene, headroom), [])[MEDIUM]
         }
         loaded = module.load_dict(make_mitsuba_objects(module, described))
@@ -85,18 +87,24 @@ class Replay:
         return np.array(self.module.render(self.scene, sensor=0, seed=seed, spp=paths), np.float32)
 
     def gradients(
-        self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int
+        self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int, view: int = 0
     ) -> tuple[float, list[np.ndarray]]:
-        """`loss_of` the image by so many `paths` a pixel, and its derivatives by the parameters
-        called `names`.
+        """`loss_of` the image of number `view` by so many `paths` a pixel, and its derivatives by
+        the parameters called `names`.
         """
         import drjit
 
+        (sensor,) = (s for s in self.scene.sensors() if s.id() == sensor_id(view))
         for name in names:
             drjit.enable_grad(self.parameters[name])
         self.parameters.update()
         image = self.module.render(
-            self.scene, self.parameters, integrator=self.integrator, sensor=0, seed=seed, spp=paths
+            self.scene,
+            self.parameters,
+            integrator=self.integrator,
+            sensor=sensor,
+            seed=seed,
+            spp=paths,
         )
         loss = loss_of(image)
         drjit.backward(loss)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     Bounds,
+    ByLabel,
     HenyeyGreensteinSection,
     MediumSection,
     MieSection,
@@ -103,14 +104,15 @@ class _Medium:
 
     def read_fields(self) -> None:
         """Reads the quantities that files give cell by cell; raises SceneError or FormatError."""
-        files = [
-            name for name, (_, value) in self.quantities.items() if isinstance(value, FieldFile)
-        ]
+        kinds = FieldFile | ByLabel
+        files = [name for name, (_, value) in self.quantities.items() if isinstance(value, kinds)]
         self.fields |= dict(zip(files, gather(self.read_field, files), strict=True))
 
     def read_field(self, variable: str) -> tuple[str, Field]:
         """The key at which the scene names the file of `variable`, and its content."""
         water, (name, value) = self.section.sigma_t, self.quantities[variable]
+        if isinstance(value, ByLabel):
+            return self.read_labels(variable, name, value)
         called = value.name or variable.removeprefix(PHASE)
         is_free = variable == "density" and not isinstance(water, Water)
         unit = None if is_free else UNITS.get(variable)
@@ -122,6 +124,32 @@ class _Medium:
             raise self.refused("sigma_t.meters", f"is {water.meters:g}, {fault}")
         return key, field
 
+    def read_labels(self, variable: str, name: str, value: ByLabel) -> tuple[str, Field]:
+        """The same where `value`, at the key `name`, gives `variable` by label."""
+        key = f"volume.{self.prefix}{name}."
+        read = partial(read_field, name=value.name)
+        field = read_referenced(self.maker.scene_file, f"{key}labels", value.labels, read)
+        by_label = self.known(variable, f"{name}.table", value.table)
+        labels = field.values.astype(np.int64)
+        if field.values.ndim != 3 or (labels != field.values).any() or labels.min() < 0:
+            raise FormatError(
+                value.labels, f"{value.name} are not whole numbers from 0, one a cell"
+            )
+        if labels.max() >= len(by_label):
+            fault = f"expected one for each label, {labels.max() + 1} with 0, found {len(by_label)}"
+            raise self.refused(f"{name}.table", fault)
+        return f"{key}labels", replace(field, values=by_label[labels].astype(np.float32))
+
+    def known(self, variable: str, key: str, values: Sequence[Any]) -> np.ndarray:
+        """`values` of `variable` at `key`, numbers or colors, as [n] or [n, 3]; else SceneError."""
+        kind, colors = kind_of(_kind_name(variable)), [np.ravel(color) for color in values]
+        if not kind.is_color and max(map(len, colors)) > 1:
+            raise self.refused(key, "expected numbers: colors belong to the cross sections")
+        known = np.stack(np.broadcast_arrays(*colors))
+        if not kind.allows(torch.from_numpy(known)):
+            raise self.refused(key, f"must be {kind.limits}")
+        return known.squeeze(1) if known.shape[1] == 1 else known
+
     def spread_profiles(self, grid: Grid) -> None:
         """Evaluates the quantities that are given by height at the centers of cells of `grid`."""
         axis = "zyx".index(self.maker.tree.volume.up)
@@ -129,17 +157,13 @@ class _Medium:
         for variable, (name, value) in self.quantities.items():
             if not isinstance(value, Profile):
                 continue
-            key, kind = f"{name}.values", kind_of(_kind_name(variable))
-            colors = [np.ravel(color) for color in value.values]
-            if not kind.is_color and max(map(len, colors)) > 1:
-                raise self.refused(key, "expected numbers: colors belong to the cross sections")
-            known = np.stack(np.broadcast_arrays(*colors), 1)
-            if not kind.allows(torch.from_numpy(known)):
-                raise self.refused(key, f"must be {kind.limits}")
-            column = np.stack([np.interp(centers, value.heights, color) for color in known], -1)
+            key = f"{name}.values"
+            known = self.known(variable, key, value.values)
+            columns = np.atleast_2d(known.T)
+            column = np.stack([np.interp(centers, value.heights, color) for color in columns], -1)
             sides = [size for side, size in enumerate(grid.shape) if side != axis]
             cells = np.moveaxis(np.broadcast_to(column, (*sides, *column.shape)), 2, axis).copy()
-            field = Field(cells[..., 0] if len(known) == 1 else cells)
+            field = Field(cells[..., 0] if known.ndim == 1 else cells)
             self.fields[variable] = f"volume.{self.prefix}{key}", field
 
     def values(self, name: str) -> Tensor:

@@ -60,8 +60,23 @@ class Water:
     meters: float = bounded(above=0)
 
 
-Density = float | FieldFile | Profile
-Quantity = Color | FieldFile | Profile
+@dataclass(frozen=True)
+class ByLabel:
+    """Values by the label of each cell, as segmentations of tissue have them.
+
+    labels: A volume file of whole numbers, from 0.
+    table: A value for each label.
+    name: The field's name in the file, where that is not `labels`.
+    """
+
+    labels: Path
+    table: tuple[Color, ...]
+    name: str = "labels"
+
+
+ByCell = FieldFile | Profile | ByLabel
+Density = float | ByCell
+Quantity = Color | ByCell
 
 
 @dataclass(frozen=True)
@@ -184,7 +199,7 @@ class MediumSection:
                 yield "effective_radius", "is that of droplets, phase: {type: mie, ...}"
         elif (by_cell is None) == (self.phase.effective_radius is None):
             yield "phase", "give droplets one effective_radius: here, or volume.effective_radius"
-        is_field = isinstance(getattr(self.phase, "g", None), FieldFile | Profile)
+        is_field = isinstance(getattr(self.phase, "g", None), ByCell)
         if type(self) is MediumSection and is_field:
             yield "phase", "the g of a medium is the same in all cells where there are two"
 

@@ -15,6 +15,7 @@ from ddrecon import defaults
 from ddrecon.errors import SceneError
 from ddrecon.io.volumes.table import write_field, write_fields
 from ddrecon.scene_file.build import load_scene
+from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
 Write = Callable[[str], Path]
 BOUNDS = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
@@ -146,6 +147,29 @@ def test_values_by_height_are_linear_between_them_and_even_beyond(write: Write, 
     part = (0.5 + 2 * place).clamp(0, 1)
     expected = torch.stack([top + (1 - top) * part for top in (1, 2, 3)]).expand(3, 4, 3, 2)
     torch.testing.assert_close(medium.sigma_a, expected)
+
+
+def test_values_by_label_are_those_of_fields(write: Write, tmp_path: Path) -> None:
+    """A table of optical properties, of whose rows each cell's label picks one."""
+    labels = np.random.default_rng(3).integers(0, 3, (4, 3, 2))
+    table = {"sigma_a": [[0, 0, 0], [1, 2, 3], 4], "sigma_s": [0.5, 0, 7], "g": [0, 0.9, -0.5]}
+    np.savez(tmp_path / "mouse.npz", labels=labels.astype(np.uint8), bounds=BOUNDS)
+    by_label, by_field = {}, {}
+    for name, values in table.items():
+        rows = np.stack(np.broadcast_arrays(*map(np.atleast_1d, values))).astype(np.float32)
+        np.savez(tmp_path / f"{name}.npz", **{name: rows[labels].squeeze(), "bounds": BOUNDS})
+        by_field[name] = {"file": f"{name}.npz"}
+        by_label[name] = {"labels": "mouse.npz", "table": values}
+    expected, found = (
+        load_scene(write(volume(("resolution", "bounds"), density=1, **medium))).volume
+        for medium in (by_field, by_label)
+    )
+    assert expected.grid == found.grid
+    for name in ("density", "sigma_a", "sigma_s", "g"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    scene_file = read_scene(write(volume(("resolution", "bounds"), density=1, **by_label)))
+    dump_scene(describe(scene_file), tmp_path / "again.yaml")
+    assert torch.equal(load_scene(tmp_path / "again.yaml").volume.sigma_a, expected.sigma_a)
 
 
 def test_an_absent_file_is_the_scenes_mistake(write: Write):

@@ -21,21 +21,24 @@ SCENES = f"""
 volume.g=.nan => volume.g: expected a finite number
 volume.g=1e400 => volume.g: expected a finite number
 volume.g=2 => -D volume.g=2: volume.g: must be below 1, found 2
-volume.density=[1, 2, 3] => expected a number, {{file: ...}} or {{heights: ...}}, found a list of 3
+volume.density=[1, 2, 3] => {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found a list of 3
 volume.density={{constant: -1}} => volume.density.constant: must be at least 0
 volume.density={{constant: 1, file: a.npz}} => volume.density.constant: unknown key
 volume.density={{file: 3}} => density.file: expected a file, found 3 (put it in quotes)
 volume.density={{file: "a\\0"}} => volume.density.file: expected text that can be printed
 volume.density={{file: gone.npz}} => volume.density.file: gone.npz does not exist
 volume.density={{file: {"n" * 5000}}} => -D volume.density={{file: nnn
-volume.sigma_a=[1, 2] => [r, g, b], {{file: ...}} or {{heights: ...}}, found a list of 2
-volume.sigma_a=red => [r, g, b], {{file: ...}} or {{heights: ...}}, found 'red'
-volume.sigma_a=true => [r, g, b], {{file: ...}} or {{heights: ...}}, found true
+volume.sigma_a=[1, 2] => [r, g, b], {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found a list
+volume.sigma_a=red => [r, g, b], {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found 'red'
+volume.sigma_a=true => [r, g, b], {{file: ...}}, {{heights: ...}} or {{labels: ...}}, found true
 volume.density={{heights: [0, 0], values: [1, 2]}} => heights: must go up from one to the next
 volume.density={{heights: [0, 1], values: [1]}} => density.values: expected one for each height, 2
 volume.density={{heights: [0], values: [-1]}} => volume.density.values: must be at least 0
 volume.density={{heights: [0], values: [[1, 2, 3]]}} => density.values: expected numbers: colors
 volume.g={{heights: [0], values: [2]}} => volume.g.values: must be at least -0.99 and at most 0.99
+volume.density={{labels: two.npz, table: [1, 2]}} => density.table: expected one for each label, 3
+volume.density={{labels: two.npz, table: [1, 2, -3]}} => volume.density.table: must be at least 0
+volume.density={{labels: two.npz, table: [1, 2, [1, 2, 3]]}} => expected numbers: colors
 volume.albedo=0.5 => volume: give only one of sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1}} => volume: missing sigma_a and sigma_s or sigma_t and albedo
 volume={{density: 1, sigma_t: 1}} => volume: missing key 'albedo'
@@ -72,7 +75,7 @@ views=[] => views: expected a list with at least one entry
 views=ring => views: expected a list with at least one entry or a mapping, found 'ring'
 views={{images: "*.exr"}} => views: missing ring or transforms or colmap
 {RING}, image: "*.exr"}} => views.image: unknown key; did you mean 'images'?
-{RING}, images: "*.npz"}} => views.images: '*.npz' matches 5 files, but the ring has 3 cameras
+{RING}, images: "*.npz"}} => views.images: '*.npz' matches 6 files, but the ring has 3 cameras
 {RING}, transforms: t.json}} => views: give only one of ring or transforms
 views={{ring: {{count: 3, radius: 1, fov: 30}}}} => views.ring: missing key 'resolution'
 views={{transforms: gone.json}} => views.transforms: gone.json does not exist, or is not a file
@@ -153,6 +156,7 @@ volume.density={file: cells.npz, name: colors} => colors belong to the cross sec
 volume.density={file: cells.npz, name: below} => below is below 0 at cell (x, y, z) = (0, 0, 0)
 volume={density: 1, sigma_t: 1, albedo: {file: cells.npz, name: two}} => two is above 1 at cell
 volume.g={file: cells.npz, name: steep} => steep is above 0.99 at cell (x, y, z) = (0, 0, 0)
+volume.density={labels: cells.npz, name: density, table: [1]} => density are not whole numbers
 views.0.image=nan.npy => nan.npy: NaN at row 0, column 0
 views.0.image=sky.npy => sky.npy: is 6 x 4 pixels, but views.0.camera has 8 x 6
 views.0.mask=sky.npy => sky.npy: is 6 x 4 pixels, but views.0.camera has 8 x 6
@@ -173,6 +177,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_fields(folder / "cells.npz", fields, BOX)
     wide = {"density": np.ones((2, 2, 3)), "sigma_a": np.ones((2, 2, 3))}
     write_fields(folder / "wide.npz", wide, BOX)
+    write_fields(folder / "two.npz", {"labels": np.full((4, 3, 2), 2)}, BOX)
     write_fields(folder / "moved.npz", {"density": cells}, 2 * BOX)
     np.savez(folder / "boxless.npz", density=np.ones((2, 2, 2)))
     np.save(folder / "nan.npy", np.full((6, 8, 3), np.nan))
