@@ -16,7 +16,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.ground import Ground, Plane
 from ddrecon.light.lights import PointLight
 from ddrecon.picture import render
-from ddrecon.scene import Scene, View
+from ddrecon.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("few_directions")
 SHAPE, CELL = (8, 10, 10), 0.1
