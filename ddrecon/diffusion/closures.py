@@ -11,6 +11,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -94,7 +95,9 @@ def _inverse_thickness(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     (axis,) = {0, 1, 2} - {*grid.periodic}
     around = [dim for dim in AXES if dim != axis + 1]
     haze = BACKGROUND / grid.extent[axis]
-    layers = sum((term.scale * term.field.mean(around, keepdim=True) for term in weight), 0.0)
+    layers = reduce(
+        torch.add, (term.scale * term.field.mean(around, keepdim=True) for term in weight)
+    )
     filled = (layers + NOTHING * haze) / (layers + haze)
     thickness = GAP * grid.spacing[axis] * filled.sum((1, 2, 3), keepdim=True)
     return (filled / thickness).expand(-1, *grid.shape).contiguous()
