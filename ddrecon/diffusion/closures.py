@@ -11,11 +11,13 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
+from ddrecon.diffusion.operator import AXES
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient
 from ddrecon.settings import FLOOR
@@ -30,8 +32,10 @@ COARSE_CELLS = 32
 
 16, 32 and 64 render alike.
 """
-GAP = 1.0
-"""In a box that repeats light spreads in gaps of so many times its thickness."""
+GAP, NOTHING = 1.0, 1e-3
+"""In a medium that repeats light spreads in gaps of `GAP` times its thickness, of which empty
+layers are so small a part: beyond the medium nothing holds it up.
+"""
 
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -61,10 +65,13 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
     The weight is a sum of coefficients >= 0: a field that colors share is transformed once for all.
     It is computed on a coarse grid and interpolated. Outside a sphere this is
     1 / (distance to its center), exactly: Newton's shell theorem. Where the box repeats without end
-    all matter is infinitely far in the mean: the distance is that of gaps, as thick as the box.
+    all matter is infinitely far in the mean: the distance is that of gaps, as thick as the box or,
+    along two axes, as all layers that have any medium.
     """
     if grid.periodic:
         sides = (side for axis, side in enumerate(grid.extent) if axis not in grid.periodic)
+        if len(grid.periodic) == 2:
+            return _inverse_thickness(weight, grid)
         return weight[0].field.new_full((1, *grid.shape), 1 / (GAP * min(sides)))
     coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
     # The haze, kappa_tr [1/u] that cells have besides their own.
@@ -81,6 +88,19 @@ def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
         for axis, few in enumerate(coarse.shape)
     )
     return (z @ (y @ (potentials / total)).flatten(2)).unflatten(2, (len(y), -1)) @ x.mT
+
+
+def _inverse_thickness(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
+    """1 over the thickness of all layers that have `weight` [1/u], and next to 0 where none has."""
+    (axis,) = {0, 1, 2} - {*grid.periodic}
+    around = [dim for dim in AXES if dim != axis + 1]
+    haze = BACKGROUND / grid.extent[axis]
+    layers = reduce(
+        torch.add, (term.scale * term.field.mean(around, keepdim=True) for term in weight)
+    )
+    filled = (layers + NOTHING * haze) / (layers + haze)
+    thickness = GAP * grid.spacing[axis] * filled.sum((1, 2, 3), keepdim=True)
+    return (filled / thickness).expand(-1, *grid.shape).contiguous()
 
 
 @functools.lru_cache(maxsize=32)
