@@ -236,4 +236,4 @@ def _combine(first: Values, second: Values, weight: float) -> Values:
 
 def _add(total: Values, addend: Values, weight: Tensor, sign: int = 1) -> Values:
     """The sum of `total` and `weight` times `addend`, or their difference."""
-    return {n: torch.addcmul(v, addend[n], weight, value=sign) for n, v in total.items()}
+    return {n: torch.addcmul(v, addend[n], weight.to(v), value=sign) for n, v in total.items()}
