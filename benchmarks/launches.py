@@ -183,7 +183,8 @@ def launches_counted(counts: Counts) -> Iterator[None]:
 def begin_plume(cells: int, pixels: int, rounds: int, device: str) -> Reconstruction:
     """The gray plume of `bench`, from half its density; without `rounds` it is the paper's case."""
     scene = plume_scene(cells, pixels, torch.float32, torch.device(device))
-    settings = replace(scene.diffusion, transport_rounds=rounds)
+    # A medium that is sought is received in whole cells, whatever this one deserves.
+    settings = replace(scene.diffusion, transport_rounds=rounds, receive=1)
     return start_run(replace(scene, diffusion=settings))
 
 

@@ -152,11 +152,11 @@ def _iterate(
         steps.turn()
         steps.power.copy_(steps.curvature)
         steps.advance()
-        # A guess that is worse than zero is not used.
-        helps = steps.square <= at_least
-        torch.where(helps, steps.square, at_least, out=steps.square)
-        torch.where(helps, steps.residual, source, out=steps.residual)
-        steps.solution.mul_(helps)
+        # A guess that is no better than zero, or not finite, is not used.
+        torch.fmin(steps.square, at_least, out=steps.square)
+        is_useless = steps.square >= at_least
+        torch.where(is_useless, source, steps.residual, out=steps.residual)
+        steps.solution.masked_fill_(is_useless, 0)
         steps.direction.zero_()
         steps.previous.fill_(1)
     while iteration != count:

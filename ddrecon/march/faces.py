@@ -252,8 +252,8 @@ def scatter_back(medium: Medium, rays: Rays) -> Tensor:
     3/4 p_1 n · w, at least 0, against the sum of the rays (E2.17).
     """
     towards, grid = _look_back(rays.direction), medium.grid
-    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1, 1, 1)
-    p_1 = cells_at_faces(grid, p_1) if medium.is_cellwise else p_1.flatten(1)
+    p_1 = remaining_moments(medium)[1] if medium.degree else towards.new_zeros(1, 1)
+    p_1 = cells_at_faces(grid, p_1) if medium.is_cellwise and medium.degree else p_1.flatten(1)
     outward = towards[None] @ _outward(grid, towards.dtype, towards.device)
     return (0.5 - 0.75 * outward * p_1).clamp(min=0)
 

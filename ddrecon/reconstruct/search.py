@@ -236,4 +236,10 @@ def _combine(first: Values, second: Values, weight: float) -> Values:
 
 def _add(total: Values, addend: Values, weight: Tensor, sign: int = 1) -> Values:
     """The sum of `total` and `weight` times `addend`, or their difference."""
-    return {n: torch.addcmul(v, addend[n], weight.to(v), value=sign) for n, v in total.items()}
+
+    def of_type(value: Tensor) -> Tensor:
+        return (
+            weight if value.ndim else weight.to(value)
+        )  # two plain numbers would be of the larger
+
+    return {n: torch.addcmul(v, addend[n], of_type(v), value=sign) for n, v in total.items()}

@@ -134,7 +134,7 @@ PHASES: dict[str, PhaseFunction] = {
     "blend": Blend(
         Rayleigh(CENTER),
         HenyeyGreenstein(CENTER.new_tensor(0.7)),
-        torch.linspace(0, 1, 12).expand(12, 12, 12),
+        torch.linspace(0, 1, 12).to(CENTER).expand(12, 12, 12),
     ),
     "by color": HenyeyGreenstein(CENTER.new_tensor([0.5, 0.0, -0.5])),
 }
