@@ -84,11 +84,16 @@ class FieldMetric:
         periodic = tuple(axis for axis in grid.periodic if grid.shape[axis] > 1)
         self._operator = Operator((z, y, x), loss, periodic, grid.spacing)
 
-    def solve(self, residual: Tensor) -> Tensor:
-        """The inverse metric times `residual` [..., z, y, x], one or several, of what is free."""
-        right = _with_colors(residual * self._scale)
-        solution = solve_by_multigrid(self._operator, right, None, 0.0, tuning.CYCLES).value
-        return solution.view_as(residual) * self._scale
+    def solve(self, residuals: Tensor) -> Tensor:
+        """The inverse metric times several `residuals` [N, ..., z, y, x], of what is free."""
+        right, colors = _with_colors(residuals * self._scale), len(self._operator.loss)
+        # Fields of one color are as colors of one field.
+        parts = right.split(colors) if colors > 1 else [right]
+        solutions = [
+            solve_by_multigrid(self._operator, part, None, 0.0, tuning.CYCLES).value
+            for part in parts
+        ]
+        return torch.cat(solutions).view_as(residuals) * self._scale
 
 
 def _with_colors(field: Tensor) -> Tensor:

@@ -120,16 +120,17 @@ def test_what_no_picture_shows_is_held_by_a_part_of_what_they_show(
     assert bool((bare < least).any())
 
 
+@pytest.mark.parametrize(("name", "colors"), [("density", ()), ("emission", (3,))])
 def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, colors: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against the dense matrix: H plus the curvature of smoothing, of free rows and columns."""
     monkeypatch.setattr(tuning, "CYCLES", 30)
     monkeypatch.setattr(tuning, "HELD", 1e9)
-    shape, weight, grid = (4, 5, 6), 0.5, box_grid((4, 5, 6))
+    shape, weight, grid = (*colors, 4, 5, 6), 0.5, box_grid((4, 5, 6))
     value = torch.full(shape, 0.2, dtype=torch.float64)
-    parameter = Parameter("density", ParameterSettings(tv=0.1), value, grid, unit=0.7)
-    diagonal, residual = 1e-3 + random_values(*shape), random_values(*shape, seed=2)
+    parameter = Parameter(name, ParameterSettings(tv=0.1), value, grid, unit=0.7)
+    diagonal, residuals = 1e-3 + random_values(*shape), random_values(2, *shape, seed=2)
     free = (random_values(*shape, seed=3) > 0.3).double()
 
     def smoothing(x: torch.Tensor) -> torch.Tensor:
@@ -137,7 +138,8 @@ def test_a_field_moves_by_the_inverse_of_its_metric_where_it_is_free(
 
     curvature = torch.autograd.functional.hessian(smoothing, value.flatten())
     matrix, at = diagonal.flatten().diag() + weight * curvature, free.flatten().nonzero()[:, 0]
-    wanted = torch.zeros(value.numel()).double()
-    wanted[at] = torch.linalg.solve(matrix[at[:, None], at], residual.flatten()[at])
+    wanted = torch.zeros(2, value.numel()).double()
+    wanted[:, at] = torch.linalg.solve(matrix[at[:, None], at], residuals.flatten(1)[:, at].T).T
     metric = FieldMetric(parameter, value, diagonal, weight, free)
-    torch.testing.assert_close(metric.solve(residual).flatten(), wanted, rtol=1e-5, atol=1e-7)
+    moves = metric.solve(residuals).flatten(1)
+    torch.testing.assert_close(moves, wanted, rtol=1e-5, atol=1e-7)
