@@ -8,6 +8,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.cameras import Rays
 from ddrecon.diffusion.cells import average_cells, sharpen
@@ -54,7 +55,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     grid, cells = exchange_grid(scene)
     thin = medium_of(volume_at_level(scene.volume, grid, cells), settings)
     ambient = ambient_radiance(sources, thin.g).flatten()
-    from_below = light_from_below(average_cells(thin), plane, ambient, grid)
+    from_below = light_from_below(average_cells(thin), plane, ambient)
     lit = light_evenly(ground, sources, thin.grid, ambient)
     for _ in range(EXCHANGES if thin.grid.periodic else 1):
         up = from_below(*reflect(lit, thin, scene.render))
@@ -62,10 +63,17 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         down = partial(send_down, first, plane, multiply_scatters(thin, settings))
         lit = light_texels(lit, sources, thin, down, scene.render)
     sent = reflect(lit, thin, scene.render)
-    if grid != medium.grid:
-        from_below = light_from_below(average_cells(medium), plane, ambient, grid)
-    light_field = find_light(medium, sources, settings, memory, from_below(*sent))
+    below = _spread(from_below(*sent), medium.grid, cells)
+    light_field = find_light(medium, sources, settings, memory, below)
     return replace(light_field, ground=replace(lit, sent=sent))
+
+
+def _spread(light: Tensor, grid: Grid, cells: Cells) -> Tensor:
+    """`light` [K, C, z, y, x] of these `cells` of `grid`, in all of them as in the nearest."""
+    light = resample(light, grid.cut(cells))
+    ends = [(at.start, count - at.stop) for at, count in zip(cells, grid.shape, strict=True)]
+    z, y, x = ends
+    return pad(light, (*x, *y, *z), mode="replicate") if any(map(any, ends)) else light
 
 
 def exchange_grid(scene: Scene) -> tuple[Grid, Cells]:

@@ -164,13 +164,12 @@ def hemisphere(axis: int, count: int, power: float) -> tuple[Tensor, Tensor]:
 
 
 def light_from_below(
-    medium: Medium, plane: Plane, ambient: Tensor, grid: Grid
+    medium: Medium, plane: Plane, ambient: Tensor
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """phi of what a ground at `plane` sends into `medium`, not yet scattered, as a function (E5.3).
 
     Its arguments are the ground's radiance `even` [C], and in `texels` [C, rows, columns] how much
-    more that is, under `grid`. It returns phi less that of light that is `ambient` [C] from
-    everywhere.
+    more that is. It returns phi less that of light that is `ambient` [C] from everywhere.
     """
     directions, angles = (field.to(ambient) for field in hemisphere(plane.axis, UPWARDS, 1.0))
     rays = Sky(directions, angles[:, None], directions[..., None] * angles[:, None, None])
@@ -183,7 +182,7 @@ def light_from_below(
     points = [centers[across] - travel[across] * drift for across in plane.across]
 
     def send(even: Tensor, texels: Tensor) -> Tensor:
-        more = look_up_texels(texels, grid, plane, *points).transpose(0, 1)
+        more = look_up_texels(texels, medium.grid, plane, *points).transpose(0, 1)
         sent = passed * ((even - ambient).view(-1, 1, 1, 1) + more)
         return torch.tensordot(weights.T, sent, 1)
 
