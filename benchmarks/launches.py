@@ -1,10 +1,11 @@
 """What an iteration of a reconstruction asks of the machine: calls, launches, waits.
 
-    python benchmarks/launches.py [--views 3] [--device cpu] [--modules]
+    python benchmarks/launches.py [--views 3] [--device cpu] [--modules] [--plume] [--as-a-gpu]
 
 Prints a table in Markdown: of each engine without and with a transport round; with `--modules`
 another, where in ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full
-resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels.
+resolution; `--plume` takes the gray one of `bench`, in one view of 512 x 512 pixels. `--as-a-gpu`
+makes a GPU's choices on a processor (`tests/as_on_a_gpu.py`), which takes some minutes.
 
 A call is an operation of torch, which on a GPU costs at least 5 microseconds; not counted are views
 of tensors, memory without numbers yet, and numbers that are read. A launch is that of a fused
@@ -19,7 +20,7 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
@@ -249,17 +250,23 @@ def main() -> None:
     parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
     parser.add_argument("--plume", action="store_true")
     parser.add_argument("--modules", action="store_true")
+    parser.add_argument("--as-a-gpu", action="store_true")
     options = parser.parse_args()
+    if options.as_a_gpu:
+        sys.path.append(str(ROOT / "tests"))
+        from as_on_a_gpu import as_on_a_gpu
+    choices = as_on_a_gpu if options.as_a_gpu else nullcontext
     torch.set_num_threads(1)  # so that a kernel is one launch, as on a GPU
     found = {}
     for engine in options.engines:
         use_engine(engine)
         for rounds in options.rounds:
-            if options.plume:
-                run = begin_plume(64, 512, rounds, options.device)
-            else:
-                run = Reconstruction(load(options.views, rounds, options.device))
-            found[engine, rounds] = count(run)
+            with choices():
+                if options.plume:
+                    run = begin_plume(64, 512, rounds, options.device)
+                else:
+                    run = Reconstruction(load(options.views, rounds, options.device))
+                found[engine, rounds] = count(run)
     print_totals(found)
     if options.modules:
         print_modules(found)

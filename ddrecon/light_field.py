@@ -191,8 +191,8 @@ def receive_in_parts(
     medium: Medium, cells: Medium, lights: Sequence[Source], settings: DiffusionSettings
 ) -> Received:
     """What `cells`, the means of `medium`, receive of `lights`, in parts by `settings` (E5.10)."""
-    parts = refine_medium(medium, settings.receive or 1)
-    narrow = None if parts is medium else average_cells(parts)
+    finer = refine_medium(medium, settings.receive or 1)
+    narrow = None if finer is medium else average_cells(finer)
     return receive_light(cells, lights, cells.degree, narrow)
 
 

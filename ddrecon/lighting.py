@@ -90,8 +90,8 @@ def exchange_grid(scene: Scene) -> tuple[Grid, Cells]:
         return slice(max(first - BESIDE, 0), min(last + BESIDE, count))
 
     cells = span(0), span(1), span(2)
-    part = grid.cut(cells)
-    return part.coarsen(max(1.0, max(part.shape) / MOST_CELLS)), cells
+    around = grid.cut(cells)
+    return around.coarsen(max(1.0, max(around.shape) / MOST_CELLS)), cells
 
 
 def fluence(scene: Scene, memory: SolveMemory | None = None) -> Tensor:

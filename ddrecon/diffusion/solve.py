@@ -87,8 +87,8 @@ class TensorSteps:
 
     def _keep(self, numbers: Tensor) -> None:
         self.numbers = numbers
-        each = numbers.view(-1, self.NUMBERS, 1, 1, 1).unbind(1)
-        self.power, self.previous, self.curvature, self.square, self.least = each
+        columns = numbers.view(-1, self.NUMBERS, 1, 1, 1).unbind(1)
+        self.power, self.previous, self.curvature, self.square, self.least = columns
 
     def precondition(self) -> None:
         """z becomes roughly A^-1 r of the residual r."""

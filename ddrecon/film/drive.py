@@ -96,8 +96,8 @@ def _export(film: Film, kind: str, up: str | None) -> None:
     facts = {**facts, "fps": np.array(fps)} if fps else facts
     for number in film.done():
         folder = film.of(number)
-        found = film.build(remove_pictures(read_scene(folder / RESULT), None))
-        fields, constants, bounds = fields_to_export(found)
+        scene = film.build(remove_pictures(read_scene(folder / RESULT), None))
+        fields, constants, bounds = fields_to_export(scene)
         if (file := volume_file(folder, VELOCITY)).is_file():
             fields[VELOCITY] = read_field(file, VELOCITY).values * (fps or 1)
         path = film.path / SEQUENCE / f"film_{number:04d}.{kind}"

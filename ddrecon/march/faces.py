@@ -341,16 +341,16 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
         on_line.append(((cell, 1 + share / 2), (before, -share / 2)))
         share = share * (along != axis)
         beyond.append(((place, 1 + share), (place.clamp(1, count), -share)))
-    one = torch.ones(len(places), dtype=torch.float64)
-    each, (rows, columns, weights) = torch.arange(len(places)), _multiply(beyond, wide, places)
+    unit = torch.ones(len(places), dtype=torch.float64)
+    order, (rows, columns, weights) = torch.arange(len(places)), _multiply(beyond, wide, places)
     is_inner = number[columns] < 0
-    same = each, nearest[places], one
+    same = order, nearest[places], unit
     inner = rows[is_inner], nearest[columns[is_inner]], weights[is_inner]
     rows, columns, weights = (column[~is_inner] for column in (rows, columns, weights))
     # Light on faces, then what is made of cells.
     around = [
         (places[rows], number[columns], weights),
-        (places, len(places) + each, one),
+        (places, len(places) + order, unit),
     ]
     lacking, width = _find_layers(grid, axis, nearest.view(wide))
 
@@ -369,7 +369,7 @@ def _surround(grid: Grid, axis: int | None, dtype: torch.dtype, device: torch.de
     return _Shell(
         pair(count, grid.cells, same),
         pair(3 * count, grid.cells, *lines),
-        pair(size, grid.cells, (places, nearest[places], one)),
+        pair(size, grid.cells, (places, nearest[places], unit)),
         pair(size, 2 * count, *around),
         pair(size, 2 * count + len(width), *around, shifted),
         width.to(device, dtype) / UNEVEN,

@@ -88,10 +88,10 @@ class FieldMetric:
         """The inverse metric times several `residuals` [N, ..., z, y, x], of what is free."""
         right, colors = _with_colors(residuals * self._scale), len(self._operator.loss)
         # Fields of one color are as colors of one field.
-        parts = right.split(colors) if colors > 1 else [right]
+        fields = right.split(colors) if colors > 1 else [right]
         solutions = [
-            solve_by_multigrid(self._operator, part, None, 0.0, tuning.CYCLES).value
-            for part in parts
+            solve_by_multigrid(self._operator, field, None, 0.0, tuning.CYCLES).value
+            for field in fields
         ]
         return torch.cat(solutions).view_as(residuals) * self._scale
 

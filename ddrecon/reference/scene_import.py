@@ -64,18 +64,18 @@ def import_scene(source: Path, path: Path, *, may_exist: bool) -> list[Path]:
     return written
 
 
-def _parts(module: ModuleType, plugin: Any) -> dict[str, Any]:
+def _objects_of(module: ModuleType, plugin: Any) -> dict[str, Any]:
     """What `plugin` holds, by Mitsuba's names: numbers, and other plugins."""
     parameters = module.traverse(plugin)
-    parts = {key: parameters[key] for key in parameters.keys()}  # noqa: SIM118  not a mapping
+    objects = {key: parameters[key] for key in parameters.keys()}  # noqa: SIM118  not a mapping
 
     class Callback(module.TraversalCallback):  # type: ignore[name-defined]
         def put(self, name: str, value: Any, *_: Any) -> None:
             if isinstance(value, module.Object):
-                parts[name] = value
+                objects[name] = value
 
     plugin.traverse(Callback())
-    return parts
+    return objects
 
 
 def _volume(module: ModuleType, scene: Any) -> tuple[dict[str, Any], dict[str, Any], np.ndarray]:
@@ -85,12 +85,12 @@ def _volume(module: ModuleType, scene: Any) -> tuple[dict[str, Any], dict[str, A
         warnings.warn(f"left out: {others} shapes without a medium inside", DataWarning, 3)
     if len(shapes) != 1 or shapes[0].class_name() != "Cube":
         raise SceneError(f"expected one cube with a medium inside, found {len(shapes)} such shapes")
-    medium = _parts(module, shapes[0].interior_medium())
+    medium = _objects_of(module, shapes[0].interior_medium())
     grid, phase = medium["sigma_t"], medium["phase_function"]
     if grid.class_name() != "GridVolume":
         raise SceneError(f"sigma_t is a {grid.class_name()}; expected a gridvolume")
     bounds = np.array([grid.bbox().min, grid.bbox().max], np.float64).reshape(2, 3)
-    corners = np.array(_parts(module, shapes[0])["vertex_positions"]).reshape(-1, 3)
+    corners = np.array(_objects_of(module, shapes[0])["vertex_positions"]).reshape(-1, 3)
     away = np.abs(corners - bounds[:, None]).min(0) / np.ptp(bounds, axis=0)
     if away.max() > TOLERANCE or (np.ptp(corners, axis=0) == 0).any():
         raise SceneError("the cube is not the box of its gridvolume, or does not lie along x, y, z")
@@ -107,8 +107,8 @@ def _volume(module: ModuleType, scene: Any) -> tuple[dict[str, Any], dict[str, A
         fields["albedo"] = albedo
     else:
         volume["albedo"] = _plain(flat[0])
-    parts = _parts(module, phase)
-    return volume | ({"g": float(parts["g"])} if "g" in parts else {}), fields, bounds
+    objects = _objects_of(module, phase)
+    return volume | ({"g": float(objects["g"])} if "g" in objects else {}), fields, bounds
 
 
 def _evaluate(module: ModuleType, volume: Any, grid: Any, bounds: np.ndarray) -> np.ndarray:
@@ -130,38 +130,38 @@ def _evaluate(module: ModuleType, volume: Any, grid: Any, bounds: np.ndarray) ->
 
 def _light(module: ModuleType, emitter: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     """A light, and of an environment map its pixels [h, w, 3]."""
-    parts, kind = _parts(module, emitter), emitter.class_name()
+    objects, kind = _objects_of(module, emitter), emitter.class_name()
     if kind == "DirectionalEmitter":
-        direction = _matrix(parts["to_world"])[:3, 2]
-        color = _texture(module, parts["irradiance"])
+        direction = _matrix(objects["to_world"])[:3, 2]
+        color = _texture(module, objects["irradiance"])
         return {"type": "directional", "direction": direction.tolist(), "irradiance": color}, None
     if kind == "ConstantBackgroundEmitter":
-        return {"type": "ambient", "radiance": _texture(module, parts["radiance"])}, None
+        return {"type": "ambient", "radiance": _texture(module, objects["radiance"])}, None
     if kind == "PointLight":
-        place = np.ravel(parts["position"]).tolist()
-        color = _texture(module, parts["intensity"])
+        place = np.ravel(objects["position"]).tolist()
+        color = _texture(module, objects["intensity"])
         return {"type": "point", "position": place, "intensity": color}, None
     if kind != "EnvironmentMapEmitter":
         raise SceneError(f"{kind}: only directional, constant, point and envmap are read")
-    turn = _matrix(parts["to_world"])[:3, :3]
+    turn = _matrix(objects["to_world"])[:3, :3]
     up = "z" if abs(turn[2, 1]) > 0.5 else "y"
     level = np.array([turn[0], turn[2], -turn[1]]) if up == "z" else turn
     angle = math.atan2(level[0, 2], level[0, 0])
     cosine, sine = math.cos(angle), math.sin(angle)
     if np.abs(level - [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]).max() > TOLERANCE:
         raise SceneError("an envmap is turned about another axis than its pole, which is y or z")
-    light = {"type": "environment", "scale": float(parts["scale"]), "up": up}
+    light = {"type": "environment", "scale": float(objects["scale"]), "up": up}
     # Mitsuba keeps a column more on both sides, so that the map wraps around.
-    pixels = np.array(parts["data"], np.float32)[:, 1:-1]
+    pixels = np.array(objects["data"], np.float32)[:, 1:-1]
     return light | {"rotation": math.degrees(angle)}, pixels
 
 
 def _view(module: ModuleType, sensor: Any) -> dict[str, Any]:
     """A camera, with the size of its film."""
-    parts, kind = _parts(module, sensor), sensor.class_name()
+    objects, kind = _objects_of(module, sensor), sensor.class_name()
     film = sensor.film()
     width, height = (int(count) for count in film.size())
-    matrix = _matrix(parts["to_world"])
+    matrix = _matrix(objects["to_world"])
     sides = np.linalg.norm(matrix[:3, :3], axis=0)
     pose = np.eye(4)
     pose[:3] = np.stack([-matrix[:3, 0], matrix[:3, 1], -matrix[:3, 2], matrix[:3, 3]], 1)
@@ -170,9 +170,9 @@ def _view(module: ModuleType, sensor: Any) -> dict[str, Any]:
         raise SceneError(f"{sensor.id()}: the film is cropped")
     camera: dict[str, Any] = {"matrix": pose.tolist(), "resolution": [width, height]}
     if kind == "PerspectiveCamera":
-        offsets = (parts[f"principal_point_offset_{axis}"] for axis in "xy")
+        offsets = (objects[f"principal_point_offset_{axis}"] for axis in "xy")
         middle = [0.5 - float(offset) for offset in offsets]
-        fov = float(parts["x_fov"])
+        fov = float(objects["x_fov"])
         camera |= {"type": "perspective", "fov": fov, "principal_point": middle}
     elif kind == "OrthographicCamera":
         aspect = float(sides[1] / sides[0])

@@ -54,10 +54,10 @@ def slices(field: Tensor) -> np.ndarray:
     """
     colors = (field if field.ndim == 4 else field[None]).detach().expand(3, -1, -1, -1)
     cells = colors.permute(1, 2, 3, 0).float().cpu().numpy()
-    shown = cells / find_high(np.abs(cells))
-    shown = diverge(shown.mean(-1)) if cells.min() < 0 else shown
+    values = cells / find_high(np.abs(cells))
+    values = diverge(values.mean(-1)) if cells.min() < 0 else values
     z, y, x = (size // 2 for size in cells.shape[:3])
-    sides = shown[z, ::-1], shown[:, ::-1, x].transpose(1, 0, 2), shown[::-1, y]
+    sides = values[z, ::-1], values[:, ::-1, x].transpose(1, 0, 2), values[::-1, y]
     return place_beside([*sides])
 
 

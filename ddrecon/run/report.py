@@ -101,12 +101,12 @@ def list_numbers(
 def _tell_change(start: Tensor, value: Tensor, is_direction: bool) -> tuple[str, str]:
     """The numbers `start` [n], and those found, with their changes: parts of them, or an angle."""
     pairs = list(zip(start.tolist(), value.tolist(), strict=True))
-    parts = ["" if is_direction or not x else f" ({y / x - 1:+.1%})" for x, y in pairs]
-    found = ", ".join(f"{y:.4g}{part}" for (_, y), part in zip(pairs, parts, strict=True))
+    changes = ["" if is_direction or not x else f" ({y / x - 1:+.1%})" for x, y in pairs]
+    end = ", ".join(f"{y:.4g}{text}" for (_, y), text in zip(pairs, changes, strict=True))
     if is_direction:
         apart = float(torch.nn.functional.cosine_similarity(start.double(), value.double(), dim=0))
-        found += f" (turned by {math.degrees(math.acos(min(1.0, apart))):.2g} degrees)"
-    return ", ".join(f"{x:.4g}" for x in start.tolist()), found
+        end += f" (turned by {math.degrees(math.acos(min(1.0, apart))):.2g} degrees)"
+    return ", ".join(f"{x:.4g}" for x in start.tolist()), end
 
 
 def _lead(scene: Scene, summary: Mapping[str, Any]) -> str:

@@ -421,8 +421,8 @@ template <class F> struct Steps {
             Size face = at(STEP + 1, face_color, pair);
             pair[axis] = is_second ? (k < last ? k + 1 : 0) : (k > 0 ? k - 1 : last);
             if (!is_second) face = at(STEP + 1, face_color, pair);
-            const F part = (is_second ? p.belows : p.aboves)[STEP][face];
-            return value + part * (prolonged<STEP + 1>(pair) - value);
+            const F stiffness = (is_second ? p.belows : p.aboves)[STEP][face];
+            return value + stiffness * (prolonged<STEP + 1>(pair) - value);
         }
         return 0;
     }

@@ -35,7 +35,7 @@ function drawSlices(name) {
   const { size, signed, white } = fields.get(`result ${name}`);
   const cut = size.map((count, axis) => Math.min(count - 1, Math.floor(slider(axis).value * count)));
   const at = cut.map((index, i) => round(world.low[i] + ((index + 0.5) / size[i]) * world.sides[i]));
-  const told = [];
+  const readings = [];
   for (const figure of document.querySelectorAll("figure.slice")) {
     const axis = Number(figure.dataset.axis);
     const count = size[axis];
@@ -45,7 +45,7 @@ function drawSlices(name) {
       canvas.hidden = !field;
       if (!field) continue;
       drawSlice(canvas, field, axis, cut);
-      if (axis === 0) told.push(valueOf(field, ...cut).map(round).join(", "));
+      if (axis === 0) readings.push(valueOf(field, ...cut).map(round).join(", "));
     }
     const [across, upwards] = SIDES[axis].map((i) => `${"xyz"[i]} ${round(world.sides[i])}`);
     const place = `${"xyz"[axis]} = ${at[axis]}: cell ${cut[axis]} of ${count}`;
@@ -53,7 +53,7 @@ function drawSlices(name) {
     slider(axis).setAttribute("aria-valuetext", place);
   }
   document.querySelector("#cell").textContent =
-    `${name} at ${at.join(", ")}: ${told.join("; in the scene file ")}`;
+    `${name} at ${at.join(", ")}: ${readings.join("; in the scene file ")}`;
   // The scale of the slices, and that of the viewer's colors for values.
   document.querySelector("#scale").className = signed ? "signed" : "";
   EVEN.forEach((part, i) => (document.querySelectorAll("#scale span")[i].textContent =
@@ -67,8 +67,8 @@ function listenToSlices() {
     const follow = (event) => {
       if (!event.buttons) return;
       const { left, bottom, width, height } = canvas.getBoundingClientRect();
-      const parts = [(event.clientX - left) / width, (bottom - event.clientY) / height];
-      axes.forEach((axis, i) => (slider(axis).value = Math.min(1, Math.max(0, parts[i]))));
+      const shares = [(event.clientX - left) / width, (bottom - event.clientY) / height];
+      axes.forEach((axis, i) => (slider(axis).value = Math.min(1, Math.max(0, shares[i]))));
       drawSlices(shownField);
     };
     for (const kind of ["pointerdown", "pointermove"]) canvas.addEventListener(kind, follow);

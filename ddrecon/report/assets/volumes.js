@@ -42,8 +42,8 @@ const EVEN = [0, 1, 2, 3, 4].map((part) => part / 4);
 
 // The number of a cell, or its three. Signed ones are blue below 0 and red above, by one channel.
 function valueOf(field, ...cell) {
-  const shown = Array.from({ length: field.channels }, (_, channel) => displayed(field, ...cell, channel));
-  if (!field.signed) return shown.map((part) => field.white * linear(part));
-  const [red, green, blue] = shown;
+  const values = Array.from({ length: field.channels }, (_, channel) => displayed(field, ...cell, channel));
+  if (!field.signed) return values.map((value) => field.white * linear(value));
+  const [red, green, blue] = values;
   return [field.white * (red < blue ? (green - 1) / 0.7 : (1 - green) / 0.91)];
 }
