@@ -178,5 +178,5 @@ def test_opaque_and_empty_media_have_finite_derivatives():
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
-    kernels += [way_kernel(False, 32), way_kernel(True, 32), receive_kernel("tangent", 32)]
+    kernels += [way_kernel("", 32), way_kernel("long", 32), receive_kernel("tangent", 32)]
     assert_compiles(kernels, tmp_path)
