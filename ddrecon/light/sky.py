@@ -142,9 +142,10 @@ def _integrate(radiance: Tensor, pixels: Sequence[Tensor]) -> Tensor:
     weights = torch.from_numpy(pixel_moments(*radiance.shape[1:])).to(values).flatten(1)
     terms = (weights[:, None] * values).flatten(0, 1).T
     if is_forward():
-        sums = terms.new_zeros(len(first), terms.shape[1]).index_add(0, label, terms)
+        is_in = label == torch.arange(len(first), device=device)[:, None]
+        sums = is_in.to(terms) @ terms
     else:
-        # In a fixed order, but without forward mode.
+        # Many times as fast, but without forward mode.
         sums = embedding_bag(order, terms, first, mode="sum")
     return sums.unflatten(1, (len(weights), len(values)))
 
