@@ -72,6 +72,7 @@ class _Masses(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.shears, ctx.columns, *tensors = inputs
         ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
         keep(ctx, *tensors, *output[1:])
 
     @staticmethod
@@ -81,7 +82,7 @@ class _Masses(torch.autograd.Function):
         laid = dict(zip(_slicings(ctx.shears), tensors, strict=False))
         slopes = iter(tensors[len(laid) :])
         bars = {slicing: field.new_zeros(field.shape) for slicing, field in laid.items()}
-        numbers_bar = torch.zeros_like(numbers)
+        numbers_bar = torch.zeros_like(numbers) if ctx.columns else None
         for light, shear in enumerate(ctx.shears):
             mass_bar = shear.slicing.lay(entered_bar[light]).contiguous()
             row, field, ray_slopes = numbers[light], laid[shear.slicing], next(slopes)

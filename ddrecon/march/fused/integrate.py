@@ -123,18 +123,17 @@ class Integrate(torch.autograd.Function):
         sums = Sums([*shapes[len(NAMES) :], shapes[3]], rays)
         packets, arguments = _arguments(ctx.cells, tensors, len(sums.copies))
         arguments |= {"masses": masses, "packets": packets}
-        outputs = _empty_outputs(ctx.layout, rays).items()
-        for (name, empty), bar in zip(outputs, output_bars, strict=False):
-            arguments[f"{name}_bar"] = empty.zero_() if bar is None else bar
+        arguments |= dict(zip(("out_bar", "masses_bar"), output_bars, strict=False))
         kernel = adjoint_kernel(ctx.layout, _case(ctx.layout, ctx.cells, needs), type_of_sums(rays))
         bounds = None
         if rays.is_cuda:
             most = masses.new_empty(ctx.layout.channels + 1, packets)
             kernel.launch(packets, arguments, {"most": most})
-            arguments["bounds"] = most.sum(1)
-            parts = arguments["bounds"].split([*map(len, fields), 1])
+            bounds = arguments["bounds"] = most.sum(1)
             asked = [shape is not None for shape in shapes[len(NAMES) :]]
-            bounds = torch.cat([*itertools.compress(parts, asked), parts[-1]])
+            if not all(asked):
+                parts = bounds.split([*map(len, fields), 1])
+                bounds = torch.cat([*itertools.compress(parts, asked), parts[-1]])
         numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
         results = {"rays_bar": rays_bar, "angles_bar": angles_bar, "fronts_bar": fronts_bar}
         kernel.launch(
