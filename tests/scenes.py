@@ -5,7 +5,7 @@ from dataclasses import replace
 from media import half_empty, make_camera, make_scene, random_values, tensor
 
 from ddrecon.light.lights import EnvironmentLight, PointLight
-from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase import TwoLobe
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 

@@ -23,8 +23,7 @@ from ddrecon.light.lights import (
 )
 from ddrecon.light_field import fluence_of
 from ddrecon.lighting import solve_light
-from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
-from ddrecon.medium.phase_blend import Blend
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, Rayleigh
 from ddrecon.picture import view_image
 from ddrecon.scene import Scene
 

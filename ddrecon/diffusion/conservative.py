@@ -25,7 +25,7 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.light.moments import flux_along_axes, mean_and_first, moments_of_flux
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.fresnel import face_resistance
+from ddrecon.medium.optics import face_resistance
 from ddrecon.numerics.autodiff import is_fused, recompute
 
 

@@ -12,7 +12,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.lighting import solve_light
-from ddrecon.medium.black_body import WHITE, black_body_radiance
+from ddrecon.medium.optics import WHITE, black_body_radiance
 from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
 

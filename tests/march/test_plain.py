@@ -29,10 +29,9 @@ from ddrecon.lighting import send, solve_light
 from ddrecon.march.box import intersect_box
 from ddrecon.march.faces import extend_fields
 from ddrecon.march.outgoing import OutgoingLight
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
-from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.numerics.interpolation import ThirdOrder
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 from ddrecon.variables.values import value_of, with_values

@@ -7,9 +7,8 @@ import torch
 from media import box_grid, make_scene, random_values, tensor
 from torch import Tensor
 
-from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.coefficients import Volume, mix_media, scale_medium
 from ddrecon.medium.levels import volume_at_level
-from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.picture import render
 from ddrecon.reconstruct.levels import scene_at_level

@@ -9,12 +9,16 @@ from media import box_grid, random_values, summed_series, tensor
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase import (
+    Blend,
+    HenyeyGreenstein,
+    PhaseFunction,
+    Rayleigh,
+    Tabulated,
+    TwoLobe,
+)
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.medium.phase_series import Tabulated
-from ddrecon.numerics.angle_table import STEPS
-from ddrecon.numerics.legendre import even_angles
+from ddrecon.numerics.series import STEPS, even_angles
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)

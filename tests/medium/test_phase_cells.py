@@ -10,8 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.lighting import solve_light
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase import Blend, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.picture import render
 from ddrecon.scene import Scene

@@ -10,8 +10,7 @@ from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon.numerics.interpolation import sample_slices, sample_volume
-from ddrecon.numerics.third_order import ThirdOrder, subdivide
+from ddrecon.numerics.interpolation import ThirdOrder, sample_slices, sample_volume, subdivide
 
 
 def interpolated(values: Tensor, point: Tensor) -> Tensor:

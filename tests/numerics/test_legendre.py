@@ -5,8 +5,16 @@ import math
 import numpy as np
 import torch
 
-from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
-from ddrecon.numerics.legendre import even_angles, gauss_legendre, legendre, legendre_at_even_angles
+from ddrecon.numerics.series import (
+    STEPS,
+    angle_of,
+    even_angles,
+    gauss_legendre,
+    legendre,
+    legendre_at_even_angles,
+    look_up,
+    with_slopes,
+)
 
 
 def test_a_long_rule_is_exact_to_twice_its_length():

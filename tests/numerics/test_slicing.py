@@ -6,7 +6,7 @@ import pytest
 import torch
 from media import random_values
 
-from ddrecon.numerics.slicing import Slicing, across
+from ddrecon.numerics.layout import Slicing, across
 
 
 @pytest.mark.parametrize("axis", range(3))
