@@ -1,20 +1,27 @@
 """Media that emit light, against closed forms (E2.11)."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
+from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.lighting import solve_light
 from ddrecon.medium.optics import WHITE, black_body_radiance
 from ddrecon.picture import render, view_components
 from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+from ddrecon.variables.values import with_values
 
 GRID = Grid((6, 5, 7), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
 COLORS = torch.tensor([0.7, 0.3, 0.1], dtype=torch.float64)
@@ -98,3 +105,70 @@ def test_a_black_body_follows_stefan_and_boltzmanns_kin() -> None:
     assert 1.4388e7 / 610 < rise < 1.4388e7 / 560
     # daylight of 6500 K is nearly white
     assert float(colors[:, 4].max() / colors[:, 4].min()) == pytest.approx(1, abs=0.1)
+
+
+ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)
+"""Two directions (x, y, z) that are along no axis of the grid."""
+
+
+def unlike_its_mirror(cells: int) -> torch.Tensor:
+    """A smooth density without symmetry, zero at the faces of the unit box."""
+    grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
+    z, y, x = grid.centers(torch.zeros(1, dtype=torch.float64))
+    hump = (torch.sin(math.pi * z) * torch.sin(math.pi * y) * torch.sin(math.pi * x)) ** 2
+    return hump * (1 + 0.8 * torch.sin(3 * z + 2 * y) * torch.cos(4 * x))
+
+
+def power_seen(
+    scene: Scene, travel: tuple[float, float, float], towards: tuple[float, float, float]
+) -> tuple[float, float]:
+    """What leaves along `towards` of light along `travel`, scattered once, and more often."""
+    eye = torch.nn.functional.normalize(torch.tensor(towards, dtype=torch.float64), dim=0) * 3 + 0.5
+    pose = look_at(eye, torch.full_like(eye, 0.5), eye.new_tensor([0.0, 1.0, 0.0]))
+    camera = Camera(pose, (48, 48), 0.9, is_perspective=False)
+    lit = replace(scene, lights=[DirectionalLight(eye.new_tensor(travel), eye.new_tensor([1.0]))])
+    parts = view_components(solve_light(lit, SolveMemory()), lit, camera)
+    return float(parts.single[0].mean()), float(parts.multiple[0].mean())
+
+
+def asymmetry(cells: int, g: float) -> tuple[float, float]:
+    """How much the ways from ONE to OTHER and back differ, of single and of multiple scattering."""
+    grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
+    scene = make_scene(unlike_its_mirror(cells), grid=grid, sigma_a=(1.0,), sigma_s=(12.0,), g=g)
+    forth = power_seen(scene, ONE, OTHER)
+    back = power_seen(scene, tuple(-c for c in OTHER), tuple(-c for c in ONE))
+    single, multiple = (abs(a - b) / b for a, b in zip(forth, back, strict=True))
+    return single, multiple
+
+
+def test_light_and_camera_may_change_places():
+    coarse, fine = (asymmetry(cells, 0.5) for cells in (12, 24))
+    assert max(fine) < 0.002 and sum(fine) < 0.45 * sum(coarse), (coarse, fine)
+
+
+ROOT = Path(__file__).parents[2]
+CAMERA = "type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28"
+TRACED = [
+    f"volume.density={{file: {ROOT}/data/plume/density.npz}}",
+    *("volume.sigma_t=10", "volume.albedo=0.9"),
+    *("volume.g=0", "diffusion={}", "optimize=", "render.samples_per_pixel=4"),
+    f"views=[{{name: view, camera: {{{CAMERA}, resolution: [64, 64]}}}}]",
+]
+"""What was traced, beside the config."""
+
+
+def test_the_plumes_derivative_is_that_of_a_path_tracer() -> None:
+    scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=TRACED)
+    density = scene.volume.density
+    leaf = density.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(render(with_values(scene, {"density": leaf})).mean(), leaf)
+    ours, amount = (
+        torch.nn.functional.avg_pool3d(item[None], 4)[0].numpy()
+        for item in (64 * gradient, density)
+    )
+    with np.load(ROOT / "data" / "plume" / "gradient.npz", allow_pickle=False) as archive:
+        traced = archive["gradient_blocks4"]
+    seen = amount > 0.05
+    assert seen.sum() > 500
+    assert np.corrcoef(ours[seen], traced[seen])[0, 1] > 0.95
+    assert np.linalg.norm(ours[seen] - traced[seen]) < 0.2 * np.linalg.norm(traced[seen])
