@@ -3,21 +3,17 @@
 import math
 from dataclasses import replace
 
-import media
 import pytest
 import torch
 from media import box_grid, convergence_order, half_empty, make_camera, make_scene, tensor
 from torch import Tensor
 
-from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.light.moments import flux_along_axes
 from ddrecon.light.point_light import follow_point_light, receive_point_light
-from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.picture import render
-from ddrecon.settings import RenderSettings
 
 SHAPE = (5, 4, 6)
 OUTSIDE, INSIDE = (0.3, 1.7, 1.1), (0.11, 0.13, 0.17)
@@ -73,44 +69,6 @@ def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
                 entered = max(entered, ((low if a < low else high) - a) / (b - a))
         inside = (1 - entered) * math.dist(start, end)
         assert float(beam.mass[0, z, y, x]) == pytest.approx(inside, rel=1e-12)
-
-
-def test_the_depth_of_a_smooth_blob_converges_at_second_order():
-    """From a light inside: the integral of a Gaussian along a line, an error function."""
-    width, errors, counts = 0.15, [], [8, 12, 18, 27]
-    for count in counts:
-        grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
-        density = torch.exp(-sum(axis**2 for axis in grid.centers(tensor(0))) / (2 * width**2))
-        beam = follow_point_light(medium_of(grid, density), light_at(INSIDE))
-        start, offset, unit = tensor(*INSIDE[::-1]), offsets(grid, INSIDE), width * math.sqrt(2)
-        distance = offset.norm(dim=-1)
-        along = (start * offset).sum(-1) / distance
-        across = torch.exp(-((start**2).sum() - along**2) / unit**2)
-        erf = torch.erf((along + distance) / unit) - torch.erf(along / unit)
-        expected = across * width * math.sqrt(math.pi / 2) * erf
-        errors.append(float((beam.mass[0] - expected).square().mean().sqrt()))
-    assert convergence_order([1 / count for count in counts], errors) >= 1.7, errors
-
-
-def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
-    """kappa_s I / (4 pi) times int 1 / r^2 along a ray: I (angle subtended) / (its distance)."""
-    grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
-    medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
-    bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
-    beams = (follow_point_light(medium, light_at(position)),)
-    dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
-    matter = medium.extinction, medium.scattering
-    outgoing = OutgoingLight(grid, *matter, beams, dark, medium.seen, medium.peak)
-    radiance = media.march_rays(outgoing, bundle, RenderSettings())[0][0]
-    light = tensor(*position[::-1])
-    low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))
-    near, far = torch.minimum(one, other).amax(-1), torch.maximum(one, other).amin(-1)
-    along = ((light - bundle.origin) * bundle.direction).sum(-1)
-    apart = (bundle.origin + along[:, None] * bundle.direction - light).norm(dim=-1)
-    angle = torch.atan((far - along) / apart) - torch.atan((near - along) / apart)
-    expected = 3e-9 * 2.0 / (4 * math.pi) * angle / apart
-    torch.testing.assert_close(radiance, expected, rtol=1e-7, atol=0)
 
 
 def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
