@@ -43,7 +43,7 @@ from ddrecon.medium.coefficients import Medium, Volume, keep_medium, scale_mediu
 from ddrecon.medium.levels import refine_medium, resample
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_varied
-from ddrecon.numerics.periods import Unrolled, unroll
+from ddrecon.numerics.layout import Unrolled, unroll
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.bounced import reflected_light

@@ -23,7 +23,7 @@ from ddrecon.lighting import exchange_grid
 from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
-from ddrecon.medium.fresnel import transmitted_moments
+from ddrecon.medium.optics import transmitted_moments
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene import Scene

@@ -17,7 +17,7 @@ from ddrecon.march.outgoing import OutgoingLight
 from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase_peak import SeenPhase, peaked_series
-from ddrecon.numerics.legendre import legendre
+from ddrecon.numerics.series import legendre
 from ddrecon.picture import render
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings

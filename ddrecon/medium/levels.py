@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Cells, Grid
-from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume
-from ddrecon.medium.mixture import remix
-from ddrecon.numerics.periods import Unrolled
+from ddrecon.medium.coefficients import Medium, Volume, for_cells, put_volume, remix
+from ddrecon.numerics.layout import Unrolled
 
 
 def volume_at_level(volume: Volume, grid: Grid, cells: Cells | None = None) -> Volume:

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from ddrecon.extras import load_extra
 from ddrecon.light.lights import BRIGHTNESS
-from ddrecon.medium.phase import PhaseFunction
-from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase import Blend, PhaseFunction, TwoLobe
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
 from ddrecon.scene import Scene, View
 

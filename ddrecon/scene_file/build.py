@@ -27,9 +27,8 @@ from ddrecon.light.lights import (
     PointLight,
 )
 from ddrecon.march.windows import look_inside
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import mix_media
-from ddrecon.medium.phase_blend import Blend
+from ddrecon.medium.coefficients import Volume, mix_media
+from ddrecon.medium.phase import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build_views import build_views

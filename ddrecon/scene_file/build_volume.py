@@ -19,13 +19,17 @@ from ddrecon.io.phase_files import read_phase_table
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.io.volumes.units import GRAMS, KELVIN, MICROMETERS, size_of
-from ddrecon.medium.black_body import black_body_radiance
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mie import scatter_droplets
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.medium.phase_series import Tabulated
-from ddrecon.numerics.angle_table import at_even_angles
+from ddrecon.medium.optics import black_body_radiance, scatter_droplets
+from ddrecon.medium.phase import (
+    Blend,
+    HenyeyGreenstein,
+    PhaseFunction,
+    Rayleigh,
+    Tabulated,
+    TwoLobe,
+)
+from ddrecon.numerics.series import at_even_angles
 from ddrecon.scene_file.load import SceneFile, read_referenced
 from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (

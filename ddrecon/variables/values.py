@@ -19,8 +19,7 @@ from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
 from ddrecon.grid import Triple
 from ddrecon.light.lights import Light
-from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.mixture import remix
+from ddrecon.medium.coefficients import Volume, remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
 from ddrecon.variables.forms import require_form, shapes_in_place

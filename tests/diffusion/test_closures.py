@@ -1,4 +1,4 @@
-"""Closures: D of dense media, and what replaces its infinity in empty space."""
+"""Closures: D of dense media and of empty space; means in cells and values at centers (E2.12)."""
 
 import math
 
@@ -8,9 +8,12 @@ import torch
 from media import box_grid, half_empty, random_values
 from torch import Tensor
 
+from ddrecon.diffusion.cells import average, average_cells, sharpen
 from ddrecon.diffusion.closures import CLOSURES, FLOOR, geometric, inverse_distance
 from ddrecon.grid import Grid
-from ddrecon.medium.coefficients import Coefficient
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.reduced import receive_light
+from ddrecon.medium.coefficients import Coefficient, Volume, scale_medium
 
 each_closure = pytest.mark.parametrize("closure", CLOSURES.values(), ids=CLOSURES.keys())
 
@@ -128,3 +131,26 @@ def test_finite_differences_may_step_below_zero():
     )
     torch.testing.assert_close((above - below) / 2e-5, slope, rtol=1e-7, atol=0)
     assert bool((geometric(kappa - 0.4, box_grid((3, 4, 2))) > 0).all())
+
+
+def test_cells_receive_what_a_beam_loses_where_density_changes():
+    """In a column: E (1 - exp(-depth)), as matter times what is received, summed."""
+    grid, one = Grid((7, 1, 1), (0, 0, 0), (2.0, 1, 1)), torch.ones(1, dtype=torch.float64)
+    density = torch.tensor([0, 0, 9, 30, 0.5, 0, 0], dtype=torch.float64).view(7, 1, 1)
+    cells = average_cells(scale_medium(Volume(grid, density, 0.2 * one, 0.8 * one, 0 * one[0])))
+    light = DirectionalLight(torch.tensor([0.0, 0, -1], dtype=torch.float64), 3 * one)
+    received = 4 * math.pi * receive_light(cells, [light], 0).mean
+    lost = (cells.extinction.value * received).sum() * grid.spacing[0]
+    whole = density.sum() * grid.spacing[0]
+    torch.testing.assert_close(lost, 3 * -torch.expm1(-whole), rtol=1e-12, atol=0)
+
+
+def test_centers_of_thin_cells_are_those_whose_means_are_known():
+    """Of light that bends evenly along each axis, away from the faces of the box."""
+    grid, one = box_grid((6, 7, 5)), torch.ones(1, dtype=torch.float64)
+    z, y, x = grid.centers(one)
+    light = (2 + z - 0.3 * y + 0.5 * z**2 + 0.2 * y**2 - 0.7 * x**2)[None]
+    medium = scale_medium(Volume(grid, 0 * light[0], one, one, 0 * one[0]))
+    found = sharpen(medium, average(light))
+    inner = (slice(None), *[slice(2, -2)] * 3)
+    torch.testing.assert_close(found[inner], light[inner], rtol=1e-13, atol=0)

@@ -9,9 +9,8 @@ import pytest
 import torch
 from example_scene import changed
 
-from ddrecon.medium.mixture import mix_media
-from ddrecon.medium.phase import Rayleigh
-from ddrecon.medium.phase_blend import Blend
+from ddrecon.medium.coefficients import mix_media
+from ddrecon.medium.phase import Blend, Rayleigh
 from ddrecon.run.result import describe_result, result_names
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.load import describe, dump_scene, read_scene

@@ -13,9 +13,7 @@ from example_scene import SCENE, changed
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
-from ddrecon.medium.phase_blend import TwoLobe
-from ddrecon.medium.phase_series import Tabulated
+from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh, Tabulated, TwoLobe
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
