@@ -26,12 +26,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.bench.plume import fade, plume_density
 from ddrecon.io.volumes.table import write_field
 from ddrecon.picture import render
 from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
+from ddrecon.validate.hard import fade, plume_density
 from ddrecon.variables.values import with_values
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]

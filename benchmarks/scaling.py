@@ -3,7 +3,7 @@ the exponents fitted to them.
 
     python benchmarks/scaling.py [--largest 192] [--device cuda]
 
-The plume of `ddrecon.bench.plume` is reconstructed from half its density, from its own images at
+The plume of `ddrecon.validate.hard` is reconstructed from half its density, from its own images at
 full resolution. One thing grows at a time, from 64 x 96 x 64 cells, 128 x 128 pixels, one view, one
 light and one color; with the cells so does the width of the image, which has two pixels a cell:
 what a view can tell of so many. On a CPU these are seconds of one thread's processor time, whatever
@@ -22,7 +22,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ddrecon.bench.plume import plume_scene
 from ddrecon.cameras import look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light.lights import DirectionalLight
@@ -30,6 +29,7 @@ from ddrecon.picture import render_each
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings, ParameterSettings
+from ddrecon.validate.hard import plume_scene
 
 CELLS, PIXELS = 64, 128
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192)
