@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
-from ddrecon.io.files.arrays import check_size
 from ddrecon.io.files.folders import require_free_files
-from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.files.reading import check_size, guard_reading
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.volumes.table import write_fields
 from ddrecon.reference.trace import load_mitsuba
