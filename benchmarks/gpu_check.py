@@ -25,7 +25,7 @@ from statistics import median
 from typing import Any
 
 import torch
-from scaling import start_run
+from speed import start_run
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 

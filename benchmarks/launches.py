@@ -28,7 +28,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from scaling import start_run
+from speed import start_run
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
