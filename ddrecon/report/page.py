@@ -9,14 +9,12 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.atomic import write_bytes
 
 
 def write_page(path: Path, **facts: Any) -> None:
     """Writes the page of these `facts` to `path`."""
-    text = page_text(**facts)
-    with replace_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace")
+    write_bytes(path, page_text(**facts).encode(errors="replace"))
 
 
 def page_text(**facts: Any) -> str:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.atomic import replace_file, write_bytes
 from ddrecon.io.files.reading import as_float32, check_size, guard_reading, read_npy
 from ddrecon.io.volumes.field import BOX, VECTORS, Facts, Field, Fields, check_field
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf
@@ -89,8 +89,7 @@ def write_vol(path: Path, fields: Fields, bounds: np.ndarray, _: Facts) -> None:
     (values,) = map(as_float32, fields.values())
     z, y, x = values.shape[:3]
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, values[0, 0, 0].size, *bounds.ravel())
-    with replace_file(path) as temporary:
-        temporary.write_bytes(header + values.astype("<f4", copy=False).tobytes())
+    write_bytes(path, header + values.astype("<f4", copy=False).tobytes())
 
 
 class VolumeFormat(NamedTuple):

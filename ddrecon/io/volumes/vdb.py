@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.atomic import write_bytes
 from ddrecon.io.files.reading import as_float32, check_size
 from ddrecon.io.volumes.field import VECTORS, Facts, Field, Fields, check_field, prune
 from ddrecon.io.volumes.vdb_tree import (
@@ -305,8 +305,7 @@ def write_vdb(path: Path, fields: Fields, bounds: np.ndarray, facts: Facts) -> N
         blocks = len(data) + 24 + len(head)
         data += struct.pack("<3q", blocks - len(head), blocks, blocks + len(buffers))
         data += head + buffers
-    with replace_file(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, data)
 
 
 def _grid(name: str, values: np.ndarray, bounds: np.ndarray, facts: Facts) -> tuple[bytes, bytes]:
