@@ -85,8 +85,7 @@ def reference(
     loaded = session.build(scene_file)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import REFERENCE, claim_folder
-    from ddrecon.reference.compare import compare_to_folder, reference_lines
-    from ddrecon.reference.trace import open_tracer
+    from ddrecon.reference.trace import compare_to_folder, open_tracer, reference_lines
     from ddrecon.scene_file.load import referenced_files
 
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
