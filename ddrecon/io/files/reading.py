@@ -11,12 +11,12 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
-
-import numpy as np
-from numpy.lib import format as npy
+from typing import IO, TYPE_CHECKING
 
 from ddrecon.errors import DdreconError, FormatError, is_utf8
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MAX_BYTES = 4 * 2**30
 """More than this, uncompressed, is taken for a mistake or an attack."""
@@ -59,9 +59,11 @@ def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
     `path` and `name` are what errors speak of. Raises FormatError for arrays of objects or
     text, over 4 GiB, or shorter or longer than their header says.
     """
+    from numpy.lib import format as npy  # here, as scene files are read without NumPy
+
     check_size(size, path, name)
     try:
-        values = npy.read_array(stream, allow_pickle=False)
+        values: np.ndarray = npy.read_array(stream, allow_pickle=False)
         if stream.read(1):
             raise ValueError("it holds more than its header says")
     except (ValueError, SyntaxError, TypeError, EOFError) as error:
@@ -80,5 +82,7 @@ def check_size(size: int, path: Path, name: str) -> None:
 
 def as_float32(values: np.ndarray) -> np.ndarray:
     """`values` as contiguous float32; those beyond its range are infinite, which callers refuse."""
+    import numpy as np
+
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(values, dtype=np.float32)
