@@ -6,9 +6,9 @@
 
 A figure is a table that one command prints. What was measured lies in benchmarks/figures.json with
 its commit, day and machine. A page quotes it between `<!-- figure: NAME -->` and
-`<!-- end of figure -->`, or names it; a house test compares. Run it on idle cores. Path tracing needs the extra
-`reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds `images/cases.json` of
-the eleven cases.
+`<!-- end of figure -->`, or names it; a house test compares. Run it on idle cores. Path tracing
+needs the extra `reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds
+`images/cases.json` of the eleven cases.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ COMMANDS = {
     "angles": "python benchmarks/accuracy.py angles --references FOLDER",
     "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
     "grounds": "python benchmarks/accuracy.py grounds --references FOLDER",
-    "thick": "python benchmarks/thick_cells.py",
+    "thick": "python benchmarks/accuracy.py thick",
     "layers": "python benchmarks/dial.py --only step,half,slab,phantom",
     "boxes": "python benchmarks/dial.py --only box",
     "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
-    "rounds": "python benchmarks/rounds.py",
+    "rounds": "python benchmarks/speed.py rounds",
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
     "film": "python benchmarks/reconstruction.py film",
     "replay": "python benchmarks/path_replay.py --paths 4 16",
     "cloud": "python benchmarks/cloud_path_replay.py FOLDER/wdas_cloud_sixteenth.vdb",
-    "engines": "python benchmarks/engines.py",
-    "tangents": "python benchmarks/engines.py --tangents",
+    "engines": "python benchmarks/speed.py engines",
+    "tangents": "python benchmarks/speed.py tangents",
     "launches": "python benchmarks/launches.py --as-a-gpu --engines warp",
-    "solvers": "python benchmarks/solver.py",
+    "solvers": "python benchmarks/speed.py solvers",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
     "gpu": "python benchmarks/gpu_check.py speed",
-    "scale": "python benchmarks/scaling.py",
+    "scale": "python benchmarks/speed.py scale",
     "speed": "ddrecon bench --quick",
     "hard": "ddrecon bench --hard",
     "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
@@ -138,6 +138,18 @@ def ask_git(*words: str) -> str:
     return subprocess.run(
         ["git", *words], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
+
+
+def print_row(*cells: object) -> None:
+    """Prints a row of a table."""
+    shown = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
+    print(f"| {' | '.join(shown)} |", flush=True)
+
+
+def print_header(*names: str) -> None:
+    """Prints the head of a table."""
+    print_row(*names)
+    print_row(*["---"] * len(names))
 
 
 def split_row(line: str) -> list[str]:

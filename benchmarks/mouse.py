@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import print_header, print_row
+from figures import print_header, print_row
 
 LAYERS = ((0, 2), (2, 4), (4, 8), (8, 12), (12, 20))
 """Depths below the skin [mm]."""

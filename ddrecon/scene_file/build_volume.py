@@ -16,9 +16,8 @@ from torch import Tensor
 from ddrecon.errors import DataWarning, FormatError, Problems, SceneError, UsageError, gather
 from ddrecon.grid import Grid
 from ddrecon.io.phase_files import read_phase_table
-from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.field import GRAMS, KELVIN, MICROMETERS, Field, size_of
 from ddrecon.io.volumes.table import read_field
-from ddrecon.io.volumes.units import GRAMS, KELVIN, MICROMETERS, size_of
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.optics import black_body_radiance, scatter_droplets
 from ddrecon.medium.phase import (

@@ -135,7 +135,7 @@ def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, f
 def test_hard_cases_are_passed(name: str):
     """Where cells are opaque, little mass is left of much on the walk back."""
     use_engine("warp")
-    assert run_case(CASES[name], torch.device("cpu")).failures() == []
+    assert run_case(CASES[name], torch.device("cpu"))["failures"] == []
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
