@@ -145,7 +145,7 @@ volume..g=3 => -D volume..g=3: expected key.path=value
 volume.g.x=3 => -D volume.g.x=3: volume.g.x: volume.g is 0.3, not a mapping or list
 lights.x=3 => lights.x: no such entry: lights is a list of 2, counted from 0
 volume.g=[1 => -D volume.g=[1: not YAML: while parsing a flow sequence, did not find
-volume.g=*x => -D volume.g=*x: volume.g: aliases such as *name are not supported
+volume.g=*x => -D volume.g=*x: aliases such as *name are not supported
 """
 """Overrides of the small scene, and what its one line says: the user mends the scene."""
 
