@@ -192,7 +192,12 @@ def test_a_file_of_windows_is_read(read: Read, tmp_path: Path) -> None:
         ("transforms_test.json", {}, 2, "ttttt"),
         ("transforms_train.json", {}, 2, "....."),
         ("contest.json", {}, None, "....."),
-        ("transforms.json", {"train": ["0.png"], "val": ["3.png"], "test": ["./4.png"]}, 2, "...tt"),
+        (
+            "transforms.json",
+            {"train": ["0.png"], "val": ["3.png"], "test": ["./4.png"]},
+            2,
+            "...tt",
+        ),
         ("transforms.json", {"test": ["1.png"]}, None, ".t..."),
         ("transforms.json", {"val": []}, None, "....."),
     ],
