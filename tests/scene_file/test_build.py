@@ -135,20 +135,6 @@ def test_gray_fields_take_the_colors_of_constants(write: Write, tmp_path: Path):
         assert np.allclose(scene.volume.sigma_a[color], (color + 1) * (1 - values), atol=1e-6)
 
 
-@pytest.mark.parametrize("up", ["x", "y", "z"])
-def test_values_by_height_are_linear_between_them_and_even_beyond(write: Write, up: str) -> None:
-    """A ramp that ends within the box, of one number and of colors."""
-    gas = {"heights": [-0.25, 0.25], "values": [[1, 2, 3], 1]}
-    density = {"heights": [-9, 9], "values": [0, 18]}
-    scene = load_scene(write(volume((), density=density, sigma_a=gas, up=up)), dtype=torch.float64)
-    medium, axis = scene.volume, "zyx".index(up)
-    place = medium.grid.centers(medium.density)[axis]
-    torch.testing.assert_close(medium.density, (place + 9).expand(4, 3, 2))
-    part = (0.5 + 2 * place).clamp(0, 1)
-    expected = torch.stack([top + (1 - top) * part for top in (1, 2, 3)]).expand(3, 4, 3, 2)
-    torch.testing.assert_close(medium.sigma_a, expected)
-
-
 def test_values_by_label_are_those_of_fields(write: Write, tmp_path: Path) -> None:
     """A table of optical properties, of whose rows each cell's label picks one."""
     labels = np.random.default_rng(3).integers(0, 3, (4, 3, 2))

@@ -12,6 +12,7 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
+from ddrecon.io.volumes.table import write_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
 from ddrecon.medium.phase_blend import TwoLobe
@@ -19,6 +20,7 @@ from ddrecon.medium.phase_series import Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.load import describe, dump_scene, read_scene
 
+BOUNDS = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
 VOLUME = {name: value for name, value in yaml.safe_load(SCENE)["volume"].items() if name != "g"}
 SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {
     "henyey_greenstein": (HenyeyGreenstein, {"g": [0.8, 0.7, 0.6]}),
@@ -140,12 +142,14 @@ def test_a_number_of_each_cell_is_optimized_from_one(write: Callable[[str], Path
     assert scene.starts["phase.g"].tolist() == pytest.approx([0.8, -0.3])
 
 
-def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None:
+def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path], tmp_path: Path) -> None:
     """Between ends that are exact, moments are those of droplets of each size."""
     pytest.importorskip("miepython")
     droplets = {"type": "mie", "wavelength": 0.67, "refractive_index": 1.33}
     droplets |= {"effective_variance": 0.1}
-    sizes = {"heights": [-0.5, 0.5], "values": [6.0, 12.0]}
+    radius = np.array([7.0, 9.0, 11.0])
+    cells = np.broadcast_to(radius[:, None], (4, 3, 2))
+    write_field(tmp_path / "sizes.npz", "effective_radius", cells, BOUNDS)
     water = {name: VOLUME[name] for name in ("bounds", "resolution")}
     water |= {"density": 0.5, "sigma_t": {"meters": 1000}, "albedo": 1}
 
@@ -153,10 +157,9 @@ def test_droplets_differ_from_cell_to_cell(write: Callable[[str], Path]) -> None
         volume = water | {"phase": droplets, "effective_radius": radius}
         return load_scene(write(changed(volume=volume)), dtype=torch.float64).volume
 
-    medium = built(sizes)
-    radius = 9 + 6 * medium.grid.centers(medium.density)[1].flatten()
+    medium = built({"file": "sizes.npz"})
     moments_between = medium.phase.moments(9)[0, :, 0, :, 0]
-    torch.testing.assert_close(medium.sigma_s[0, 0, :, 0], 1500 / radius)
+    torch.testing.assert_close(medium.sigma_s[0, 0, :, 0], 1500 / torch.from_numpy(radius))
     assert not medium.sigma_a.any()
     for place, tolerance in ((0, 1e-12), (1, 4e-3)):
         same = built(float(radius[place]))
