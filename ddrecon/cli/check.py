@@ -24,9 +24,8 @@ from ddrecon.reconstruct.support import (
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
-from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
-from ddrecon.terms import needed_terms
+from ddrecon.terms import find_doubts, needed_terms
 from ddrecon.turntable import upright_axis
 from ddrecon.variables.values import with_values
 

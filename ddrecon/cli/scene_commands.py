@@ -47,7 +47,7 @@ def check(session: Session, scene: Path) -> None:
     scene_file = session.read(scene)
     from ddrecon.cli.check import describe, lines, supports_of
     from ddrecon.progress import tell
-    from ddrecon.scene_file.frames import each_frame, require_frames
+    from ddrecon.scene_file.build_views import each_frame, require_frames
 
     if scene_file.tree.frames is not None:
         require_frames(scene_file)

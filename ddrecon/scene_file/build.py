@@ -32,11 +32,9 @@ from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, numbers_in_cell, refuse_excess
 from ddrecon.scene import Scene, View
-from ddrecon.scene_file.build_views import build_views
+from ddrecon.scene_file.build_views import Maker, at_frame, build_views
 from ddrecon.scene_file.build_volume import build_media, cells_of, read_quantity
-from ddrecon.scene_file.frames import at_frame
 from ddrecon.scene_file.load import SceneFile, read_referenced, read_scene, require
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     AmbientSection,
     BeamSection,

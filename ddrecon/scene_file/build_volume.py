@@ -26,8 +26,8 @@ from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_series import Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
+from ddrecon.scene_file.build_views import Maker
 from ddrecon.scene_file.load import SceneFile, read_referenced
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.schema import (
     Bounds,
     ByLabel,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ddrecon.scene_file.build import load_scene
-from ddrecon.scene_file.doubts import find_doubts
+from ddrecon.terms import find_doubts
 
 ROOT = Path(__file__).parents[2]
 BALL = ROOT / "configs" / "ball.yaml"

@@ -8,7 +8,7 @@ from example_scene import changed
 from film_files import H264, write_film
 
 from ddrecon.errors import SceneError
-from ddrecon.scene_file.frames import require_frames
+from ddrecon.scene_file.build_views import require_frames
 from ddrecon.scene_file.load import SceneFile
 
 CAMERA = {"type": "perspective", "origin": [0, 0.3, 3.2], "target": [0, 0, 0], "fov": 28}

@@ -71,8 +71,7 @@ def turned(sign: int) -> Callable[[Tensor], Tensor]:
         (lambda pose: inverse(as_opencv(pose)), "world to camera with OpenCV axes"),
         (turned(1), "z up, as in Blender, in a scene with y up"),
         (turned(-1), "y up in a scene with z up"),
-        (lambda pose: pose * torch.tensor([1.0, 1, 1, 1000]), "lengths of the cameras times 0.001"),
-        (lambda pose: pose * torch.tensor([1.0, 1, 1, 0.01]), "lengths of the cameras times 100:"),
+        (lambda pose: pose * torch.tensor([1.0, 1, 1, 1000]), "check its target, field of view"),
         (lambda pose: pose + 90 * torch.eye(3, 4)[:, [3, 3, 3, 0]], "the camera looks past it"),
     ],
 )
