@@ -1,4 +1,4 @@
-"""What `check` says of a scene in words: the physics it needs, and what can hardly be meant in it."""
+"""What `check` says of a scene: the physics it needs, and what can hardly be meant in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The views section as cameras and pictures, of each frame of a film, and the box that fits them."""
+"""The views section as cameras and pictures, frame by frame, and the box that fits them."""
 
 from __future__ import annotations
 

@@ -8,12 +8,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.cameras import twist
 from ddrecon.errors import UsageError
@@ -23,12 +25,12 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import remix
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.forms import require_form, shapes_in_place
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
     PHASE,
     RESPONSE,
+    XYZ,
     is_of_volume,
     kind_of,
     split_name,
@@ -149,6 +151,54 @@ def shapes_of(scene: Scene, name: str) -> list[tuple[int, ...]]:
     is_pair = name in (*CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO) and scene.volume.media is None
     shape = () if is_pair else tuple(value_of(scene, name).shape)
     return shapes_in_place(_stored_name(scene.volume, name), shape, scene.volume.grid.shape)
+
+
+def shapes_in_place(
+    name: str, shape: tuple[int, ...], cells: tuple[int, ...]
+) -> list[tuple[int, ...]]:
+    """The shapes that the variable `name` may have in place of its own `shape`."""
+    kind, last = kind_of(name), split_name(name)[1]
+    if last == "density":
+        return [cells]
+    if last.startswith(PHASE):
+        return [shape, (), *((color, *tail) for color in (1, 3) for tail in ((), cells))]
+    if kind.is_color:
+        tails = [(), cells] if kind.is_cellwise else [shape[1:]]
+        return [(color, *tail) for tail in tails for color in (1, 3)]
+    if kind.is_cellwise:
+        return [(), cells, (1, *cells)]
+    return [(len(kind.components),)] if kind.components in (XYZ, XYZ[:2]) else [shape]
+
+
+def require_form(
+    name: str, value: Tensor, known: Tensor, like: Tensor, cells: tuple[int, ...]
+) -> None:
+    """Raises UsageError unless `value` can be the variable `name`, in place of `known`, on `cells`.
+
+    Its precision and device are to be those of `like`. Nothing is read from a GPU.
+    """
+    if not isinstance(value, Tensor):
+        raise UsageError(f"{name}: expected a tensor, found {type(value).__name__}")
+    if not is_real(value):
+        raise UsageError(f"{name}: is {value.dtype}, {value.layout}; expected real and strided")
+    if (value.dtype, value.device) != (like.dtype, like.device):
+        raise UsageError(
+            f"{name}: is {value.dtype} on {value.device}, but the scene is {like.dtype} on "
+            f"{like.device}; convert it by .to(...)"
+        )
+    require_shape(name, value, *shapes_in_place(name, tuple(known.shape), cells))
+
+
+def require_shape(name: str, value: Tensor | None, *shapes: tuple[int, ...]) -> None:
+    """Raises UsageError unless `value` is None or has one of `shapes`."""
+    if value is not None and tuple(value.shape) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in dict.fromkeys(shapes))
+        raise UsageError(f"{name}: has shape {list(value.shape)}; expected {expected}")
+
+
+def is_real(value: object) -> bool:
+    """Whether `value` is a tensor of real numbers, each in its place."""
+    return isinstance(value, Tensor) and value.layout == torch.strided and not value.is_complex()
 
 
 def _unknown(scene: Scene, name: str) -> UsageError:
@@ -290,3 +340,42 @@ def _replace_view(view: View, values: Mapping[str, Tensor], center: Triple) -> V
     if "focal" in changes:
         changes["half_width"] = 1 / (2 * changes.pop("focal"))
     return replace(view, camera=replace(camera, **changes) if changes else camera, **response)
+
+
+def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
+    """The variable of `name`, and its change, of its value's shape, by one unit of `name`.
+
+    `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
+    or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
+    Directions, positions and cameras change by component only. Raises UsageError.
+    """
+    if name in variable_names(scene):
+        value = value_of(scene, name)
+        if components := kind_of(name).components:
+            names = ", ".join(f"{name}.{component}" for component in components)
+            raise UsageError(f"{name} changes by component: {names}")
+        return name, torch.ones_like(value)
+    owner, _, component = name.rpartition(".")
+    if owner in variable_names(scene):
+        value = value_of(scene, owner)
+        components = component_names(owner, value)
+        if component in components:
+            change = torch.zeros_like(value)
+            change[components.index(component)] = 1
+            return owner, change
+    raise UsageError(f"the scene has no number {name}")
+
+
+@contextmanager
+def varied(scene: Scene, name: str | None) -> Iterator[Scene]:
+    """`scene` in which `name`, as for `variation`, is a dual number while the block lasts, if any.
+
+    Images of it have their derivative as a tangent. Raises UsageError.
+    """
+    if name is None:
+        yield scene
+        return
+    variable, change = variation(scene, name)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(value_of(scene, variable), change)
+        yield with_values(scene, {variable: dual})
