@@ -48,11 +48,10 @@ from ddrecon.supported import require_above, require_supported
 from ddrecon.variables.kinds import PHASE, kind_of, split_name, unit_of
 from ddrecon.variables.values import (
     component_names,
+    find_volume_readers,
     name_each,
     value_of,
     variable_names,
-    volume_names,
-    volume_value,
 )
 
 START_OF_EMISSION = 0.1
@@ -260,9 +259,9 @@ def _varied(
     """How many numbers a cell the parameter `name` has."""
     (owner, last), kind = split_name(name), kind_of(name)
     medium = media.get(owner.removeprefix("media.").strip("."))
-    if medium is None or not kind.is_cellwise or last not in volume_names(medium):
+    if medium is None or not kind.is_cellwise or last not in (read := find_volume_readers(medium)):
         return 0
-    value = volume_value(medium, last)
+    value = read[last]()
     is_field = value.ndim >= 3 or isinstance(settings.init, FieldFile)
     is_field = is_field or (last == "emission" and _is_dark(value))
     is_field = is_field if settings.field is None else settings.field

@@ -37,6 +37,7 @@ from ddrecon.scene_file.schema import (
     RayleighSection,
     TableSection,
     TwoLobeSection,
+    VolumeSection,
     Water,
 )
 from ddrecon.settings import FieldFile
@@ -168,7 +169,7 @@ class _Medium:
         density = tensor(self.values("density"))[0].expand(grid.shape)
         medium = Volume(grid, density, sigma_a, sigma_s, phase)
         medium.index = getattr(section, "index", 1.0)
-        if not self.prefix and self.maker.tree.glows:
+        if isinstance(section, VolumeSection) and self.maker.tree.glows:
             if section.temperature is not None:
                 medium.black_body = tensor(black_body_radiance(self.values("temperature")[0]))
             else:

@@ -126,8 +126,8 @@ def _require_strict(text: str, locate: Locate) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent):
             fault = "aliases such as *name are not supported; write the value again"
-        elif getattr(event, "tag", None):
-            fault = f"tags such as {event.tag!r} are not supported"
+        elif tag := getattr(event, "tag", None):
+            fault = f"tags such as {tag!r} are not supported"
         elif depth > MAX_DEPTH:
             fault = f"nested more than {MAX_DEPTH} deep"
         if fault:

@@ -15,7 +15,7 @@ from ddrecon.records import faults_of
 from ddrecon.scene import Scene, View
 from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, RESPONSE, STEEPEST_G, kind_of, split_name
-from ddrecon.variables.values import require_form, require_shape, stored_value, variable_names
+from ddrecon.variables.values import find_readers, require_form, require_shape
 
 RIGID = 0.01
 """How far from 1 and 0 products of a pose's axes may be: optimizers and halves round."""
@@ -75,8 +75,8 @@ def _require_range(name: str, value: Tensor) -> None:
 def _numbers_of(scene: Scene, views: Sequence[View]) -> dict[str, Tensor]:
     """All that can be varied of `scene` and its `views`, by name, as it is stored."""
     numbers: dict[str, object] = {
-        name: stored_value(scene, name)
-        for name in variable_names(scene)
+        name: read()
+        for name, read in find_readers(scene).items()
         if not name.startswith("views.") and split_name(name)[1] not in EXTINCTION_AND_ALBEDO
     }
     for view in views:
