@@ -284,7 +284,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     lights = decompose_lights(scene.lights)
     problem = DiffusionProblem(
         cells,
-        Closure(settings.closure, grid, settings.floor),
+        Closure(settings.closure, grid),
         cut(receive_in_parts(medium, cells, lights, settings).source)[0],
         ambient_radiance(lights, solution),
         cells.degree > 0,
