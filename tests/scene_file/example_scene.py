@@ -37,7 +37,7 @@ def changed(**sections: Any) -> str:
     return scene_text({name: value for name, value in tree.items() if value is not None})
 
 
-def volume(left_out: tuple[str, ...] = (), **changes: Any) -> str:
-    """`SCENE` with another volume."""
-    section = VOLUME | changes
-    return changed(volume={name: section[name] for name in section if name not in left_out})
+def volume(left_out: tuple[str, ...] = (), views: Any = TREE["views"], **changes: Any) -> str:
+    """`SCENE` with another volume, or other views as well."""
+    section = {name: value for name, value in (VOLUME | changes).items() if name not in left_out}
+    return changed(volume=section, views=views)
