@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.ground import UPWARDS, stay_above
+from ddrecon.light.ground import stay_above
 from ddrecon.light.lights import (
     BRIGHTNESS,
     AmbientLight,
@@ -17,11 +17,8 @@ from ddrecon.light.lights import (
     EnvironmentLight,
     PointLight,
 )
-from ddrecon.light.profile import seen_radius
 from ddrecon.light.sky import count_suns, decompose_lights
 from ddrecon.light_field import multiply_scatters
-from ddrecon.lighting import exchange_grid
-from ddrecon.march.ground import DOWNWARDS
 from ddrecon.march.samplers import greatest_depth
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.medium.fresnel import transmitted_moments
@@ -32,6 +29,11 @@ from ddrecon.settings import DiffusionSettings
 from ddrecon.transport.sweep import count_directions
 from ddrecon.variables.values import extinction_of, with_values
 
+LIGHTS = {
+    DirectionalLight: "directional light",
+    PointLight: "point light",
+    BeamLight: "beam from outside",
+}
 METHODS = {
     ("p1", "conservative"): "{} closure, multigrid",
     ("p1", "printed"): "smooth closure, printed scheme by Jacobi iteration",
@@ -54,10 +56,10 @@ UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    return list(_terms(scene))
+    return [*_find_terms(scene)]
 
 
-def _terms(scene: Scene) -> Iterator[str]:
+def _find_terms(scene: Scene) -> Iterator[str]:
     volume, medium = scene.volume, scale_medium(scene.volume, scene.diffusion.angles)
     is_diffuse = multiply_scatters(medium, scene.diffusion)
     yield _color_term(scene)
@@ -66,7 +68,7 @@ def _terms(scene: Scene) -> Iterator[str]:
     if volume.grid.periodic:
         axes = " and ".join("zyx"[axis] for axis in reversed(volume.grid.periodic))
         yield f"the volume repeats without end along {axes}"
-    yield from _light_terms(scene, is_diffuse)
+    yield from _light_terms(scene)
     if volume.emission is not None or volume.black_body is not None:
         emission = "emission" if volume.black_body is None else "emission of a black body"
         yield f"{emission}, {'scattered and seen' if is_diffuse else 'only seen: not scattered'}"
@@ -77,7 +79,6 @@ def _terms(scene: Scene) -> Iterator[str]:
             f"refractive index {volume.index:g}: faces reflect {inside:.1%} of diffuse light "
             f"inside, and {outside:.1%} of light from straight ahead"
         )
-    yield from _ground_terms(scene)
     if is_diffuse:
         yield from _diffuse_terms(medium, scene)
     else:
@@ -108,40 +109,20 @@ def _color_term(scene: Scene) -> str:
     )
 
 
-def _light_terms(scene: Scene, is_diffuse: bool) -> Iterator[str]:
-    for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
+def _light_terms(scene: Scene) -> Iterator[str]:
+    for kind, name in LIGHTS.items():
         if count := sum(isinstance(light, kind) for light in scene.lights):
             yield f"transmittance towards {_count(count, name)}"
-    ambient = "by quadrature over 50 directions"
-    if is_diffuse:
-        ambient = "as inflow of the diffusion through the box's faces"
     for light in scene.lights:
-        if isinstance(light, BeamLight):
-            radius = float(seen_radius(light.radius, max(scene.volume.grid.spacing)))
-            yield f"transmittance towards a beam from outside, {radius:.3g} u in radius here"
-        elif isinstance(light, EnvironmentLight):
+        if isinstance(light, EnvironmentLight):
             (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
             beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
-            sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
-            yield f"environment map {width} x {height}: {beams}{sky}"
+            yield f"environment map {width} x {height}: {beams}{_count(directions, 'direction')}"
     if any(isinstance(light, AmbientLight) for light in scene.lights):
-        yield f"ambient light, {ambient}"
-
-
-def _ground_terms(scene: Scene) -> Iterator[str]:
-    """A ground, and on what it and the volume light each other."""
-    ground = scene.ground
-    if ground is None:
-        return
-    albedo = _listed(ground.mean_albedo, is_by_cell=False)
-    if ground.albedo.ndim > 1:
-        rows, columns = ground.albedo.shape[1:]
-        albedo += f" in the mean of {columns} x {rows} pixels"
-    yield (
-        f"ground at {'zyx'[ground.plane.axis]} = {ground.plane.height:g}, albedo {albedo}: direct "
-        f"light ray by ray, other light by {DOWNWARDS} directions, its own by {UPWARDS}, "
-        f"to and fro in {_cells(exchange_grid(scene)[0])}"
-    )
+        yield "ambient light"
+    if scene.ground is not None:
+        plane, albedo = scene.ground.plane, _listed(scene.ground.mean_albedo, is_by_cell=False)
+        yield f"ground at {'zyx'[plane.axis]} = {plane.height:g}, albedo {albedo}"
 
 
 def _diffuse_terms(medium: Medium, scene: Scene) -> Iterator[str]:
