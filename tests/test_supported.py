@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,26 +11,13 @@ import pytest
 import torch
 from media import box_grid, make_scene, random_values, tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError, UsageError
 from ddrecon.grid import Grid
 from ddrecon.layer import VolumeRenderer, fluence, render
 from ddrecon.light.ground import Ground, Plane
-from ddrecon.light.lights import (
-    AmbientLight,
-    BeamLight,
-    DirectionalLight,
-    EnvironmentLight,
-    PointLight,
-)
-from ddrecon.lighting import solve_light
-from ddrecon.medium.phase import HenyeyGreenstein
-from ddrecon.picture import view_picture
+from ddrecon.light.lights import BeamLight, PointLight
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.terms import needed_terms
-from ddrecon.variables.values import with_values
 
 SHAPE = (3, 4, 5)
 PERIOD = "volume.periodic is for model p1 with scheme conservative, or none"
@@ -151,122 +137,3 @@ def test_lists_serve_as_tuples() -> None:
     for size in ([2, 3], torch.Size([2, 3]), np.array([2, 3])):
         scene.views[0].camera.size = size
         assert render(scene).shape[-2:] == (2, 3)
-
-
-ABOVE, DOWN = tensor(0.1, 2.0, 0.1), tensor(-0.1, -1.0, 0.1)
-LIGHTS: dict[str, Callable[[torch.Tensor], Any]] = {
-    "sun": lambda color: DirectionalLight(DOWN, color),
-    "ambient": lambda color: AmbientLight(color),
-    "sky": lambda color: EnvironmentLight(
-        color.view(-1, 1, 1).expand(-1, 2, 3), *tensor(1.0, 0.0), directions=6
-    ),
-    "lamp": lambda color: PointLight(ABOVE, color),
-    "beam": lambda color: BeamLight(ABOVE, DOWN, color, tensor(0.2)[0]),
-}
-
-
-def color_part(part: str, color: torch.Tensor) -> Scene:
-    """A scene that is gray but for one `part`, of a `color` [1] or [3]."""
-    scene = make_scene(random_values(3, 4, 3), sigma_a=(0.5,), sigma_s=(3.0,), ambient=(0.3,))
-    volume, (view,) = scene.volume, scene.views
-    if part in LIGHTS:
-        return replace(scene, lights=[LIGHTS[part](color)])
-    if part == "ground":
-        return replace(scene, ground=Ground(0.2 * color, Plane(volume.grid.lower[1], 1)))
-    if part == "phase":
-        return replace(scene, volume=replace(volume, phase=HenyeyGreenstein(0.2 * color)))
-    if part in ("exposure", "offset"):
-        return replace(scene, views=[replace(view, **{part: color})])
-    if part == "background":
-        return replace(scene, views=[replace(view, background=color.view(-1, 1, 1))])
-    return replace(scene, volume=replace(volume, **{part: color}))
-
-
-VOLUME = "sigma_a", "sigma_s", "phase", "emission", "black_body"
-VIEW = "exposure", "offset", "background"
-
-
-@pytest.mark.parametrize("part", [*LIGHTS, *VOLUME, "ground", *VIEW])
-def test_all_is_gray_where_pictures_are(part: str) -> None:
-    for color in (tensor(1.5), tensor(1.0, 2.0, 3.0)):
-        scene = color_part(part, color)
-        picture = view_picture(solve_light(scene, SolveMemory()), scene, scene.views[0])
-        is_gray = bool(torch.allclose(picture, picture.mean(0)))
-        assert is_gray == (len(color) == 1)
-        assert needed_terms(scene)[0].startswith("1 color channel (all is gray)") == is_gray
-
-
-SCENE = """
-volume:
-  bounds: {min: [0, 0, 0], max: [1, 2, 4]}
-  resolution: [10, 10, 10]
-  density: 1
-  sigma_t: [1, 2, 4]
-  albedo: 0.9
-lights: [{type: directional, direction: [1, 0, 0], irradiance: 1}]
-views:
-  - {name: view, camera: {type: perspective, origin: [4, 0, 0], target: [0, 0, 0], up: [0, 1, 0],
-     fov: 30, resolution: [2, 2]}}
-"""
-AS_GIVEN = "diffusion.refine=1"
-MEAN_SIDE = (0.1 + 0.2 + 0.4) / 3
-
-
-@pytest.mark.parametrize("depth", [0.7, 0.8])
-def test_two_where_a_cell_is_thick(tmp_path: Path, depth: float) -> None:
-    """The densest color decides, across a cell's mean side; `check` says so."""
-    path = tmp_path / "scene.yaml"
-    path.write_text(SCENE)
-    scene = load_scene(path, overrides=[f"volume.density={depth / (4 * MEAN_SIDE)}", AS_GIVEN])
-    steps = 1 if depth < 0.75 else 2
-    assert scene.render.steps == steps
-    samples = "1 sample" if steps == 1 else "2 samples"
-    assert f"view rays: {samples} a cell of at most {depth} optical depths" in needed_terms(scene)
-    asked = load_scene(path, overrides=["render.steps_per_voxel=3", "volume.density=9"])
-    assert asked.render.steps == 3
-
-
-SMALL = ["optimize=null", "volume.resolution=[3, 2, 3]", "volume.density=1", "volume.sigma_s=1"]
-SMALL += [
-    "diffusion.tolerance=0.1",
-    "views=[{name: front, camera: {type: perspective, origin: [0, 0.2, 3], target: [0, 0, 0],"
-    " fov: 30, resolution: [2, 2]}}]",
-]
-MEDIA = (
-    "volume={bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}, resolution: [3, 2, 2], media:"
-    " {smoke: {density: 1, sigma_a: 1, sigma_s: 3, g: 0.5},"
-    " air: {density: 1, sigma_a: 0, sigma_s: 1, phase: {type: rayleigh}}}}"
-)
-KINDS = {
-    "thick cells": ["volume.sigma_s=4"],
-    "a strong forward peak": ["volume.g=0.85"],
-    "a glow": ["volume.density=0.1", "volume.emission=1"],
-    "periods": ["volume.periodic=[x]"],
-    "an index": ["volume.index=1.4"],
-    "two media": [MEDIA],
-    "density that is sought": ["optimize={parameters: {density: {}}}"],
-}
-
-
-@pytest.mark.parametrize("overrides", KINDS.values(), ids=KINDS)
-def test_a_scene_made_in_python_is_that_of_its_file(overrides: list[str]) -> None:
-    loaded = load_scene(BALL, overrides=[*SMALL, *overrides])
-    settings = DiffusionSettings(tolerance=loaded.diffusion.tolerance)
-    parts = loaded.volume, loaded.lights, loaded.views
-    made = Scene(*parts, diffusion=settings, optimize=loaded.optimize)
-    assert (made.diffusion, made.render, made.reason) == (
-        loaded.diffusion,
-        loaded.render,
-        loaded.reason,
-    )
-    assert torch.equal(render(made), render(loaded))
-    assert (made.diffusion, made.render) != (settings, RenderSettings())
-
-
-def test_what_was_chosen_stays_when_the_medium_changes() -> None:
-    """So a loss has no steps where a thicker medium would be given more rounds."""
-    scene = load_scene(BALL, overrides=SMALL)
-    thick = with_values(scene, {"density": 100 * scene.volume.density})
-    assert (thick.diffusion, thick.render) == (scene.diffusion, scene.render)
-    fresh = replace(scene, volume=thick.volume, diffusion=DiffusionSettings())
-    assert fresh.diffusion != replace(scene.diffusion, tolerance=fresh.diffusion.tolerance)

@@ -54,7 +54,7 @@ def export(
     kind, suffixes = output.suffix.lower(), (".xml", ".json", *WRITTEN)
     if kind not in suffixes:
         raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(suffixes)}")
-    from ddrecon.reference.export import export_scene
+    from ddrecon.reference.exchange import export_scene
     from ddrecon.run.exported import LENGTHS, fields_to_export
     from ddrecon.scene_file.transforms import export_transforms
     from ddrecon.uncertainty.folder import volumes_in
@@ -125,7 +125,7 @@ def _is_scene(source: Path) -> bool:
 @in_session
 def import_(session: Session, source: Path, output: Path, overwrite: bool) -> None:
     """Write a scene file of a Mitsuba 3 scene: a grid volume in a cube, its lights and cameras."""
-    from ddrecon.reference.scene_import import import_scene
+    from ddrecon.reference.exchange import import_scene
 
     written = import_scene(source, output, may_exist=overwrite)
     click.echo(f"written: {', '.join(map(str, written))}")

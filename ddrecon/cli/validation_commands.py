@@ -6,7 +6,7 @@ import sys
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -85,8 +85,7 @@ def reference(
     loaded = session.build(scene_file)
     from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import REFERENCE, claim_folder
-    from ddrecon.reference.compare import compare_to_folder, reference_lines
-    from ddrecon.reference.trace import open_tracer
+    from ddrecon.reference.trace import compare_to_folder, open_tracer, reference_lines
     from ddrecon.scene_file.load import referenced_files
 
     views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
@@ -135,33 +134,31 @@ def bench(
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     scene_file = None if scene is None else session.read(scene)
+    from ddrecon.io.files.atomic import write_json
     from ddrecon.io.files.folders import BENCH, claim_folder
+    from ddrecon.validate.hard import hard_lines, run_cases
 
     claim = nullcontext() if output is None else claim_folder(output, BENCH, overwrite=overwrite)
     with claim as folder:
         if folder is not None:
             folder.clear()
-        if not is_hard:
-            _bench_speed(session, scene_file, is_quick, output)
-            return
-        from ddrecon.io.files.atomic import write_json
-        from ddrecon.validate.hard import hard_lines, run_cases
-
-        report = run_cases(session.start(), session.progress)
+        if is_hard:
+            report = run_cases(session.start(), session.progress)
+            lines = hard_lines(report)
+        else:
+            report, lines = _bench_speed(session, scene_file, is_quick)
         if output is not None:
-            write_json(output / "hard.json", report)
-        session.show(report, hard_lines(report))
-        if not report["passed"]:
+            write_json(output / ("hard.json" if is_hard else "bench.json"), report)
+        session.show(report, lines)
+        if is_hard and not report["passed"]:
             sys.exit(1)
 
 
 def _bench_speed(
-    session: Session, scene_file: SceneFile | None, is_quick: bool, output: Path | None
-) -> None:
-    from ddrecon.bench.measure import bench_lines, describe, run_bench
-    from ddrecon.bench.plume import load_pair
+    session: Session, scene_file: SceneFile | None, is_quick: bool
+) -> tuple[dict[str, Any], list[str]]:
+    from ddrecon.bench import bench_lines, load_pair, run_bench
     from ddrecon.errors import MissingExtraError, SceneError
-    from ddrecon.io.files.atomic import write_json
     from ddrecon.reference.trace import open_tracer
 
     load = None if scene_file is None else partial(session.build, scene_file)
@@ -173,8 +170,5 @@ def _bench_speed(
         tracer = open_tracer(scene, scene.views, threads=session.threads)
     except (MissingExtraError, SceneError) as error:
         click.echo(f"without path tracing: {error}", err=True)
-    rows = run_bench(scene, double, tracer, is_quick, session.progress)
-    measured = describe(rows, scene, session.environment())
-    if output is not None:
-        write_json(output / "bench.json", measured)
-    session.show(measured, bench_lines(rows))
+    report = run_bench(scene, double, tracer, is_quick, session.progress)
+    return report | {"environment": session.environment()}, bench_lines(report)

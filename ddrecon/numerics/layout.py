@@ -53,9 +53,13 @@ class Unrolled:
         """`field` [..., z, y, x] of a period in all cells."""
         for axis, (low, high) in enumerate(zip(self.before, self.after, strict=True)):
             if low or high:
-                count = field.shape[axis - 3]
-                places = torch.arange(-low, count + high, device=field.device) % count
-                field = field.index_select(axis - 3, places)
+                # Cut, not indexed: sums on the way back have a fixed order.
+                count, place, pieces = field.shape[axis - 3], -low, list[Tensor]()
+                while place < (end := count + high):
+                    length = min(count - place % count, end - place)
+                    pieces.append(field.narrow(axis - 3, place % count, length))
+                    place += length
+                field = torch.cat(pieces, axis - 3)
         return field
 
     def crop(self, field: Tensor) -> Tensor:

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
-from ddrecon.numerics.autodiff import is_forward
+from ddrecon.numerics.interpolation import weigh_rows
 
 COUNTS = tuple(2**power for power in range(5, 12))
 """Lengths of series: few of them, so that few matrices are kept."""
@@ -172,7 +171,7 @@ def look_up(table: Tensor, angle: Tensor) -> Tensor:
     weights = torch.stack(_cubic((place - first).to(table.dtype), math.pi / steps), -1)
     # Values and slopes at both ends of a step stand beside each other.
     rows = 2 * first[:, None] + torch.arange(4, device=place.device)
-    values = torch.stack([_weigh(curves.flatten(0, 1), rows, weights) for curves in table])
+    values = torch.stack([weigh_rows(curves.flatten(0, 1), rows, weights) for curves in table])
     return values.view(colors, *angle.shape, table.shape[-1])
 
 
@@ -180,14 +179,6 @@ def _cubic(t: Any, step: Any) -> tuple[Any, Any, Any, Any]:
     """Weights of values and slopes at both ends of a `step`, the part `t` of it on (Hermite)."""
     u = 1 - t
     return (1 + 2 * t) * u**2, step * t * u**2, (1 + 2 * u) * t**2, -step * u * t**2
-
-
-def _weigh(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """The sums over j of `weights` [R, J] times the `rows` [R, J] of `values` [N, K], [R, K]."""
-    if is_forward():
-        return (values[rows] * weights[..., None]).sum(1)
-    # Several times as fast, but without forward mode.
-    return embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
 
 
 def with_slopes(values: Tensor) -> Tensor:

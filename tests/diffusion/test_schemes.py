@@ -18,8 +18,8 @@ from media import (
 from test_operator import EXTENT, manufactured
 from torch import Tensor
 
-from ddrecon.diffusion import flux_limited, printed
-from ddrecon.diffusion.closures import CLOSURES, FLOOR
+from ddrecon.diffusion import closures, flux_limited, printed
+from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.flux_limited import (
     VACUUM,
     LimitedOperator,
@@ -181,19 +181,20 @@ def test_a_color_without_source_stays_dark():
 def ball() -> Callable[..., Scene]:
     """A ball 0.7 `sigma` optical depths thick in empty space, its surface `width` cells wide."""
 
-    def make(sigma: float, width: float, floor: float = FLOOR) -> Scene:
+    def make(sigma: float, width: float) -> Scene:
         grid = Grid((16, 16, 16), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
         radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
         density = (16 * (0.35 - radius) / width + 0.5).clamp(0, 1)
         optics = {"sigma_a": (0.01 * sigma,), "sigma_s": (0.99 * sigma,), "scheme": "printed"}
-        return make_scene(density, grid=grid, **optics, tolerance=1e-4, floor=floor)
+        return make_scene(density, grid=grid, **optics, tolerance=1e-4)
 
     return make
 
 
-def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
+def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball, monkeypatch):
     """At a floor of 0.1; the cell named differs most from its neighbors, by over 4 of its kappa."""
-    scene = ball(20.0, 2.0, floor=0.1)
+    monkeypatch.setattr(closures, "FLOOR", 0.1)
+    scene = ball(20.0, 2.0)
     with pytest.raises(SolveError, match=r"above 4; .*diffusion\.scheme=conservative") as caught:
         solve_light(scene, SolveMemory())
     words = r"the largest is ([\d.]+) at cell \((\d+), (\d+), (\d+)\)"
@@ -202,7 +203,7 @@ def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
     factor, (x, y, z) = float(told[1]), (int(index) for index in told.groups()[1:])
     volume = scene.volume
     extinction = keep_medium(volume).transport_extinction
-    kappa = 3 * CLOSURES["smooth"](extinction, volume.grid, scene.diffusion.floor)
+    kappa = 3 * CLOSURES["smooth"](extinction, volume.grid)
     kappa = torch.nn.functional.pad(kappa, (1,) * 6, mode="replicate")[0]
     here = kappa[z : z + 3, y : y + 3, x : x + 3]
     lines = here[:, 1, 1], here[1, :, 1], here[1, 1]

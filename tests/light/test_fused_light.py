@@ -253,6 +253,6 @@ def test_light_of_any_degree(degree: int, has_more: bool):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [shear_kernel(name, 32, is_dual=True) for name in [*_KERNELS][:2]]
-    kernels += [way_kernel(False, 32), way_kernel(True, 32), receive_kernel("tangent", 32)]
+    kernels += [way_kernel("", 32), way_kernel("long", 32), receive_kernel("tangent", 32)]
     outgoing = RowFunction(HEADER, "Outgoing<3, 1, 1>", ((3, 1, 1, 1),), 1, VIEW, GIVEN)
     assert_compiles([*kernels, outgoing.kernel("tangents", 17, 32)], tmp_path)

@@ -137,7 +137,7 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     packets = [
         kernels.integral_kernel(by_g, False),
         kernels.tangent_kernel(layout, Case(False, True)),
-        kernels.adjoint_kernel(several, Case(False)),
+        kernels.adjoint_kernel(several, Case(False), "long"),
     ]
     assert_compiles(packets, tmp_path)
 

@@ -1,24 +1,119 @@
-"""COLMAP's models: rays as its manual has them, text and binary alike, and refusals in one line."""
+"""Views that are not listed: rings of cameras and their images; COLMAP's models."""
 
+import math
 import struct
 from collections.abc import Callable
+from operator import mul, sub
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from example_scene import changed
+import yaml
+from example_scene import SCENE, changed
 
 from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.lenses import distort
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.view_sources import MODELS, OTHERS
+from ddrecon.scene_file.load import SceneFile, describe, dump_scene, read_scene
+from ddrecon.scene_file.view_schema import PerspectiveSection, RingSection
+from ddrecon.scene_file.view_sources import MODELS, OTHERS, ring_cameras
 from ddrecon.settings import LENSES
+from ddrecon.turntable import upright_axis
 
 Read = Callable[..., SceneFile]
+RING = {"count": 3, "radius": 3.2, "height": 0.3, "fov": 28, "resolution": [8, 6]}
+
+
+@pytest.mark.parametrize("up", range(3))
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_ring_goes_around_its_target_about_the_way_up(up: int, is_own: bool) -> None:
+    """From the axis after it, x, y, z and x again, towards the one after that."""
+    upright, ahead, aside = up, (up + 1) % 3, (up + 2) % 3
+    along = (float(up == 0), float(up == 1), float(up == 2))
+    given = {"up": along} if is_own else {}
+    ring = RingSection(count=10, radius=2, fov=30, target=(1, 2, 3), height=0.5, **given)
+    cameras = ring_cameras(ring, (1.0, 2.0, 3.0) if is_own else along)
+    offsets = [tuple(map(sub, camera.origin or (), ring.target)) for camera in cameras]
+    assert offsets[0][ahead] == 2 and offsets[1][aside] > 0 > offsets[-1][aside]
+    for camera, offset in zip(cameras, offsets, strict=True):
+        assert offset[upright] == 0.5
+        assert math.hypot(offset[ahead], offset[aside]) == pytest.approx(2)
+        same = {"origin": camera.origin, "target": (1, 2, 3), "up": along, "fov": 30}
+        assert camera == PerspectiveSection(**same)
+    turns = [math.dist(offsets[i - 1], offsets[i]) for i in range(10)]
+    assert turns == pytest.approx([4 * math.sin(math.pi / 10)] * 10)
+
+
+def test_a_ring_lies_around_a_tilted_way_up() -> None:
+    """Whatever its length: cameras keep their height along it, and their distance."""
+    up = (0.3, -2.0, 0.5)
+    ring = RingSection(count=5, radius=2, fov=30, height=0.5, up=up)
+    for camera in ring_cameras(ring, (0, 1, 0)):
+        assert camera.origin is not None
+        assert sum(map(mul, camera.origin, up)) == pytest.approx(0.5 * math.hypot(*up))
+        assert math.hypot(*camera.origin) == pytest.approx(math.hypot(2, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("volume", "ring", "axis"),
+    [({}, {}, 1), ({"up": "z"}, {}, 2), ({"up": "x"}, {}, 0), ({"up": "z"}, {"up": [0, 1, 0]}, 1)],
+)
+def test_the_volume_says_what_is_up(read: Read, volume: Any, ring: Any, axis: int) -> None:
+    volume = yaml.safe_load(SCENE)["volume"] | volume
+    scene_file = read(changed(volume=volume, views={"ring": RING | ring}))
+    assert upright_axis(build_scene(scene_file)) == "xyz".index(volume.get("up", "y"))
+    views = scene_file.tree.views
+    assert [view.camera.origin[axis] for view in views] == [RING["height"]] * 3
+    assert [view.camera.up[axis] for view in views] == [1] * 3
+
+
+def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path) -> None:
+    scene_file = read(changed(views={"ring": RING, "test_every": 2}))
+    views = scene_file.tree.views
+    assert [view.name for view in views] == ["ring_00", "ring_01", "ring_02"]
+    assert [view.split for view in views] == ["test", "train", "test"]
+    assert all(view.image is None for view in views)
+    dump_scene(describe(scene_file), tmp_path / "dump.yaml")
+    assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        *(["a", "b", "c"], ["2", "10", "11"], ["09", "10", "100"], ["1_10", "2_1", "2_9"]),
+        *(["0.25", "0.50", "1.00"], ["a-2", "a-9", "a-10"]),
+    ],
+)
+@pytest.mark.parametrize("pattern", ["targets/t_*.exr", "targets\\t_*.exr"])
+def test_images_are_in_order_of_their_numbers(
+    read: Read, tmp_path: Path, names: list[str], pattern: str
+) -> None:
+    """Of files alone, which are relative to the scene."""
+    (tmp_path / "targets").mkdir()
+    paths = [tmp_path / "targets" / f"t_{name}.exr" for name in names]
+    for path in reversed(paths):
+        path.touch()
+    (tmp_path / "targets" / "t_d.exr").mkdir()
+    ring = {name: value for name, value in RING.items() if name != "resolution"}
+    views = read(changed(views={"ring": ring, "images": pattern})).tree.views
+    assert [view.image for view in views] == paths
+
+
+@pytest.mark.parametrize("names", [["0.25", "0.5", "1"], ["-30", "0", "30"], ["1.9", "1.10", "2"]])
+def test_an_order_that_is_not_plain_is_refused(
+    refusal: Callable[..., list[str]], tmp_path: Path, names: list[str]
+) -> None:
+    for name in names:
+        (tmp_path / f"t_{name}.exr").touch()
+    (line,) = refusal(changed(views={"ring": RING, "images": "t_*.exr"}))
+    assert "views.images: 't_*.exr' matches names with fractions or signs" in line
+
+
+# COLMAP: rays as its manual has them, text and binary alike, and refusals in one line.
+
 CAMERAS: dict[str, list[float]] = {
     "SIMPLE_PINHOLE": [20.0, 4.2, 3.1],
     "PINHOLE": [20.0, 19.0, 4.2, 3.1],
@@ -84,7 +179,7 @@ def test_points_are_seen_where_the_manual_says(
     tree = scene_file.tree.__class__(**{**vars(scene_file.tree), "views": tuple(views)})
     scene = build_scene(SceneFile(tree, scene_file.path, scene_file.marks), dtype=torch.float64)
     camera = scene.views[1].camera
-    given = dict(zip(MODELS[model], CAMERAS[model], strict=True))
+    given = dict(zip(MODELS[model].split(), CAMERAS[model], strict=True))
     lens = "fisheye" if model == "OPENCV_FISHEYE" else "opencv"
     numbers = torch.tensor([given.get(name, 0.0) for name in LENSES[lens]]).double()
     points = torch.from_numpy(np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)))
@@ -126,12 +221,10 @@ def test_lines_of_points_may_be_missing(read: Read, tmp_path: Path, lines: list[
     assert [view.name for view in read(scene_text()).tree.views] == ["a", "b_2", "b_10"]
 
 
-@pytest.mark.parametrize("lines", [[POINTS, POINTS], ["", POINTS], [IMAGE]])
-def test_a_line_that_is_neither_is_refused(read: Read, tmp_path: Path, lines: list[str]) -> None:
+def test_a_line_that_is_neither_is_refused(read: Read, tmp_path: Path) -> None:
     write_text(tmp_path / "sparse/0", "PINHOLE")
-    text = "\n".join([f"{IMAGE} a.png", *lines])
-    (tmp_path / "sparse/0/images.txt").write_text(text)
-    with pytest.raises(FormatError, match=f"line {1 + len(lines)}: expected IMAGE_ID"):
+    (tmp_path / "sparse/0/images.txt").write_text(f"{IMAGE} a.png\n{IMAGE}")
+    with pytest.raises(FormatError, match="line 2: expected IMAGE_ID"):
         read(scene_text())
 
 

@@ -1,13 +1,17 @@
-"""OpenVDB files (.vdb) of any program, read without OpenVDB.
+"""OpenVDB files (.vdb) of any program, read and written without OpenVDB.
 
 Fog volumes are read: grids of half, float, double, and of vectors of three, on trees 5, 4, 3, in
 files of the versions 220 to 225, compressed by zip, by Blosc or not at all. Level sets, points and
-other trees are refused.
+other trees are refused. Where axes are exchanged or mirrored, cells are put in order along x, y and
+z; a grid that is turned otherwise is resampled. Grids of a file that have the same voxels share one
+box, around what is active in any of them, so that a scene can have several.
 
-A grid's transform puts the center of voxel (i, j, k) in the world. Grids of a file that have the
-same voxels share one box, around what is active in any of them, so that a scene can have several.
-Where axes are exchanged or mirrored, cells are put in order along x, y and z; a grid that is turned
-otherwise is resampled.
+What is written is of the plainest kind, not compressed, without tiles: float, or vec3s for colors.
+The background is 0, and active is what `prune` leaves; how many cells the box has, which a sparse
+grid does not say, is its metadata.
+
+A grid's transform puts the center of voxel (i, j, k) in the world. What is written has our cell
+(i, j, k) along x, y, z there.
 """
 
 from __future__ import annotations
@@ -15,41 +19,50 @@ from __future__ import annotations
 import itertools
 import re
 import struct
+import uuid
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 
 from ddrecon.errors import DataWarning, FormatError
-from ddrecon.io.volumes.field import VECTORS, Field, check_field
+from ddrecon.io.files.atomic import write_bytes
+from ddrecon.io.files.reading import as_float32, check_size
+from ddrecon.io.volumes.field import VECTORS, Facts, Field, Fields, check_field, prune
 from ddrecon.io.volumes.vdb_tree import (
+    ACTIVE_MASK,
+    LEAF,
+    LOWER,
     NODE_MASKS,
     NOWHERE,
+    SIDE,
+    UPPER,
+    VOXELS,
     ZIP,
     Coding,
     Stream,
     Tree,
-    check_box,
     join,
 )
 
-MAGIC, HEADER, UUID_LENGTH = 0x56444220, struct.Struct("<qIIIB"), 36
+MAGIC, HEADER = 0x56444220, "<qIIIB"
 OLDEST, NEWEST = 220, 225
 """Versions of files that are read."""
-POSITIONS = struct.Struct("<3q")
-"""Where a grid begins, where its voxels do, and where it ends."""
+WRITTEN, LIBRARY = 224, (10, 0)
+"""The versions of files and of OpenVDB that files of ours say they are of."""
 RESOLUTION = "ddrecon_resolution"
 """Metadata of our own files: how many cells the box has, empty ones included."""
 NUMBERS = {"half": "<f2", "float": "<f4", "double": "<f8", "vec3s": "<f4", "vec3d": "<f8"}
 """The numbers of a value, by its type."""
 TREE = re.compile(f"Tree_({'|'.join(NUMBERS)})_5_4_3(_HalfFloat)?")
 MAPS = {
-    **dict.fromkeys(("UniformScaleMap", "ScaleMap"), 15),
-    **dict.fromkeys(("UniformScaleTranslateMap", "ScaleTranslateMap"), 18),
     "TranslationMap": 3,
+    **dict.fromkeys(("UniformScaleMap", "ScaleMap"), 15),
     **dict.fromkeys(("UnitaryMap", "AffineMap"), 16),
+    **dict.fromkeys(("UniformScaleTranslateMap", "ScaleTranslateMap"), 18),
 }
 """How many numbers a transform has, by its type."""
 STEEPEST = 1e6
@@ -119,9 +132,9 @@ class _File:
     """
 
     def __init__(self, path: Path):
-        self.path, self.stream = path, Stream(path)
-        stream, size = self.stream, HEADER.size
-        magic, self.version, *_, has_places = HEADER.unpack(stream.read(size))
+        check_size(path.stat().st_size, path, "the file")
+        self.path, self.stream = path, (stream := Stream(path, path.read_bytes()))
+        magic, self.version, *_, has_places = stream.unpack(HEADER)
         if magic != MAGIC:
             raise FormatError(path, "is no OpenVDB file")
         if not OLDEST <= self.version <= NEWEST:
@@ -130,17 +143,17 @@ class _File:
         if not has_places:
             raise FormatError(path, "was written as a stream: save it as a file, by OpenVDB's File")
         self.flags = ZIP if self.version < NODE_MASKS and stream.read(1) != b"\0" else 0
-        stream.read(UUID_LENGTH)
+        stream.read(36)  # its UUID
         stream.metadata()
         grids = (self._read_grid() for _ in range(*stream.unpack("<I")))
         self.grids = {grid.name: grid for grid in grids}
 
     def _read_grid(self) -> Grid:
         """The next grid, all but its tree."""
-        stream = self.stream
+        stream, coding = self.stream, None
         # Grids of the same name have numbers behind a separator of records.
         name, tree, parent = (re.sub("\x1e(.*)", r"[\1]", stream.text()) for _ in range(3))
-        begin, _, end = stream.unpack(POSITIONS.format)
+        begin, _, end = stream.unpack("<3q")
         if not stream.at <= begin <= end:
             raise ValueError(f"{name} begins at {begin} and ends at {end}")
         stream.at = begin
@@ -148,10 +161,9 @@ class _File:
         labels, kind = stream.metadata(), stream.text()
         steps, origin = _read_map(stream, kind)
         begin, stream.at = stream.at, end
-        coding = None
         if match := TREE.fullmatch(tree):
-            number, is_half = np.dtype(NUMBERS[match[1]]), bool(match[2])
-            stored = np.dtype("<f2") if is_half else number
+            number = np.dtype(NUMBERS[match[1]])
+            stored = np.dtype("<f2") if match[2] else number
             coding = Coding(self.version, flags, stored, number, 3 if "vec" in tree else 1)
         return Grid(name, tree, parent, labels, kind, steps, origin, coding, begin)
 
@@ -173,8 +185,7 @@ class _File:
 
     def measure(self, grid: Grid) -> np.ndarray:
         """The box [2, 3] of the voxels of `grid` that are active, or cells of ours."""
-        box = self.tree_of(grid).measure()
-        cells = grid.labels.get(RESOLUTION, b"")
+        box, cells = self.tree_of(grid).measure(), grid.labels.get(RESOLUTION, b"")
         if len(cells) == 12 and min(sides := struct.unpack("<3i", cells)) > 0:
             box = join(box, np.array([[0, 0, 0], sides]))
         return box
@@ -186,17 +197,23 @@ class _File:
         """
         shifts = {other.name: grid.shift(other) for other in self.grids.values()}
         same = {name: shift for name, shift in shifts.items() if shift is not None}
-        box, is_motion = NOWHERE, grid.name.lower() in MOTION
-        for name, shift in same.items():
-            if is_motion or name.lower() not in MOTION:
-                box = join(box, self.measure(self.grids[name]) + shift)
+        is_motion = grid.name.lower() in MOTION
+        counted = [name for name in same if is_motion or name.lower() not in MOTION]
+        boxes = (self.measure(self.grids[name]) + same[name] for name in counted)
+        box = reduce(join, boxes, NOWHERE)
         if (box[0] >= box[1]).any():
             raise FormatError(self.path, f"{grid.name} has no active voxel")
-        assert grid.coding is not None
-        check_box(self.path, grid.name, box, grid.coding.components)
+        self.check_cells(grid, box[1] - box[0])
         # By the first grid's transform: rounding of their own must not tell them apart.
         first = self.grids[next(iter(same))]
         return box, first.origin + (box[0] - same[first.name]) @ first.steps
+
+    def check_cells(self, grid: Grid, cells: np.ndarray) -> None:
+        """Raises FormatError where `grid` in so many `cells` (x, y, z) takes too much memory."""
+        assert grid.coding is not None
+        x, y, z = (int(side) for side in cells)
+        size = 4 * grid.coding.components * x * y * z
+        check_size(size, self.path, f"{grid.name}, of {x} x {y} x {z} voxels,")
 
 
 def _read_map(stream: Stream, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -226,55 +243,157 @@ def read_vdb(path: Path, name: str) -> Field:
     grid = file.require(name)
     box, center = file.place(grid)
     tree, sides = file.tree_of(grid), box[1] - box[0]
-    axes = _find_axes(grid.steps)
-    if axes is None:
-        return _read_turned(file, grid, tree, box, center)
-    order, signs = axes
+    is_along = np.abs(grid.steps) > UPRIGHT * np.abs(grid.steps).max(1, keepdims=True)
+    if (is_along.sum(0) != 1).any() or (is_along.sum(1) != 1).any():
+        return _read_turned(file, grid, tree, sides, box[0], center)
+    # Which index runs along x, y and z; it runs backward where its step does.
+    order = is_along.argmax(0)
+    flips = tuple(slice(None, None, int(np.sign(grid.steps[i, a]))) for a, i in enumerate(order))
     values = np.empty([*sides[order[::-1]], tree.coding.components], np.float32)
-    # The same by index: its axes are exchanged, and run backward where a step does.
-    by_index = values.transpose(2, 1, 0, 3)[tuple(slice(None, None, sign) for sign in signs)]
-    tree.fill(by_index.transpose(*np.argsort(order), 3), box[0])
+    by_index = values.transpose(2, 1, 0, 3)[flips].transpose(*np.argsort(order), 3)
+    tree.fill(by_index, box[0])
     corner = center - grid.steps.sum(0) / 2
     bounds = np.sort([corner, corner + sides @ grid.steps], axis=0)
     return check_field(path, name, values, bounds)
 
 
-def _find_axes(steps: np.ndarray) -> tuple[np.ndarray, list[int]] | None:
-    """Which index runs along x, y and z, and which way; None where `steps` are turned."""
-    is_along = np.abs(steps) > UPRIGHT * np.abs(steps).max(1, keepdims=True)
-    if (is_along.sum(0) != 1).any() or (is_along.sum(1) != 1).any():
-        return None
-    order = is_along.argmax(0)
-    return order, [int(np.sign(steps[index, axis])) for axis, index in enumerate(order)]
+def _read_turned(
+    file: _File, grid: Grid, tree: Tree, sides: np.ndarray, low: np.ndarray, center: np.ndarray
+) -> Field:
+    """The `tree` of a turned `grid`, of whose `sides` voxels the first, `low`, is at `center`.
 
-
-def _read_turned(file: _File, grid: Grid, tree: Tree, box: np.ndarray, center: np.ndarray) -> Field:
-    """The `tree` of a turned `grid`, of which `box` has its first voxel at `center`, resampled.
-
-    In an upright box around it, in cubes of its shortest step, by trilinear interpolation.
+    It is resampled in an upright box, in cubes of its shortest step, by trilinear interpolation.
     """
-    corners = np.array(list(itertools.product(*np.stack([[-0.5] * 3, box[1] - box[0] - 0.5], 1))))
-    corners = center + corners @ grid.steps
+    corners = np.array([*itertools.product(*([-0.5, side - 0.5] for side in sides))]) @ grid.steps
+    corners += center
     extent, side = np.ptp(corners, axis=0), np.linalg.norm(grid.steps, axis=1).min()
     cells = np.maximum(1, np.ceil(extent / side - SAME_PLACE)).astype(int)
     middle = (corners.min(0) + corners.max(0)) / 2
     bounds = middle + side * np.stack([-cells, cells]) / 2
-    check_box(file.path, grid.name, np.stack([0 * cells, cells]), tree.coding.components)
+    file.check_cells(grid, cells)
     size = " x ".join(map(str, cells))
     text = f"{grid.name} is turned; resampled to {size} cubes of {side:.4g} u along x, y, z"
     warnings.warn(f"{file.path}: {text}", DataWarning, 2)
     # A voxel of background around it is what lies beyond.
-    source = np.empty([*(box[1] - box[0] + 2), tree.coding.components], np.float32)
-    tree.fill(source, box[0] - 1)
+    source = np.empty([*(sides + 2), tree.coding.components], np.float32)
+    tree.fill(source, low - 1)
     x, y, z = (bounds[0, axis] + side * (np.arange(cells[axis]) + 0.5) for axis in range(3))
-    values = np.empty([*cells[::-1], source.shape[3]], np.float32)
+    values = np.zeros([*cells[::-1], source.shape[3]], np.float32)
     to_index, last = np.linalg.inv(grid.steps), np.array(source.shape[:3]) - 1
     for layer, height in zip(values, z, strict=True):
         centers = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], -1)
         index = np.clip((centers - center) @ to_index + 1, 0, last)
         first = np.minimum(index.astype(int), last - 1)
-        layer[:] = 0
         for corner in itertools.product((0, 1), repeat=3):
             weight = np.abs(1 - np.array(corner) - (index - first)).prod(-1, keepdims=True)
             layer += weight * source[tuple(np.moveaxis(first + corner, -1, 0))]
     return check_field(file.path, grid.name, values, bounds)
+
+
+def write_vdb(path: Path, fields: Fields, bounds: np.ndarray, facts: Facts) -> None:
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes, pruned.
+
+    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform; all `facts`,
+    texts and one number or three, become metadata of each. `VECTORS` turn with their grid.
+    """
+    data = struct.pack(HEADER, MAGIC, WRITTEN, *LIBRARY, 1) + str(uuid.uuid4()).encode()
+    data += _metadata({}) + struct.pack("<I", len(fields))
+    for name, values in fields.items():
+        data += _text(name) + _text(f"Tree_{'vec3s' if values.ndim == 4 else 'float'}_5_4_3")
+        data += _text("")
+        head, buffers = _grid(name, prune(as_float32(values)), bounds, facts)
+        blocks = len(data) + 24 + len(head)
+        data += struct.pack("<3q", blocks - len(head), blocks, blocks + len(buffers))
+        data += head + buffers
+    write_bytes(path, data)
+
+
+def _grid(name: str, values: np.ndarray, bounds: np.ndarray, facts: Facts) -> tuple[bytes, bytes]:
+    """The grid of `values` with `facts`: all but its voxels, and these."""
+    cells, is_vector = values.shape[2::-1], name in VECTORS
+    labels: dict[str, str | np.ndarray] = {**facts, "name": name}
+    labels |= {"class": "unknown" if is_vector else "fog volume", RESOLUTION: np.array(cells)}
+    labels |= {"vector_type": "contravariant relative"} if is_vector else {}
+    # The map from index to world: a translation, a scale, and what OpenVDB derives from it.
+    size = (bounds[1] - bounds[0]) / cells
+    is_uniform = np.allclose(size, size[0], rtol=1e-9, atol=0)
+    numbers = np.concatenate([bounds[0] + size / 2, size, size, 1 / size, size**-2, 0.5 / size])
+    head = struct.pack("<I", ACTIVE_MASK) + _metadata(labels)
+    head += _text("UniformScaleTranslateMap" if is_uniform else "ScaleTranslateMap")
+    places, is_active, voxels = _leaves(values)
+    topology, order = _topology(places, is_active, bytes(4 * voxels.shape[2]))
+    buffers = b"".join(
+        _bits(mask) + b"\0" + leaf[mask].astype("<f4", copy=False).tobytes()
+        for mask, leaf in zip(is_active[order], voxels[order], strict=True)
+    )
+    return head + numbers.astype("<f8").tobytes() + topology, buffers
+
+
+def _leaves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The n leaves of `values` that hold anything but 0.
+
+    Their places [n, 3] (x, y, z) among leaves; which of their voxels are active [n, 512]; and their
+    values [n, 512, components].
+    """
+    # [x, y, z, component], padded to whole leaves; then the voxels of each, z fastest.
+    colors = values.reshape(*values.shape[:3], -1).transpose(2, 1, 0, 3)
+    padded = np.pad(colors, [(0, -count % SIDE) for count in colors.shape[:3]] + [(0, 0)])
+    x, y, z = (count // SIDE for count in padded.shape[:3])
+    blocks = padded.reshape(x, SIDE, y, SIDE, z, SIDE, -1).transpose(0, 2, 4, 1, 3, 5, 6)
+    blocks = blocks.reshape(x, y, z, VOXELS, -1)
+    is_active = (blocks != 0).any(-1)
+    is_leaf = is_active.any(-1)
+    return np.argwhere(is_leaf), is_active[is_leaf], blocks[is_leaf]
+
+
+def _topology(
+    places: np.ndarray, is_active: np.ndarray, background: bytes
+) -> tuple[bytes, list[int]]:
+    """One buffer; the root, which has no tiles; then each node before its children.
+
+    And the order in which leaves at `places`, with voxels that are active, come.
+    """
+    roots, which = np.unique(places >> (LOWER + UPPER), axis=0, return_inverse=True)
+    data, order = struct.pack("<i", 1) + background + struct.pack("<II", 0, len(roots)), list[int]()
+
+    def add_node(inside: np.ndarray, size: int, *below: int) -> None:
+        """Adds the node above the leaves `inside`, which has 2^`size` children along an axis."""
+        nonlocal data
+        child = (places[inside] >> sum(below)) % 2**size @ [2 ** (2 * size), 2**size, 1]
+        is_child = np.zeros(2 ** (3 * size), bool)
+        is_child[child] = True
+        # No active tiles nor, therefore, values of its own.
+        data += _bits(is_child) + bytes(len(is_child) // 8) + b"\0"
+        for index in np.unique(child) if below else ():
+            add_node(inside[child == index], *below)
+        if not below:
+            leaves = inside[np.argsort(child)]
+            data += _bits(is_active[leaves])
+            order.extend(leaves.tolist())
+
+    for index, root in enumerate(roots.tolist()):
+        data += struct.pack("<3i", *(place << (LEAF + LOWER + UPPER) for place in root))
+        add_node(np.flatnonzero(which.ravel() == index), UPPER, LOWER)
+    return data, order
+
+
+def _metadata(entries: Mapping[str, str | np.ndarray]) -> bytes:
+    """Texts, whole numbers, or numbers, one or three."""
+    data = struct.pack("<I", len(entries))
+    for name, fact in entries.items():
+        if isinstance(fact, str):
+            kind, value = "string", fact.encode()
+        else:
+            is_whole = name == RESOLUTION
+            kind = "vec3i" if is_whole else {1: "float", 3: "vec3s"}[fact.size]
+            value = fact.astype("<i4" if is_whole else "<f4").tobytes()
+        data += _text(name) + _text(kind) + struct.pack("<I", len(value)) + value
+    return data
+
+
+def _bits(is_on: np.ndarray) -> bytes:
+    return np.packbits(is_on, bitorder="little").tobytes()
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text.encode())) + text.encode()
