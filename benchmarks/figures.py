@@ -2,12 +2,13 @@
 
     python benchmarks/figures.py --references FOLDER [NAME]...     all of them, or some
     python benchmarks/figures.py --write                           no measuring: pages anew
+    python benchmarks/figures.py --show NAME                       prints what is stored
 
 A figure is a table that one command prints. What was measured lies in benchmarks/figures.json with
 its commit, day and machine. A page quotes it between `<!-- figure: NAME -->` and
-`<!-- end of figure -->`; a house test compares. Run it on idle cores. Path tracing needs the extra
-`reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds `images/cases.json` of
-the eleven cases.
+`<!-- end of figure -->`, or names it; a house test compares. Run it on idle cores. Path tracing
+needs the extra `reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds
+`images/cases.json` of the eleven cases.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ COMMANDS = {
     "cloud": "python benchmarks/cloud_path_replay.py FOLDER/wdas_cloud_sixteenth.vdb",
     "engines": "python benchmarks/speed.py engines",
     "tangents": "python benchmarks/speed.py tangents",
-    "launches": "python benchmarks/launches.py",
+    "launches": "python benchmarks/launches.py --as-a-gpu --engines warp",
     "solvers": "python benchmarks/speed.py solvers",
     "memory": "python benchmarks/memory.py --cells 96",
     "numbers": "python benchmarks/memory.py --count",
@@ -56,11 +57,12 @@ COMMANDS = {
     "fig10": "python benchmarks/paper_g.py",
     "paper": "python benchmarks/paper.py",
     "pyshdom": "python benchmarks/pyshdom.py FOLDER/pyshdom",
+    "mouse": "python benchmarks/mouse.py FOLDER/mouse",
 }
 """By the name of a figure, what prints it."""
 KEPT_BY_THEMSELVES = ("fig10", "paper")
 """Scripts that keep their tables: the paper's, of one experiment or of all."""
-COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb"}
+COPIED = {"pyshdom": "pyshdom", "cloud": "wdas_cloud_sixteenth.vdb", "mouse": "mouse"}
 """Figures of what licenses keep out of here, and its place in FOLDER: measured where it is."""
 SUMMARY = (
     ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
@@ -206,7 +208,11 @@ def main() -> None:
     parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--show", choices=[*COMMANDS])
     given = parser.parse_args()
+    if given.show:
+        print(show(given.show, read_store()))
+        return
     references = given.references.resolve()
     absent = [name for name, place in COPIED.items() if not (references / place).exists()]
     absent += [] if shutil.which("nvidia-smi") else ["gpu"]

@@ -270,11 +270,11 @@ def graphs(check: Check) -> Iterator[str]:
             torch.manual_seed(0)
             run = check.runs()[name]()
             if is_plain:
-                run.frame.replays.new_recorder = None
+                run.frames[0].replays.new_recorder = None
             taken = [check.time_of(run.step, 1) for _ in range(6)]
             ends.append(run.parameters[0].value.detach())
             seconds.append(median(taken[1:]))
-        is_recorded = run.frame.replays.recording is not None
+        is_recorded = run.frames[0].replays.recording is not None
         apart = float((ends[0] - ends[1]).norm() / ends[0].norm())
         yield (
             f"{name}: {seconds[0]:.4f} s plainly, {seconds[1]:.4f} s replayed "

@@ -24,12 +24,11 @@ from torch import Tensor
 
 from ddrecon.engine import use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.numerics.around import mean_around
 from ddrecon.reconstruct.levels import resample, scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
-from ddrecon.uncertainty.deviations import EMPTY, Deviations
+from ddrecon.uncertainty.deviations import EMPTY, Deviations, mean_around
 from ddrecon.uncertainty.experiments import Uncertainty
 
 ROOT = Path(__file__).parents[1]

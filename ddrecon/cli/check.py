@@ -24,10 +24,8 @@ from ddrecon.reconstruct.support import (
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import needs_of_scene
-from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.settings import AUTO
-from ddrecon.terms import needed_terms
-from ddrecon.turntable import upright_axis
+from ddrecon.terms import find_doubts, needed_terms
 from ddrecon.variables.values import with_values
 
 TOO_WIDE = 8.0
@@ -70,10 +68,10 @@ def asks_support(scene: Scene) -> bool:
     return density is not None and density.support is not None
 
 
-def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> dict[str, Any]:
+def describe(scene: Scene, supports: Sequence[Support] = ()) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: its grid, physics, engine, time and so on.
 
-    And what can hardly be meant. Its parameters are where they start. `up` is `volume.up`.
+    And what can hardly be meant. Its parameters are where they start.
     """
     built, scene = scene, with_values(scene, scene.starts)
     grid, train = scene.volume.grid, select_views(scene, is_test=False)
@@ -85,8 +83,7 @@ def describe(scene: Scene, supports: Sequence[Support] = (), up: str = "y") -> d
             seconds = time_iteration(built)
     support = None
     with suppress(SceneError) if not asks_support(scene) else nullcontext():
-        upright = upright_axis(replace(scene, up=None)), "xyz".index(up)
-        support = describe_support(supports, grid, upright)
+        support = describe_support(supports, grid)
         if support is not None and "doubt" not in support:
             support["cut"] = find_cut(supports[0], grid)
     return {

@@ -33,8 +33,7 @@ from ddrecon.run.loss_log import LossLog
 from ddrecon.run.result import RESULT
 from ddrecon.run.run_folder import SCENE, volume_file, write_volume
 from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.build_views import remove_pictures
-from ddrecon.scene_file.frames import at_frame
+from ddrecon.scene_file.build_views import at_frame, remove_pictures
 from ddrecon.scene_file.load import read_scene
 
 REPORT_SHARE = 0.05

@@ -25,8 +25,8 @@ from ddrecon.numerics.flow import carry, find_flow
 from ddrecon.run.checkpoint import require_same
 from ddrecon.run.run_folder import SCENE, SUMMARY, field_key, volume_file, write_scene, write_volume
 from ddrecon.scene import Scene
+from ddrecon.scene_file.build_views import Maker, at_frame, require_frames
 from ddrecon.scene_file.build_volume import build_media
-from ddrecon.scene_file.frames import at_frame, require_frames
 from ddrecon.scene_file.load import (
     SceneFile,
     describe,
@@ -34,7 +34,6 @@ from ddrecon.scene_file.load import (
     read_scene,
     referenced_files,
 )
-from ddrecon.scene_file.maker import Maker
 from ddrecon.scene_file.view_schema import FramesSection
 from ddrecon.variables.kinds import kind_of
 

@@ -11,7 +11,8 @@ from torch.nn.functional import avg_pool2d, conv2d, pad
 from ddrecon.pictures.noise import Noise, estimate_noise
 from ddrecon.pictures.srgb import display, display_slope
 
-NODES = 1025
+SIDE = 32
+NODES = SIDE**2 + 1
 """Places between which the stabilized scale is interpolated, close together near black."""
 RADIUS, DEVIATION = 5, 1.5
 """The Gaussian window, in pixels: 11 x 11."""
@@ -63,7 +64,12 @@ class Stabilized(Scale):
         top = radiance.max().clamp(min=torch.finfo(radiance.dtype).tiny).double()
         places = top * torch.linspace(0, 1, NODES, dtype=torch.float64, device=top.device) ** 2
         slopes = 1 / self.noise.deviation(places)
-        heights = torch.cat([places[:1], torch.cumulative_trapezoid(slopes, places)])
+        # Summed up to each node by rows: on a GPU `cumsum` has no fixed order.
+        areas = ((slopes[1:] + slopes[:-1]) / 2 * places.diff()).view(SIDE, SIDE)
+        ones = torch.ones_like(areas)
+        rows = areas @ ones.triu()
+        sums = rows + ones.tril(-1) @ rows[:, -1:]
+        heights = torch.cat([places[:1], sums.flatten()])
         at = ((radiance / top).clamp(min=0).sqrt() * (NODES - 1)).clamp(max=NODES - 1)
         below = at.long().clamp(max=NODES - 2)
         fraction = (radiance - places[below]) / (places[below + 1] - places[below])

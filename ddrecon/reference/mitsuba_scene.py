@@ -28,8 +28,7 @@ from ddrecon.light.environment import rotate_directions
 from ddrecon.light.ground import Ground
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium.coefficients import Volume
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
-from ddrecon.medium.phase_blend import Mixture
+from ddrecon.medium.phase import HenyeyGreenstein, Mixture, PhaseFunction, Rayleigh
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024

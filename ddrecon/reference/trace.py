@@ -24,8 +24,7 @@ from ddrecon.io.images.table import write_picture, write_preview
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.lighting import solve_light
 from ddrecon.losses import Target
-from ddrecon.medium.phase import PhaseFunction
-from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase import Blend, PhaseFunction, TwoLobe
 from ddrecon.picture import view_image
 from ddrecon.progress import Progress
 from ddrecon.reference.mitsuba_scene import LONGEST, is_gray, mitsuba_scene, sensor_id

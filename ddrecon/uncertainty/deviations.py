@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
-from ddrecon.numerics.around import mean_around
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.uncertainty.experiments import Uncertainty, is_tabled
 from ddrecon.variables.kinds import split_name
@@ -108,3 +108,13 @@ def _entry_names(parameter: Parameter) -> Sequence[str]:
         return [name]
     components = component_names(name, value) if value.ndim else ()
     return [f"{name}.{component}" for component in components or range(value.numel())]
+
+
+def mean_around(field: Tensor, width: int = 5) -> Tensor:
+    """The mean of `field` [..., z, y, x] over `width`^3 cells around each, `width` being odd.
+
+    Beyond the box there are no cells: those that there are count alone.
+    """
+    cells = field.reshape(1, -1, *field.shape[-3:])
+    means = avg_pool3d(cells, width, 1, width // 2, count_include_pad=False)
+    return means.view(field.shape)

@@ -262,7 +262,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     medium = scale_medium(scene.volume, settings.angles)
     cells, lights = average_cells(medium), decompose_lights(scene.lights)
     source = cut(receive_in_parts(medium, cells, lights, settings).source)[0]
-    closure = Closure(settings.closure, grid, settings.floor)
+    closure = Closure(settings.closure, grid)
     outside = ambient_radiance(lights, solution)
     problem = DiffusionProblem(cells, closure, source, outside, cells.degree > 0)
     operator, right = problem.system
