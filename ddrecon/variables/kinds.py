@@ -237,7 +237,7 @@ KINDS: Mapping[str, Kind] = {
 FIELDS = tuple(name for name, kind in KINDS.items() if kind.is_cellwise)
 """Those that may differ from cell to cell."""
 PHASE = "phase."
-"""What variables of a phase function begin with; `phase.g` of Henyey and Greenstein's is `g`."""
+"""What variables of a phase function begin with, but `g` of Henyey and Greenstein's."""
 CROSS_SECTIONS = ("sigma_a", "sigma_s")
 EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
 PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)
